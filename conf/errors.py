@@ -1,4 +1,4 @@
-"""Exceptions that a command reports as one sentence instead of a traceback."""
+"""Exceptions that a command reports by their message, without a traceback."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from types import ModuleType
 
 
 class UserError(Exception):
-    """A mistake that the user can correct.
+    """A problem that the user can solve, such as a missing file or an unreachable server.
 
     Args:
-        message: What is wrong, where, and what to do about it.
-        code: A short, stable name of the mistake in kebab case, such as ``missing-run``. Scripts
+        message: What is wrong, where, and what to do about it; one line per problem.
+        code: A short, stable name of the problem in kebab case, such as ``missing-run``. Scripts
             and tests rely on the code, never on the wording of the message.
     """
 
@@ -26,17 +26,17 @@ class UserError(Exception):
 
 
 class SettingsError(UserError):
-    """A mistake in a command's settings, detected before the command starts; one line a mistake."""
+    """A mistake in a command's settings. Most are detected before its `main` is called."""
 
     def __init__(self, message: str, code: str = "invalid-setting") -> None:
         super().__init__(message, code)
 
 
 def import_extra(name: str, setting: str) -> ModuleType:
-    """Import the package of an extra that has the same name.
+    """Import the package that the extra (the optional dependencies) of the same name installs.
 
     Raises:
-        UserError: It is not installed; the message names the `setting` that needs it.
+        UserError: The package is not installed; the message names the `setting` that needs it.
     """
     try:
         return import_module(name)

@@ -1,4 +1,4 @@
-"""End a command after an error: one sentence for a mistake, a traceback for a bug."""
+"""End a command after an error: a message for what the user can correct, a traceback for a bug."""
 
 from __future__ import annotations
 
@@ -17,29 +17,30 @@ from conf.errors import SettingsError, UserError
 from conf.runs import rank, world_size
 
 MAIN_RANK_GRACE = 3.0
-"""Time (s) for the main rank to print an error before another rank does."""
+"""Time (s) that other ranks wait before they print an error, so that the main rank prints first."""
 PEER_ENDED = r"gloo.*(by peer|[Bb]roken pipe)"
-"""Error of a rank that waits for the others after one of them has ended."""
+"""Pattern of the error that a rank gets when it communicates with a rank that has ended."""
 FAILED_WRITE = r"PytorchStreamWriter|unexpected pos|\(os error (27|28|122)\)"
-"""Messages of torch and safetensors about a file that they cannot write. torch gives no cause."""
+"""Pattern of the messages of torch and safetensors for a file that they cannot write. torch's
+message gives no cause."""
 FULL_DISK_BYTES = 1 << 20
 """Free space below which a disk counts as full."""
 WRITE_ERRORS = {
     "ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM", "ENOTDIR", "EISDIR", "EEXIST",
     "ENAMETOOLONG",
 }  # fmt: skip
-"""Errors of the operating system that the user can correct, by their names in `errno`."""
+"""Names in `errno` of the errors of writing that the user can correct."""
 
 
 @contextmanager
 def report_failures(folder: str = ".") -> Iterator[None]:
-    """Print a UserError, an interruption or a failed write as one sentence and exit.
+    """Exit with a message after a UserError, an interruption or a failed write in the block.
 
     Any other exception is a bug and keeps its traceback. With several ranks, one rank prints.
 
     Args:
-        folder: The folder that the block writes to. Some libraries raise their own errors when its
-            disk is full.
+        folder: The folder that the block writes to. If its disk is full, any exception counts as a
+            failed write, because some libraries raise errors of their own.
     """
     try:
         yield
@@ -68,14 +69,14 @@ def _exit_after_failed_write(path: str, reason: str) -> NoReturn:
 
 
 def _exit(status: int, message: str) -> NoReturn:
-    """Print a message and exit, on the main rank first.
+    """Print a message and exit; ranks other than the main rank do so after a delay.
 
-    An error that all ranks share is printed by the main rank, whose exit makes the launcher end the
-    others; an error of a single other rank is printed after a delay.
+    If all ranks have the error, the main rank prints it first, and its exit makes the launcher end
+    the others. If only another rank has the error, that rank prints it after the delay.
     """
     if rank() != 0:
         time.sleep(MAIN_RANK_GRACE)
-        # The progress bar of the main rank has not ended its line.
+        # The cursor may be at the end of the main rank's progress bar: start a new line.
         print(file=sys.stderr)
     print(message, file=sys.stderr)
     _end_process(status)
@@ -83,7 +84,7 @@ def _exit(status: int, message: str) -> NoReturn:
 
 def _end_process(status: int) -> NoReturn:
     if world_size() > 1:
-        # A normal exit waits for messages of other ranks, which wait for this one.
+        # A normal exit would wait for messages of the other ranks, which wait for this rank.
         logging.shutdown()
         sys.stdout.flush()
         sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""The GPUs of this machine, without importing torch, which takes seconds and reserves memory."""
+"""Find the GPUs of this machine without torch, whose import takes seconds and reserves memory."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from itertools import takewhile
 log = logging.getLogger(__name__)
 
 DEVICE = r"\d+|(GPU|MIG)-\S+"
-"""A device in CUDA_VISIBLE_DEVICES."""
+"""Pattern of a valid device in CUDA_VISIBLE_DEVICES: an index or an identifier."""
 
 
 def visible_gpus() -> list[str]:
-    """The GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    """The GPUs that this process may use, in the notation of CUDA_VISIBLE_DEVICES."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None:
         # Like CUDA, ignore everything after the first invalid device.
@@ -32,9 +32,9 @@ def visible_gpus() -> list[str]:
 def restrict_to_one_gpu() -> None:
     """Make only the first GPU visible, unless a launcher started this process as a rank.
 
-    A Trainer that sees several GPUs spreads each micro-batch over them, so that a step has more
-    samples than the settings. Call this before anything initialises CUDA, as importing bitsandbytes
-    does.
+    With several visible GPUs, transformers' Trainer runs one micro-batch on each, so that an
+    optimizer step has more samples than `train.batch`. Call this before anything initialises CUDA;
+    importing bitsandbytes does.
     """
     gpus = visible_gpus()
     if len(gpus) > 1 and "LOCAL_RANK" not in os.environ:

@@ -1,4 +1,4 @@
-"""The text of `--help`: the presets of a command, and every key with its value and description."""
+"""The text of `--help`: a command's presets, and every setting with its value and description."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from dataclasses import asdict, fields, is_dataclass
 from functools import cache
 from typing import Any
 
-from conf.compose import OVERLAYS, compose, options
+from conf.compose import OVERLAYS, compose, list_presets
 
 COLUMN = 46
-"""Column at which descriptions begin."""
+"""Column at which the descriptions of settings begin."""
 
 
 def help_text(command: str, schema: type, overrides: list[str]) -> str:
-    """Help of a command, with the values that `overrides` result in. Raises SettingsError."""
+    """Help of a command, with the values that result from `overrides`. Raises SettingsError."""
     settings = compose(command, schema, overrides)
     purpose = (sys.modules["__main__"].__doc__ or "").strip()
-    groups = options(command, schema)
+    groups = list_presets(command, schema)
     presets = [f"  {g}: {', '.join(groups[g])}" for g in groups if g not in OVERLAYS]
     overlays = [f"  {g}: {', '.join(groups[g])}" for g in groups if g in OVERLAYS]
     lines = [f"python -m {command} [KEY=VALUE ...]", "", *([purpose, ""] if purpose else [])]
@@ -49,14 +49,15 @@ def _setting_lines(settings: Any, group: str = "") -> Iterator[str]:
 
 
 def description(schema: type, name: str) -> str:
-    """The docstring below a field, from the class or the base class that has one."""
+    """The docstring below a field of a schema, or below the field of the same name in a base class;
+    empty if there is none."""
     schemas = [kind for kind in schema.__mro__ if is_dataclass(kind)]
     return next((text for kind in schemas if (text := _docstrings(kind).get(name))), "")
 
 
 @cache
 def _docstrings(schema: type) -> dict[str, str]:
-    """The docstrings of a dataclass's own fields, each on one line."""
+    """The docstrings of the fields that a dataclass defines itself, each joined to one line."""
     [node] = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
     assert isinstance(node, ast.ClassDef)
     return {

@@ -27,13 +27,14 @@ log = logging.getLogger(__name__)
 RESULT_NEUTRAL_KEYS = {
     "run", "store", "checkpoints", "workers", "train.workers", "host", "port", "public",
 }  # fmt: skip
-"""Keys that do not change the result of a run; a resumed run may have other values."""
+"""Keys that do not change the result of a run. Their values may differ when a run is resumed, and
+they are not part of the run's name."""
 
 BOOKKEEPING_FILES = {"config.yaml", "run.json", "run.log", "output.log", "job.json"}
-"""Files of a run's folder that exist before the command writes its first result."""
+"""Files that may exist in a run's folder before the command writes its first result."""
 
 TRAINER_FOLDERS = {"student": "sft", "retriever": "contrastive"}
-"""Folder of the training runs of each product below checkpoints/."""
+"""Folder below checkpoints/ of the training runs that have each product (trained model)."""
 
 PACKAGES = (
     "torch", "transformers", "peft", "bitsandbytes", "accelerate", "sentence-transformers",
@@ -70,10 +71,10 @@ def local_world_size() -> int:
 
 
 def run_name(run: str | None, overrides: Sequence[str]) -> str:
-    """`run` if it is set; otherwise a name made from the overrides, independent of their order."""
+    """`run` if it is set; otherwise a name made from the overrides, whatever the order of keys."""
     if run is not None:
         return run
-    # The sort is stable: of two values of one key, the later one takes effect.
+    # If a key occurs twice, its last value takes effect; the stable sort keeps their order.
     ordered = sorted((o.lstrip("+") for o in overrides), key=_key)
     ordered = [o for o in ordered if _key(o) not in RESULT_NEUTRAL_KEYS]
     # Keep only characters that need no quotes in an override such as model=NAME.
@@ -89,7 +90,7 @@ def _key(override: str) -> str:
 
 
 def resolve_run_name(run: str, folder: str) -> str:
-    """Name of a run in `folder`; `run` is this name or the path of the run's folder."""
+    """Name of a run in `folder`; `run` is either this name or the path of the run's folder."""
     return os.path.relpath(run, folder) if is_inside(run, folder) else os.path.normpath(run)
 
 
@@ -99,12 +100,12 @@ def is_inside(path: str, folder: str) -> bool:
 
 
 def runs_folder(checkpoints: str, product: str) -> str:
-    """Folder of the runs that train a product (student or retriever)."""
+    """Folder of the runs that train a product (student or retriever), below `checkpoints`."""
     return f"{checkpoints}/{TRAINER_FOLDERS.get(product, product)}"
 
 
 def is_run_name(run: str) -> bool:
-    """Whether a name leads to a folder below the folder of runs; a sweep's job is SWEEP/NUMBER."""
+    """Whether a name, such as exp-cot or SWEEP/NUMBER, stays within the folder of runs."""
     return not os.path.isabs(run) and run.split(os.sep)[0] not in (".", "..")
 
 
@@ -119,10 +120,10 @@ OmegaConf.register_new_resolver("resolve_run_name", resolve_run_name, replace=Tr
 OmegaConf.register_new_resolver("runs_folder", runs_folder, replace=True)
 
 
-def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[str]) -> None:
+def open_run(run: Run, settings: dict[str, Any], command: str) -> None:
     """Write the settings (config.yaml) and the record (run.json) of a run that starts or resumes.
 
-    A run without results may be started again with other settings.
+    A folder without results may be reused with other settings; its record then starts anew.
 
     Raises:
         SettingsError: The folder contains results of a run with other settings.
@@ -137,7 +138,7 @@ def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[s
     earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
     record = {
         "command": command,
-        "overrides": overrides,
+        "overrides": list(run.overrides),
         "seeds": {k: v for k, v in flatten(settings).items() if k.rpartition(".")[2] == "seed"},
         "ranks": world_size(),
         "git": _git(),
@@ -151,7 +152,7 @@ def open_run(run: Run, settings: dict[str, Any], command: str, overrides: list[s
 
 
 def other_settings_error(subject: str, changes: Sequence[str]) -> SettingsError:
-    """Error for a folder whose content (`subject`) was created with other settings."""
+    """Error for results with other settings; `subject` is a clause like "FOLDER contains a run"."""
     return SettingsError(
         f"{subject} with other settings: {'; '.join(changes[:3])}. Choose another folder with "
         "run=NAME, or delete this one.",
@@ -161,10 +162,10 @@ def other_settings_error(subject: str, changes: Sequence[str]) -> SettingsError:
 
 @contextmanager
 def lock_folder(folder: Path, busy: str) -> Iterator[None]:
-    """Lock a folder against other processes.
+    """Hold an exclusive lock on a folder during the block.
 
     Raises:
-        UserError: Another process has locked it; `busy` is the message.
+        UserError: Another process holds the lock; `busy` is the message.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -178,10 +179,10 @@ def lock_folder(folder: Path, busy: str) -> Iterator[None]:
 
 
 def wait_for_lock(handle: int, busy: str) -> None:
-    """Lock an open file or folder until it is closed, and wait while another process has the lock.
+    """Take an exclusive lock on an open file or folder, and wait while another process holds it.
 
     Args:
-        handle: File descriptor.
+        handle: File descriptor; closing it releases the lock.
         busy: What to log before waiting.
     """
     try:
@@ -192,7 +193,7 @@ def wait_for_lock(handle: int, busy: str) -> None:
 
 
 def changed_settings(folder: Path, settings: dict[str, Any]) -> list[str]:
-    """`compare_settings` of the run in `folder`, if there is one, and of `settings`."""
+    """`compare_settings` of the run in `folder` and `settings`; empty if there is no run."""
     path = folder / "config.yaml"
     if not path.exists():
         return []
@@ -200,7 +201,7 @@ def changed_settings(folder: Path, settings: dict[str, Any]) -> list[str]:
 
 
 def flatten(value: Any, key: str = "") -> dict[str, Any]:
-    """Nested settings by dotted key."""
+    """Flatten nested settings to a dict by dotted key, such as train.lr."""
     if not isinstance(value, dict) or not value:
         return {key: value}
     return {
@@ -211,8 +212,8 @@ def flatten(value: Any, key: str = "") -> dict[str, Any]:
 
 
 def compare_settings(before: Any, now: Any) -> list[str]:
-    """A phrase with both values for each setting that differs between two nested dicts and may
-    change the result of a run."""
+    """Describe each setting that differs between two nested dicts, except those that do not change
+    the result of a run (RESULT_NEUTRAL_KEYS)."""
     before, now = (
         {key: json.dumps(value) for key, value in flatten(settings).items()}
         for settings in (before, now)
@@ -242,8 +243,8 @@ def write_json_lines(path: Path, rows: Iterable[dict[str, Any]]) -> None:
 
 
 def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the objects in a file of JSON lines; skip damaged lines, such as one that a kill cut
-    off."""
+    """Yield the objects in a file of JSON lines; skip damaged lines, such as a last line that a
+    killed process wrote only in part."""
     with open(path, encoding="utf-8", errors="replace") as file:
         for line in file:
             try:
@@ -255,14 +256,14 @@ def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def run_id(run: Run) -> str:
-    """Unique id of a run, from its folder and its first start; a resumed run keeps it."""
+    """Unique id of a run, from its folder and the time of its first start; resuming keeps it."""
     record = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))
     first = [*record["earlier_starts"], record["started"]][0]
     return hashlib.sha256(f"{run.folder.resolve()} {first}".encode()).hexdigest()[:16]
 
 
 def _git() -> dict[str, Any] | None:
-    """The commit of the code and whether the code has changed since; None outside a repository."""
+    """The commit of the code, and whether there are uncommitted changes; None without git."""
 
     def git(*arguments: str) -> str:
         command, folder = ["git", *arguments], Path(__file__).parent

@@ -8,12 +8,12 @@ from conf.errors import UserError
 
 
 def check_trackers(report_to: Sequence[str]) -> None:
-    """Check that the Trainer knows each tracker and that its package is installed.
+    """Check that the Trainer knows each tracker and that the tracker's package is installed.
 
-    Call this after `restrict_to_one_gpu`: it imports transformers if there is a tracker.
+    Call this after `restrict_to_one_gpu`, because it imports transformers if there is a tracker.
 
     Raises:
-        UserError: A tracker is unknown or not installed.
+        UserError: A tracker is unknown or its package is not installed.
     """
     if not report_to:
         return

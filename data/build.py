@@ -1,4 +1,4 @@
-"""Build a benchmark: simulate scenes, make items, queries and databases, render their frames."""
+"""Build a benchmark: simulate scenes, make items, queries and databases, and render frames."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from data.store import (
     PARTS,
     PLAN,
     Store,
-    add_checksum,
     component_versions,
     hash_files,
     load_scene,
     open_store,
     save_rows,
     scene_path,
+    with_checksum,
     write_atomically,
 )
 from data.tracks.build_items import family_quotas, item_families, make_items_and_queries, suite_name
@@ -49,7 +49,8 @@ SCENE_SETTINGS = (
     "simulator", "standin", "seed", "test_share", "min_objects", "max_objects", "max_collisions",
     "fps",
 )  # fmt: skip
-"""Settings that determine the scenes. The file name of any other part is a hash of its settings."""
+"""Settings that determine the scenes. A killed build resumes only with the same values of these.
+Other settings may change, because the name of a file in `PARTS` is a hash of its job's inputs."""
 
 
 @command("data.build", BuildCommand)
@@ -70,13 +71,13 @@ def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
 
 
 def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers, strict: bool = False) -> Store:
-    """Open the benchmark that `cfg` describes below `root`; build it first where it is missing.
+    """Open the benchmark `root / cfg.name`; build it first, without frames, if it is missing.
 
     Raises:
-        UserError: the existing store is damaged, or was built by another version or from other
-            settings.
+        UserError: the existing store is damaged, or was built by another version of the code or
+            with other settings.
     """
-    check_names(cfg)
+    check_quota_names(cfg)
     folder = root / cfg.name
     if not folder.exists():
         build(cfg, folder, workers, strict)
@@ -90,12 +91,15 @@ def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers, strict: boo
 
 
 def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = False) -> None:
-    """Build a benchmark without its frames at `folder`, and resume a killed build of it.
+    """Build a benchmark without frames at `folder`, or resume a killed build of it.
 
     Args:
-        strict: Fail at the first invalid record of a release instead of leaving it out.
+        strict: Fail if a record of a release is invalid, instead of leaving the record out.
+
+    Raises:
+        UserError: the benchmark would contain no item and no query.
     """
-    check_names(cfg)
+    check_quota_names(cfg)
     log.info("building benchmark %s in %s", cfg.name, folder)
     with lock_partial_build(cfg, folder) as partial:
         if partial is None:
@@ -106,9 +110,9 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
         if not items and not queries:
             raise UserError(
-                f"benchmark {cfg.name} would be empty: its scenes give no item with "
-                f"benchmark.selection.min_displacement={cfg.selection.min_displacement}; lower "
-                "it, or raise benchmark.scenes or the quotas",
+                f"benchmark {cfg.name} would contain no item and no query: raise benchmark.scenes "
+                "or the quotas, or lower benchmark.selection.min_displacement="
+                f"{cfg.selection.min_displacement}",
                 code="empty-benchmark",
             )
         save_rows([i.to_row() for i in items], partial / "selection.parquet")
@@ -127,14 +131,14 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
             "scenes": scene_ids,
             "files": hash_files(partial),
         }
-        write_atomically(partial / MANIFEST, json.dumps(add_checksum(manifest), indent=1).encode())
+        write_atomically(partial / MANIFEST, json.dumps(with_checksum(manifest), indent=1).encode())
         partial.rename(folder)
         shutil.rmtree(folder / PARTS)
         (folder / PLAN).unlink()
 
 
-def check_names(cfg: BenchmarkConfig) -> None:
-    """Raises SettingsError where a quota names an unknown family, subtype or builder."""
+def check_quota_names(cfg: BenchmarkConfig) -> None:
+    """Raises SettingsError if a quota is set for an unknown family, subtype or builder."""
     known = {f"selection.{name}": list(f.cells) for name, f in item_families(cfg).items()}
     known["retrieval.builders"] = [str(b) for b in future.BUILDERS]
     quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
@@ -143,11 +147,11 @@ def check_names(cfg: BenchmarkConfig) -> None:
         options = known.get(key, [])
         if named and not options:
             problems.append(
-                f"benchmark.{key}: suite {suite_name(cfg)} has no items of this family; remove it"
+                f"benchmark.{key}: suite {suite_name(cfg)} lacks this family; remove its quotas"
             )
         problems += [
-            f"benchmark.{key}.{name}: unknown name, did you mean "
-            f"{nearest_key(name, options) or options[0]}? The options are {', '.join(options)}"
+            f"benchmark.{key}.{name}: unknown name; did you mean "
+            f"{nearest_key(name, options) or options[0]}? The names are {', '.join(options)}"
             for name in named
             if options and name not in options
         ]
@@ -157,15 +161,14 @@ def check_names(cfg: BenchmarkConfig) -> None:
 
 @contextmanager
 def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | None]:
-    """Lock the folder beside `folder` that a build writes to; wait while another process holds it.
-
-    A killed build resumes from the parts in that folder.
+    """Lock the partial build of `folder`, and wait while another process has locked it.
 
     Yields:
-        The folder, or None if the other process has completed `folder` meanwhile.
+        The folder of the partial build, which may contain files of a killed build; None if another
+        process has completed `folder` in the meantime.
 
     Raises:
-        UserError: the folder holds an unfinished build with other settings.
+        UserError: the partial build has other settings.
     """
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(parents=True, exist_ok=True)
@@ -184,7 +187,7 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
             yield None
             return
         if (partial / PLAN).exists():
-            # Scenes take hours to simulate, so a changed setting does not discard them silently.
+            # Simulating scenes can take hours, so a changed setting must not discard them silently.
             check_same_settings(json.loads((partial / PLAN).read_text()), plan, partial)
         for leftover in partial.rglob(".*.partial"):
             leftover.unlink()
@@ -195,10 +198,10 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
 
 
 def check_same_settings(old: dict[str, Any], new: dict[str, Any], folder: Path) -> None:
-    """Raises UserError where the nested settings of two builds differ."""
+    """Raises UserError if the nested settings of two builds differ."""
     if changes := compare_settings(old, new):
         raise UserError(
-            f"{folder} was built with another setting: {changes[0]}. Use the earlier setting, "
+            f"{folder} was built with other settings: {changes[0]}. Use the earlier value, "
             f"choose another name with benchmark.name=NAME, or delete {folder}",
             code="different-settings",
         )

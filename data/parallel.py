@@ -1,7 +1,6 @@
 """Runs jobs in worker processes of this machine or of a Ray cluster, with joblib.
 
-A job writes its result atomically to files, so that another worker can repeat the job of a worker
-that died.
+A job writes its files atomically, so that another worker can repeat the job of a worker that died.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ Job = Callable[[], Any]
 CHUNK = 32
 """Jobs per worker in one batch; all workers finish a batch before the next one starts."""
 MAX_DEATHS = 3
-"""Worker deaths in a row, without a finished job between them, that `run` tolerates."""
+"""Number of consecutive worker deaths that `run` tolerates; a finished job resets the count."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +36,8 @@ class Workers:
 
     Attributes:
         count: Number of processes.
-        engine: `loky` for this machine, `ray` for the cluster at RAY_ADDRESS, or for a new local
-            one without that variable.
+        engine: `loky` uses this machine. `ray` uses the cluster at the environment variable
+            RAY_ADDRESS, or starts one on this machine if the variable is not set.
     """
 
     count: int
@@ -50,9 +49,10 @@ class Workers:
         """Run jobs and yield their names and results in order of completion.
 
         Args:
+            jobs: Functions without arguments, by name.
             title: Title of the progress bar.
             unit: What a job processes, in the singular.
-            done: Number of earlier jobs that the progress bar counts as done.
+            done: Number of completed jobs, besides `jobs`, for the progress bar.
 
         Raises:
             UserError: workers die repeatedly without finishing a job.
@@ -68,7 +68,7 @@ class Workers:
                         bar.update()
                         deaths = 0
                         yield name, result
-                except _worker_died(self.engine) as error:
+                except _death_errors(self.engine) as error:
                     deaths += 1
                     if deaths > MAX_DEATHS:
                         raise UserError(
@@ -79,7 +79,7 @@ class Workers:
                     log.warning("a worker died; retrying its jobs")
 
     def write_files(self, jobs: Mapping[Path, Job], title: str, unit: str) -> None:
-        """Run the jobs whose files do not exist; see `run`. A job writes its file last."""
+        """Run the jobs whose files do not exist; see `run`. Each job must write this file last."""
         missing = {str(path): job for path, job in jobs.items() if not path.exists()}
         for _ in self.run(missing, title, unit, done=len(jobs) - len(missing)):
             pass
@@ -88,20 +88,20 @@ class Workers:
         from joblib import Parallel, delayed
 
         if self.engine == "ray":
-            _join_cluster(self.count)
+            _connect_to_ray(self.count)
             # Ray's backend cannot return results one by one.
             options = {}
         else:
             options = {"return_as": "generator_unordered", "initializer": _exit_with_parent}
         parallel = Parallel(self.count, backend=self.engine, **options)
-        # Loky restarts a worker whose memory grows, which caching scenes causes.
+        # Loky restarts a worker whose memory grows; workers grow because they cache scenes.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs")
         for batch in batched(list(jobs.items()), CHUNK * self.count):
             yield from parallel(delayed(_run_job)(name, job) for name, job in batch)
 
 
 def batched(elements: list[Element], size: int) -> Iterator[list[Element]]:
-    """Lists of at most `size` consecutive elements."""
+    """Yield lists of at most `size` consecutive elements."""
     return (elements[k : k + size] for k in range(0, len(elements), size))
 
 
@@ -109,7 +109,7 @@ def _run_job(name: str, job: Job) -> tuple[str, Any]:
     return name, job()
 
 
-def _worker_died(engine: str) -> tuple[type[Exception], ...]:
+def _death_errors(engine: str) -> tuple[type[Exception], ...]:
     if engine == "ray":
         from ray.exceptions import RayActorError, WorkerCrashedError
 
@@ -120,7 +120,7 @@ def _worker_died(engine: str) -> tuple[type[Exception], ...]:
 
 
 @cache
-def _join_cluster(count: int) -> None:
+def _connect_to_ray(count: int) -> None:
     ray = import_extra("ray", "parallel=ray")
     from ray.util.joblib import register_ray
 

@@ -1,7 +1,7 @@
 """The records that packages exchange: scenes, items, queries and rationales.
 
-They are plain data with checks, without rendering, simulation or models. Field names equal the
-column names of the released files, such as `selection.parquet`.
+They are dataclasses that check their values; they do not render, simulate or run models. Field
+names equal the column names of the exported tables, which `data/publish/columns.yaml` describes.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 FRAMES = 128
 """Frames per scene (CLEVRER's clip length)."""
 FPS = 25
-"""Frames per second of a scene, and of the retrieval builders."""
+"""Frame rate of simulated scenes. Questions of retrieval queries count seconds in these frames."""
 SELECTION_SECOND = 26
-"""Frames per second in the time family of selection items (128 frames in about 5 s)."""
+"""Frames that the time family of selection items counts as a second (128 frames in about 5 s)."""
 LETTERS = "ABCD"
 
 SHAPES = ("cube", "sphere", "cylinder")
@@ -33,9 +33,9 @@ FAMILIES = ("event", "time", "window")
 
 @dataclass(frozen=True)
 class SceneObject:
-    """The appearance of an object. No two objects of our own scenes are equal.
+    """The appearance of an object. Objects of a scene that Bullet simulated all look different.
 
-    An attribute that another simulator does not record is empty.
+    An attribute that a release of another simulator does not record is an empty string.
     """
 
     shape: str
@@ -52,25 +52,27 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class Collision:
-    """The first contact of two objects: the first frame at or after the contact, and their
-    indices."""
+    """The first contact of two objects."""
 
     frame: int
+    """The first frame at or after the contact."""
     objects: tuple[int, int]
+    """Indices of the two objects."""
 
 
 @dataclass(frozen=True)
 class Landing:
-    """An object's first contact with the ground after a fall: the first frame at or after the
-    contact, and the object's index."""
+    """An object's first contact with the ground after a fall."""
 
     frame: int
+    """The first frame at or after the contact."""
     object: int
+    """Index of the object."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One simulated video's oracle, F frames of N objects.
+    """The oracle of one simulated video with F frames and N objects.
 
     Attributes:
         positions: (F, N, 3) centres, simulator units, z up.
@@ -79,14 +81,15 @@ class Scene:
         angular_velocities: (F, N, 3) radians per second.
         image_positions: (F, N, 2) projected centres in px of an image of `image_size`, x right
             and y down; defined for every object in front of the camera, on screen or not.
-        in_view: (F, N) whether any part of the object falls inside the image.
-        visible_fraction: (F, N) visible pixels over the pixels the object would cover alone, 0
-            where it covers none; NaN where a simulator's record lacks it.
+        in_view: (F, N) whether a part of the object lies inside the image, even if other objects
+            hide it; in MoVi-A and Physion, whether a part of the object is visible.
+        visible_fraction: (F, N) visible pixels divided by the pixels that the object would cover
+            alone, 0 if it would cover none; NaN where a simulator's record lacks it.
         collisions: first contacts in order of frame.
         image_size: (width, height) of the image plane that `image_positions` refers to.
         fps: frames per second.
-        landings: in order of frame, where a simulator's record contains the ground.
-        scenario: the kind of scene, for a simulator with several.
+        landings: landings in order of frame, for simulators that record contacts with the ground.
+        scenario: the kind of scene, for a simulator with several kinds.
         footage: path of the recorded frames of another simulator's scene, relative to the folder
             of its release; None for a scene that is rendered from its oracle.
     """
@@ -120,21 +123,21 @@ class Scene:
 
 @dataclass(frozen=True)
 class FrameRef:
-    """A frame, identified by its scene and index."""
+    """A reference to a frame by its scene and index."""
 
     scene_id: str
     frame: int
 
     @property
     def name(self) -> str:
-        """The key in logs and caches."""
+        """The frame's key in logs and caches."""
         return f"{self.scene_id}/{self.frame}"
 
 
 @dataclass(frozen=True)
 class Candidate(FrameRef):
-    """One of an item's four frames. Its source is target, same_offset, same_obj_match, same_time,
-    same_near, same_far or cross_scene."""
+    """One of an item's four frames. `source` is `target` or the kind of distractor: same_offset,
+    same_obj_match, same_time, same_near, same_far or cross_scene."""
 
     source: str = "target"
 
@@ -147,7 +150,7 @@ class Record:
 
     @classmethod
     def from_row(cls, row: dict[str, Any]) -> Self:
-        """Raises ValueError where a value is missing or has another type."""
+        """Return a row's record. Raises ValueError if a value is missing or has a wrong type."""
         return _adapter(cls).validate_python(row)
 
 
@@ -162,8 +165,9 @@ def _adapter(record: type[Record]) -> TypeAdapter:
 class SelectionItem(Record):
     """A question with four candidate frames, one of which is the target.
 
-    `prefix_start` and `prefix_stop` are inclusive. `min_displacement` is the smallest displacement
-    between two candidates, px at 336 x 336. A construction axis that does not apply is None.
+    `prefix_start` and `prefix_stop` are inclusive. `answer` is the index of the target among the
+    candidates. `min_displacement` is the smallest displacement between two candidates, px at
+    336 x 336. Fields that do not apply to the item's family are None.
     """
 
     item_id: str
@@ -208,13 +212,19 @@ class SelectionItem(Record):
 
     @property
     def name(self) -> str:
-        """The key in logs and caches."""
+        """The item's key in logs and caches."""
         return self.item_id
 
 
 @dataclass(frozen=True)
 class RetrievalQuery(Record):
-    """A prefix and a question whose answer is one frame of a database."""
+    """A prefix and a question whose answer is one frame of a database.
+
+    `pool` is `future`, or `counterfactual` for queries about the scene without one of its objects.
+    `builder` is the number (1 to 6) of the function that makes future-state queries of this kind;
+    it is None in the counterfactual pool. `anchor` is what the question refers to: time, event or
+    intervention.
+    """
 
     query_id: str
     split: str
@@ -229,11 +239,11 @@ class RetrievalQuery(Record):
     hard_negatives: tuple[FrameRef, ...] = ()
     removed_object: str | None = None
     standard: bool = False
-    """Whether the query belongs to the standard test."""
+    """Whether the query belongs to the standard test, on which retrievers are evaluated."""
 
     @property
     def name(self) -> str:
-        """The key in logs and caches."""
+        """The query's key in logs and caches."""
         return self.query_id
 
 
@@ -255,23 +265,23 @@ class Rationale(Record):
     reasons: tuple[str, ...] = ()
     sections: dict[str, str] = field(default_factory=dict)
     prompt_tokens: int | None = None
-    """Tokens of the prompt; None without a server. Of several responses to one request, only the
-    first has the prompt's tokens."""
+    """Number of prompt tokens; None without a server. If a request has several responses, only the
+    first counts them and the others have 0."""
     completion_tokens: int | None = None
-    """Generated tokens; the responses to one request share their sum evenly."""
+    """Number of generated tokens, as an equal share of the request's total."""
     grammar: str | None = None
     """Version of the grammar that constrained the server; None without a grammar."""
     finished: float | None = None
     """Time of the server's response, seconds since 1970; None without a server."""
     fallback: bool = False
-    """Whether the built-in narrator replaced the teacher, for an item that was set aside."""
+    """Whether the built-in narrator wrote the text because no response of the teacher passed."""
     claims: dict[str, list[int]] = field(default_factory=dict)
-    """Counts of supported, contradicted and undecided claims, by kind of claim."""
+    """Counts of supported, contradicted and unknown claims about the scene, by kind of claim."""
 
 
 def sample_prefix_frames(start: int, stop: int, count: int) -> list[int]:
-    """Sample `count` evenly spaced frames of the inclusive range [start, stop] with both ends.
+    """Sample `count` evenly spaced frames of the inclusive range [start, stop], with both ends.
 
-    A shorter range gives all its frames.
+    All frames are returned if the range has fewer than `count`.
     """
     return [int(f) for f in np.linspace(start, stop, min(count, stop - start + 1)).round()]

@@ -1,4 +1,4 @@
-"""Report a benchmark's statistics, and the accuracy of baselines that do not predict the future."""
+"""Report a benchmark's statistics, and the accuracy of baselines that do not simulate the scene."""
 
 from __future__ import annotations
 

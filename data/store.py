@@ -1,17 +1,20 @@
 """A benchmark on disk.
 
     store/<name>/
-        manifest.json        config, versions, counts, and the SHA-256 of every file below
+        manifest.json        settings, versions, counts, and the SHA-256 of scenes and tables
         scenes/<id>.npz      the oracle of a scene; <id>-without-<k> is simulated without object k
-        selection.parquet retrieval.parquet database.parquet
-        frames/<id>.zip      cache of a scene's rendered frames; not in the manifest
-        embeddings/          cache of embeddings of frames and queries; not in the manifest
-        rationales.jsonl     every response of a teacher; not in the manifest
-        rationales.parquet   accepted rationales of the last narration; not in the manifest
+        selection.parquet retrieval.parquet database.parquet    tables of items, queries, frames
+        frames/<id>.zip      cache of a scene's frames
+        embeddings/          cache of embeddings of frames and queries
+        rationales.jsonl     every response of a teacher
+        rationales.parquet   accepted rationales of the last narration
 
-A build writes to a folder beside the store and renames it when it is complete. Every part is
-written atomically, so that a killed build resumes with the complete parts. Frames are a function of
-the oracle and the renderer, so they can be deleted, and rendered later.
+The manifest does not cover the last four, which may change after the build.
+
+A build writes to the folder `.<name>.partial` beside the store and renames it when the benchmark is
+complete. Every file is written atomically, so that a killed build resumes with the complete files.
+The frames can be deleted at any time: they are rendered again from the oracle, or read again from
+the release of another simulator.
 """
 
 from __future__ import annotations
@@ -48,15 +51,15 @@ CHECKSUM_KEY = "sha256"
 PLAN = "plan.json"
 """Settings of a build in progress; absent from a complete store."""
 PARTS = "parts"
-"""Folder of the results of a build in progress; absent from a complete store."""
+"""Folder of the results of a build's jobs; absent from a complete store."""
 SCENES_FOLDER, FRAMES_FOLDER = "scenes", "frames"
 DATABASES = ("test", "future", "counterfactual")
-"""Databases of frames: the standard test's, and the sources of the future-state and of the
-counterfactual queries. The first is a part of the second."""
+"""Names of the databases of frames: of the standard test, of the future-state queries and of the
+counterfactual queries. Every frame of `test` is also in `future`."""
 
 
 def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
-    """Versions of the code that determines a benchmark's scenes, pixels, items and queries."""
+    """Return the versions of the code that determines scenes, pixels, items and queries."""
     is_rendered, renderer = config["simulator"] == "bullet", RENDERERS[config["renderer"]]
     return {
         "generator": generator_version(config["standin"]),
@@ -66,7 +69,7 @@ def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a complete file or none."""
+    """Write a file so that a killed process leaves either the complete file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -77,7 +80,7 @@ def write_atomically(path: Path, content: bytes) -> None:
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)
-        # The error of a full disk has no file name.
+        # When the disk is full, the error does not name the file.
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
@@ -87,7 +90,7 @@ def scene_path(folder: Path, scene_id: str) -> Path:
 
 
 def part_path(folder: Path, inputs: Any) -> Path:
-    """Path of a job's result in a partial build, which depends on all inputs of the job."""
+    """Path of a job's result in a partial build; its name is a hash of the inputs of the job."""
     key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
     return folder / PARTS / f"{key[:32]}.json"
 
@@ -140,7 +143,7 @@ def hash_file(path: Path) -> str:
 
 
 def hash_files(folder: Path) -> dict[str, str]:
-    """SHA-256 of every scene and table of a store, by relative path."""
+    """SHA-256 of every scene and every parquet file of a store, by relative path."""
     paths = [*(folder / SCENES_FOLDER).glob("*.npz"), *folder.glob("*.parquet")]
     names = sorted(p.relative_to(folder).as_posix() for p in paths)
     with ThreadPoolExecutor(4) as pool:
@@ -148,8 +151,8 @@ def hash_files(folder: Path) -> dict[str, str]:
         return dict(zip(names, hashes, strict=True))
 
 
-def add_checksum(manifest: dict[str, Any]) -> dict[str, Any]:
-    """Add the SHA-256 of a manifest's content to it."""
+def with_checksum(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Return a copy of a manifest with the SHA-256 of its other entries."""
     content = {key: value for key, value in manifest.items() if key != CHECKSUM_KEY}
     return content | {CHECKSUM_KEY: hashlib.sha256(json.dumps(content).encode()).hexdigest()}
 
@@ -167,7 +170,7 @@ class Store:
 
     @property
     def identity(self) -> str:
-        """A short hash of the benchmark's files, renderer and frame size."""
+        """A short hash of the benchmark's scenes, tables, renderer and frame size."""
         config = self.manifest["config"]
         frames = [self.manifest["renderer"], config["width"], config["height"]]
         content = json.dumps([self.manifest["files"], *frames])
@@ -181,24 +184,24 @@ class Store:
 
     @property
     def suite(self) -> str:
-        """The suite of the benchmark's items, controls aside."""
+        """Name of the set of the benchmark's items, except for matched-anchor items."""
         return self.manifest["suite"]
 
     def selection(self, split: str | None = None, suite: str | None = None) -> list[SelectionItem]:
-        """Selection items, by default of the benchmark's own suite."""
+        """Selection items; by default of both splits and of the benchmark's own suite."""
         rows = load_rows(self.folder / "selection.parquet")
         suite = suite or self.suite
         kept = (r for r in rows if split in (None, r["split"]) and r["suite"] == suite)
         return [SelectionItem.from_row(r) for r in kept]
 
     def retrieval(self, split: str | None = None, pool: str = "future") -> list[RetrievalQuery]:
-        """Retrieval queries of a pool, future or counterfactual."""
+        """Retrieval queries of one of the `POOLS`; by default of both splits."""
         rows = load_rows(self.folder / "retrieval.parquet")
         kept = (r for r in rows if split in (None, r["split"]) and r["pool"] == pool)
         return [RetrievalQuery.from_row(r) for r in kept]
 
     def standard_test(self) -> list[RetrievalQuery]:
-        """The queries of the standard test, which are ranked against the database `test`."""
+        """The queries of the standard test; their targets are in the database `test`."""
         return [q for q in self.retrieval("test") if q.standard]
 
     def database(self, name: str = "test") -> list[FrameRef]:
@@ -208,44 +211,49 @@ class Store:
 
 
 cached_scene = lru_cache(maxsize=512)(load_scene)
-"""Reads a scene's oracle and keeps the most recent ones in memory."""
+"""`load_scene` that keeps the most recently used scenes in memory."""
 
 
 def open_store(folder: Path) -> Store:
-    """Open a built benchmark and verify the hash of every file.
+    """Open a built benchmark and verify the hash of every file that its manifest lists.
 
     Raises:
-        UserError: the benchmark is missing, was built by another version, or has a missing or
-            damaged file.
+        UserError: `folder` is not a benchmark, was built by another version of the code, or has a
+            missing or damaged file.
     """
     path = folder / MANIFEST
 
     def refusal(problem: str, code: str) -> UserError:
-        advice = f"delete {folder} and build it again with python -m data.build"
+        advice = f"delete {folder} and build it again with python -m data.build benchmark=NAME"
         return UserError(f"{problem}; {advice}", code=code)
 
     if not path.exists():
-        raise refusal(f"{folder} is not a benchmark: {MANIFEST} is missing", "missing-file")
+        raise UserError(
+            f"{folder} is not a benchmark, because {MANIFEST} is missing: choose another folder, "
+            "or build a benchmark with python -m data.build benchmark=NAME store=FOLDER",
+            code="missing-file",
+        )
     try:
         manifest = json.loads(path.read_text())
         config = manifest["config"]
         current = component_versions(config)
         built = {key: manifest[key] for key in current}
     except (ValueError, TypeError, KeyError) as error:
-        raise refusal(f"{path} cannot be parsed", "damaged-file") from error
+        problem = f"{path} is not a valid manifest (first check that {folder} is a benchmark)"
+        raise refusal(problem, "damaged-file") from error
     for key, version in current.items():
         if built[key] != version:
             raise refusal(
-                f"{folder} was built by {key} version {built[key]}, but this is version {version}",
+                f"{folder} has version {built[key]} of the {key}, but this code has {version}",
                 "different-version",
             )
-    if manifest != add_checksum(manifest):
+    if manifest != with_checksum(manifest):
         raise refusal(f"{path} was changed after the build", "damaged-file")
     expected, actual = manifest["files"], hash_files(folder)
     if missing := expected.keys() - actual.keys():
-        raise refusal(f"{len(missing)} files are missing: {folder / min(missing)}", "missing-file")
+        problem = f"{len(missing)} files are missing, such as {folder / min(missing)}"
+        raise refusal(problem, "missing-file")
     if damaged := [name for name in expected if actual[name] != expected[name]]:
-        raise refusal(
-            f"{len(damaged)} files differ from the manifest: {folder / damaged[0]}", "damaged-file"
-        )
+        problem = f"{len(damaged)} files differ from the manifest, such as {folder / damaged[0]}"
+        raise refusal(problem, "damaged-file")
     return Store(folder, manifest)

@@ -1,5 +1,5 @@
-"""Summarize the finished runs below checkpoints/: tables in the paper's shape, and a page with
-figures and a browser of items that opens without a network."""
+"""Summarize the finished runs below checkpoints/: tables in the layout of the paper's, and a page
+with figures and a browser of items. The page opens without a network."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def main(cfg: ReportCommand, run: Run) -> None:
     tables = [table for section in sections for table in section.tables]
     text = "\n\n".join(str(table) for table in tables if not table.folded)
 
-    # A report that fails leaves the previous one unchanged.
+    # All files are rendered before the first is written: an error leaves the previous report as is.
     files = {
         "report.txt": text + "\n",
         PAGE: render_page(sections, browser, [r.title for r in runs]),

@@ -1,4 +1,5 @@
-"""Measure a retriever: rank all frames of the test database for each test query and width."""
+"""Measure a retriever and its untrained base: for each query of the standard test and each width,
+rank all frames of the test database."""
 
 from __future__ import annotations
 
@@ -19,18 +20,18 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
     preset, store, embedders = open_retriever(cfg, run)
     queries, database = standard_test.load_standard_test(store)
-    names = [f.name for f in database]
+    frame_names = [f.name for f in database]
     rows, ranks = [], {}
     for embedder in embedders:
         query_embeddings = embedder.embed_queries(queries)
-        embeddings = embedder.embed_frames(database)
+        frame_embeddings = embedder.embed_frames(database)
         name = embedder.name
-        log.info("ranking %s frames with %s", f"{len(names):,}", name)
+        log.info("ranking %s frames with %s", f"{len(frame_names):,}", name)
         ranks[name] = standard_test.rank_targets(
             preset,
             query_embeddings.rows([q.query_id for q in queries]),
-            embeddings.rows([q.target.name for q in queries]),
-            embeddings.parts(names),
+            frame_embeddings.rows([q.target.name for q in queries]),
+            frame_embeddings.parts(frame_names),
         )
         rows += results.retrieval_results(store.name, name, ranks[name], queries, cfg.seed)
 
@@ -39,7 +40,8 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     standard_test.write_ranks(run.folder, ranks, queries)
     entries = {"build": store.identity, "differences": differences}
     standard_test.write_report(run.folder, rows, extra, **entries)
-    return {name: of.value for name, of in rows[0].measures.items() if name != "tie_rate"}
+    # The first row has the first retriever's measures over all queries, at its widest width.
+    return {name: m.value for name, m in rows[0].measures.items() if name != "tie_rate"}
 
 
 if __name__ == "__main__":

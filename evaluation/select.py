@@ -1,4 +1,4 @@
-"""Measure a student or a base on the selection track's test items, locally or on servers."""
+"""Measure a student or a base on the test items of the selection track, locally or on servers."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.select", SelectCommand)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import check_modes, modes_of, resolve_model
+    from models.trained_runs import check_modes, modes_of_regime, resolve_model
 
     folder, trained = resolve_model(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     student, regime = trained.student, trained.train.regime
-    # By default the modes that the student was trained in, or both record modes of a base.
-    trained_modes = ["record", "constrained"] if folder is None else modes_of(regime)
-    modes = cfg.modes or trained_modes or ["answer"]
+    # By default, a base is measured in both record modes, a student in the modes of its training.
+    # check_modes refuses a student that was trained in none.
+    default_modes = ["record", "constrained"] if folder is None else modes_of_regime(regime)
+    modes = cfg.modes or default_modes or ["answer"]
     if folder is not None:
         check_modes(folder, regime, modes)
 
@@ -41,17 +42,18 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = FrameReader(store, student.image_size)
     model = base.open_generator(cfg, folder, trained)
-    answers, keys, runs = {}, {}, Path(cfg.checkpoints, "select")
-    # To measure a control's effect, the unchanged items are needed too.
+    answers, keys, runs_folder = {}, {}, Path(cfg.checkpoints, "select")
+    # The results under a control are compared with those on the unchanged items.
     for control in dict.fromkeys([None, cfg.control]):
         settings = {
             mode: base.response_settings(
-                mode, regime, student, cfg.seed, model.revision, store.identity, control
+                mode, regime, student, cfg.seed, model.identity, store.identity, control
             )
             for mode in modes
         }
         responses = response_log.ResponseLog(run.folder / "answers.jsonl", settings, items)
-        if cfg.control and (count := responses.add_from(sorted(runs.glob("**/answers.jsonl")))):
+        other_logs = sorted(runs_folder.glob("**/answers.jsonl")) if cfg.control else []
+        if count := responses.add_from(other_logs):
             log.info("reusing %d answers from other runs of this model", count)
         for mode in modes:
             log.info("measuring %s in %s mode, control %s", model.name, mode, control or "none")
@@ -79,7 +81,11 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 def select_items(
     store: Store, suite: str | None, limit: int | None, seed: int
 ) -> list[SelectionItem]:
-    """Return the test items of a suite, at most `limit`; raise UserError if there are none."""
+    """Return the test items of a suite (None for the benchmark's own), reduced by `limit_items`.
+
+    Raises:
+        UserError: The benchmark has no such items.
+    """
     from data.tracks.controls import MATCHED_ANCHOR
 
     items = store.selection("test", suite)
@@ -87,17 +93,17 @@ def select_items(
         problem = f"{store.folder} has no test items of the {suite or store.suite} suite"
         if suite == MATCHED_ANCHOR:
             problem += (
-                ": set benchmark.selection.matched.test, or choose a benchmark with pairs, such as "
-                "benchmark=small"
+                ": set benchmark.selection.matched.test, or choose a benchmark with matched-anchor "
+                "pairs, such as benchmark=small"
             )
         raise UserError(problem, code="no-items")
     return limit_items(items, limit, seed)
 
 
 def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> list[SelectionItem]:
-    """Return `limit` random items, evenly over the families, or all items if `limit` is None.
+    """Return a random sample of `limit` items, or all items if `limit` is None.
 
-    Matched-anchor pairs stay whole.
+    The sample is spread evenly over the families, or consists of `limit // 2` matched-anchor pairs.
     """
     import numpy as np
 

@@ -1,4 +1,5 @@
-"""Measure a retriever on the selection track: it chooses the candidate nearest to the query."""
+"""Measure a retriever and its untrained base on the selection track: they choose the candidate with
+the highest similarity to the prefix and the question."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Measure two-stage retrieval: a model describes the future frame of each query, and a frozen
-encoder matches the text to the whole test database."""
+"""Measure two-stage retrieval: a model describes the future frame of each query in text, and a
+frozen encoder, the matcher, ranks the test database by similarity to this text."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     matcher_folder, matcher_settings = resolve_model(
         cfg.matcher, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides, "matcher.model"
     )
-    # The paper's routes: a student's rationale, or all three of a base.
+    # As in the paper: the rationales of a student, or all three routes for a base.
     routes = cfg.routes or (["cot_text"] if cfg.model is not None else list(ROUTES))
     check_routes(routes, folder, trained.train.regime, matcher_settings)
 
@@ -49,16 +49,16 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     sample_of = partial(text_sample, FrameReader(store, student.image_size), student.frames)
     model = open_generator(cfg, folder, trained)
     name = model.name
-    log.info("collecting texts of %s", name)
+    log.info("collecting the texts of %s", name)
     chosen = [text_matching.ROUTES[key] for key in routes]
-    responses = text_matching.write_texts(
+    responses = text_matching.collect_texts(
         cfg, student, model, sample_of, chosen, queries, database, store
     )
     texts = {
-        mode: {r.item_id: text_matching.future_text(r.text) for r in of_mode}
-        for mode, of_mode in responses.items()
+        mode: {r.item_id: text_matching.future_text(r.text) for r in mode_responses}
+        for mode, mode_responses in responses.items()
     }
-    # Free the memory for the matcher.
+    # The matcher needs the memory that the model occupies.
     del model
 
     rows, matched, metrics = [], [], {}
@@ -68,25 +68,20 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         title = f"{name} {route.title}, {matcher.name.removeprefix(results.UNTRAINED).strip()}"
         route_rows = results.retrieval_results(store.name, title, ranks, queries, cfg.seed)
         rows += route_rows
-        # At the widest width; a miss has the last rank.
+        # Ranks at the widest width; a query without a rank (a miss) gets the last one.
         counts = ranks.greater[0], ranks.tied[0], ranks.found
-        places = query_metrics(*counts, ranks.frames, ())["median_rank"].tolist()
+        target_ranks = query_metrics(*counts, ranks.frames, ())["median_rank"].tolist()
         matched += [
-            {"query_id": q.query_id, "route": key, "text": texts[route.mode][q.name], "rank": place}
-            for q, place in zip(queries, places, strict=True)
+            {"query_id": q.query_id, "route": key, "text": texts[route.mode][q.name], "rank": rank}
+            for q, rank in zip(queries, target_ranks, strict=True)
         ]
         measures = route_rows[0].measures
-        metrics |= {f"{key}_{m}": i.value for m, i in measures.items() if m != "tie_rate"}
+        metrics |= {f"{key}_{m}": v.value for m, v in measures.items() if m != "tie_rate"}
 
-    counts = {mode: text_matching.count_texts(of_mode) for mode, of_mode in responses.items()}
-    standard_test.write_report(
-        run.folder,
-        rows,
-        [tables.parsing_table(counts)],
-        "two_stage",
-        build=store.identity,
-        texts=counts,
-    )
+    text_counts = {mode: text_matching.count_texts(found) for mode, found in responses.items()}
+    extra = [tables.parsing_table(text_counts)]
+    entries = {"build": store.identity, "texts": text_counts}
+    standard_test.write_report(run.folder, rows, extra, "two_stage", **entries)
     write_json_lines(run.folder / "matched.jsonl", matched)
     return metrics
 
@@ -94,19 +89,20 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
 def check_routes(
     routes: list[str], folder: Path | None, regime: str, matcher: ContrastiveCommand
 ) -> None:
-    """Raise UserError if the matcher cannot embed texts, or the student writes no rationale."""
-    from models.trained_runs import modes_of
+    """Raise UserError if the matcher cannot match texts, or if `cot_text` is among the routes of a
+    student that was not trained to write rationales."""
+    from models.trained_runs import modes_of_regime
 
     if matcher.retriever.late is not None:
         raise UserError(
-            "a late-interaction matcher (retriever.late) scores only tokens of images and clips, "
-            "and cannot match a text: choose another matcher",
+            "a late-interaction matcher (retriever.late) cannot embed a text without an image or a "
+            "clip: choose another matcher",
             code="unsupported-matcher",
         )
-    if folder is not None and "cot_text" in routes and "reasoning" not in modes_of(regime):
+    if folder is not None and "cot_text" in routes and "reasoning" not in modes_of_regime(regime):
         raise UserError(
-            f"model={folder} writes no rationale (train.regime={regime}): remove cot_text from "
-            "routes",
+            f"model={folder} was not trained to write rationales (train.regime={regime}): remove "
+            "cot_text from routes",
             code="unsupported-route",
         )
 

@@ -1,5 +1,5 @@
 import logging
 
-# bitsandbytes warns at its import that a CPU kernel for inference is missing. Training does not use
-# it: the kernel passes no gradient on.
+# bitsandbytes warns when it is imported that a CPU kernel for inference is missing. This kernel is
+# not needed: it passes no gradient on, so training could not use it.
 logging.getLogger("bitsandbytes.backends.cpu.ops").setLevel(logging.ERROR)

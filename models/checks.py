@@ -1,4 +1,4 @@
-"""Checks that a base, its processor and the parts that were trained over it fit together."""
+"""Checks that a base, its processor, its adapters and a retriever's other modules fit together."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ PROCESSOR_FIELDS = {
     "image_token_id": "image_token_id",
     "video_token_id": "video_token_id",
 }
-"""Fields of a processor, and what they equal in the configuration of its model."""
+"""Fields of a processor, and the fields of the model's configuration that they must equal."""
 SINGLE_VECTOR_MODULES = ("Transformer", "Pooling", "Normalize")
-"""Modules of a retriever with one vector, of which only the first is trained."""
+"""Types of the modules of a single-vector retriever, of which only the first has weights."""
 POOLING = "lasttoken"
-"""The library's name for the pooling of a retriever with one vector."""
+"""Sentence-transformers' name of the pooling of a single-vector retriever."""
 
 
-def check_tower(model: str, config: PreTrainedConfig) -> None:
+def check_vision_tower(model: str, config: PreTrainedConfig) -> None:
     """Raise UserError if a student's base has no vision tower."""
     if getattr(config, "vision_config", None) is None:
         raise UserError(
@@ -60,13 +60,13 @@ def check_processor(
 
 
 def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
-    """Return how a processor differs from what a model needs, or None."""
+    """Return how a processor differs from what the model needs, or None if it fits."""
     try:
-        tokens, known = len(processor.tokenizer), config.get_text_config().vocab_size
-        if tokens > known:
-            return f"its tokenizer has {tokens} tokens, the model {known}"
-        for field, own in PROCESSOR_FIELDS.items():
-            actual, expected = attrgetter(field)(processor), attrgetter(own)(config)
+        tokens, embedded = len(processor.tokenizer), config.get_text_config().vocab_size
+        if tokens > embedded:
+            return f"its tokenizer has {tokens} tokens, the model {embedded}"
+        for field, config_field in PROCESSOR_FIELDS.items():
+            actual, expected = attrgetter(field)(processor), attrgetter(config_field)(config)
             if actual != expected:
                 return f"its {field} is {actual}, the model's {expected}"
     except AttributeError as error:
@@ -75,16 +75,16 @@ def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
 
 
 def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) -> None:
-    """Check that the adapters in a folder, if there are any, fit a base and a rank.
+    """Check that the adapters in a folder, if there are any, have the given rank and fit a base.
 
     Args:
-        base: The model itself, with or without adapters.
-        rank: student.lora.rank.
-        model: student.model.
+        base: The loaded base, with or without adapters.
+        rank: The value of student.lora.rank.
+        model: The value of student.model, for the error message.
 
     Raises:
-        UserError: the adapters belong to another base or rank.
-        SafetensorError: the file is damaged.
+        UserError: The adapters have another rank or were trained on another base.
+        SafetensorError: The file of the adapters is damaged.
     """
     if not (path := folder / "adapter_model.safetensors").exists():
         return
@@ -97,7 +97,7 @@ def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) 
         own_rank, width = shape if side.startswith("A") else reversed(shape)
         if own_rank != rank:
             raise UserError(
-                f"{folder} has adapters of rank {own_rank}, and student.lora.rank is {rank}: set "
+                f"{folder} has adapters of rank {own_rank}, but student.lora.rank is {rank}: set "
                 f"student.lora.rank={own_rank}, or train another run (run=NAME)",
                 code="other-rank",
             )
@@ -107,15 +107,14 @@ def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) 
             difference = f"has width {width}, not {actual}" if module else "does not exist"
             raise UserError(
                 f"{folder} has adapters of another base than {model} ({adapted} {difference}): "
-                "give the base that they were trained over with student.model=FOLDER, or train "
-                "again",
+                "set student.model to the base that they were trained on, or train again",
                 code="other-base",
             )
 
 
-def check_family(model: str, config: PreTrainedConfig) -> None:
-    """Raise UserError if a retriever's base is not a Qwen3-VL, whose masks, positions and features
-    the trainer relies on."""
+def check_is_qwen3_vl(model: str, config: PreTrainedConfig) -> None:
+    """Raise UserError if a retriever's base is not a Qwen3-VL, on whose attention masks, positions
+    and vision features the trainer relies."""
     if config.model_type != "qwen3_vl":
         raise UserError(
             f"retriever.model={model} is a {config.model_type}; retriever.encoder=qwen3_vl loads "
@@ -125,14 +124,15 @@ def check_family(model: str, config: PreTrainedConfig) -> None:
 
 
 def check_modules(saved: str | Path, revision: str | None = None, late: bool = False) -> None:
-    """Check the modules after the backbone of a saved retriever.
+    """Check that a saved retriever is only a backbone, last-token pooling and normalisation.
 
     Args:
-        late: Whether it is the base of a retriever with many vectors, whose pooling is not used.
+        saved: Folder of the retriever, or its name on the hub.
+        late: Whether it is the base of a multi-vector retriever, which ignores its pooling.
 
     Raises:
-        UserError: they have trained weights, which a retriever trained over this one would lose; or
-            they do not pool the last token; or the list of the modules is damaged.
+        UserError: The retriever has other modules, whose weights would be lost if it were used as a
+            base; or it does not pool the last token; or the list of its modules is damaged.
     """
     from sentence_transformers.sentence_transformer.modules import Pooling
     from sentence_transformers.util import load_file_path
@@ -153,8 +153,8 @@ def check_modules(saved: str | Path, revision: str | None = None, late: bool = F
         ) from error
     if lost := [kind for kind in paths if kind not in SINGLE_VECTOR_MODULES]:
         raise UserError(
-            f"{saved} has modules after its backbone that a retriever trained over it would lose "
-            f"({', '.join(lost)}): give a base, or measure it as the run that trained it "
+            f"{saved} has modules after its backbone that would be lost if it were used as a base "
+            f"({', '.join(lost)}): give another base, or evaluate the run that trained it "
             "(model=RUN)",
             code="unsupported-model",
         )
@@ -162,17 +162,17 @@ def check_modules(saved: str | Path, revision: str | None = None, late: bool = F
         actual = f"with {pooling} pooling" if pooling else "without pooling"
         raise UserError(
             f"{saved} was saved {actual}, but embeddings are taken from the last token "
-            f"({POOLING}): give a run of train.contrastive or a Qwen3-VL-Embedding",
+            f"({POOLING}): give a run of train.contrastive or a Qwen3-VL-Embedding model",
             code="unsupported-model",
         )
 
 
 def check_widths(cfg: RetrieverConfig, entries: int) -> None:
-    """Raise UserError if a retriever's widest width exceeds the entries of its embeddings."""
+    """Raise UserError if a retriever's widest width exceeds its embeddings' number of entries."""
     if cfg.widths[0] > entries:
         fitting = ",".join(str(w) for w in cfg.widths if w <= entries) or entries
         raise UserError(
-            f"retriever.widths has {cfg.widths[0]}, but the embeddings of {cfg.name} have "
-            f"{entries} entries: set retriever.widths=[{fitting}]",
+            f"retriever.widths has the width {cfg.widths[0]}, but the embeddings of {cfg.name} "
+            f"have {entries} entries: set retriever.widths=[{fitting}]",
             code="too-wide",
         )

@@ -1,23 +1,23 @@
-"""Every private or version-dependent part of the libraries that the project relies on.
+"""Functions that rely on private or version-dependent parts of libraries ("hooks").
 
-Each hook was checked with torch 2.14 to 2.15, transformers 5.17 to 5.23, peft 0.19 to 0.21.2,
+All hooks were checked with torch 2.14 to 2.15, transformers 5.17 to 5.23, peft 0.19 to 0.21.2,
 accelerate 1.12 to 1.15, sentence-transformers 6.0 to 6.2 and bitsandbytes 0.49 to 0.50.2, unless
-its docstring says otherwise. `pyproject.toml` excludes later versions; before it is raised,
+a docstring says otherwise. `pyproject.toml` excludes later versions. Before it admits them,
 tests/models/test_compat.py, which has one test per hook, must pass with them.
 
-Hooks that are used through subclasses or inputs, outside of this file:
+Hooks in other modules, which subclass a library's classes or depend on how it passes its inputs:
 
 - `models.lora_kernels` swaps the class of peft's `Linear` and `Linear4bit` layers, registers a
   `LoraVariant` in their `lora_variant`, and overrides `_cast_input_dtype`.
-- `models.attention` registers a function whose name contains "flash": Qwen3-VL's vision tower
-  passes all frames at once, with `cu_seq_lens_q` and `max_length_q`, only to those.
+- `models.attention` registers a function whose name contains "flash", because Qwen3-VL's vision
+  tower then passes all frames in one call, with `cu_seq_lens_q` and `max_length_q`.
 - `train.common.training_loop` calls `Trainer._load_from_checkpoint`, which also reads the parts of
   an FSDP checkpoint.
 - `models.retriever.multi_vector` loads with `MultiVectorEncoder._load_with_module_classes`.
 - `train.retriever.trainer` overrides `_load_from_checkpoint`, `_load_best_model`,
   `get_batch_sampler` and `collect_features`.
-- `train.retriever.inputs` adds a model's input in a forward pre-hook, which
-  sentence-transformers' `Transformer` passes on to the backbone.
+- `train.retriever.inputs` adds an input in a forward pre-hook of sentence-transformers'
+  `Transformer`, which passes it on to its model.
 - `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer.
 """
 
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
 
 def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
-    """Return the arguments of TrainingArguments that recompute activations in the backward pass.
+    """Return the arguments of TrainingArguments for recomputing activations in the backward pass.
 
-    transformers renamed them: gradient_checkpointing to 5.22, activation_checkpointing since 5.23.
+    The name is gradient_checkpointing up to transformers 5.22, activation_checkpointing from 5.23.
     """
     if not enabled:
         return {}
@@ -52,11 +52,13 @@ def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
 def encode_images(
     model: PreTrainedModel, pixels: torch.Tensor, grid: torch.Tensor, bf16: bool
 ) -> list[torch.Tensor]:
-    """Return (layers, tokens, hidden) for each image: the merged output of Qwen3-VL's vision tower,
-    then those of the deepstack. The tower encodes a clip as the images of its pairs of frames.
+    """Return the outputs of Qwen3-VL's vision tower for each image or pair of a clip's frames.
 
     Args:
         bf16: Whether the tower computes in bf16.
+
+    Returns:
+        (1 + deepstack layers, tokens, hidden) tensors: the merged output, then the deepstack's.
     """
     with torch.no_grad(), torch.autocast(pixels.device.type, torch.bfloat16, enabled=bf16):
         outputs = model.get_image_features(pixels, grid)
@@ -65,8 +67,8 @@ def encode_images(
 
 
 def encoder_outputs(layers: Iterable[torch.Tensor]) -> BaseModelOutputWithDeepstackFeatures:
-    """Return the vision tower's outputs for a kind of media as Qwen3-VL's `forward` takes them in
-    `mm_encoder_outputs`."""
+    """Return the vision tower's outputs for images or clips as an entry of `mm_encoder_outputs`,
+    which Qwen3-VL's `forward` takes instead of pixels. `layers` are as in `encode_images`."""
     from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
     merged, *deepstack = layers
@@ -78,9 +80,9 @@ def encoder_outputs(layers: Iterable[torch.Tensor]) -> BaseModelOutputWithDeepst
 def keep_differentiable(model: nn.Module) -> None:
     """Keep bitsandbytes from repacking 4-bit weights on a CPU with AVX-512 BF16.
 
-    It repacks them at the first evaluation, unless a layer's `support_avx512bf16_for_cpu` is false,
-    and repacked weights pass no gradient on: every later step would train only a part of the model,
-    without an error.
+    It repacks a layer's weights in the first evaluation, unless the layer's
+    `support_avx512bf16_for_cpu` is false. Repacked weights pass no gradient on, so all later steps
+    would train only a part of the model, without an error.
     """
     for module in model.modules():
         if hasattr(module, "support_avx512bf16_for_cpu"):
@@ -88,9 +90,10 @@ def keep_differentiable(model: nn.Module) -> None:
 
 
 def four_bit_entries(parameter: nn.Parameter) -> int | None:
-    """Return how many entries a 4-bit parameter of bitsandbytes stands for, None for others.
+    """Return the number of weights in a 4-bit parameter of bitsandbytes; None for other parameters.
 
-    The weights are packed as they are loaded; on the meta device they keep their own shape.
+    Loading packs the weights, two in a byte. On the meta device, the parameter keeps the shape that
+    the weights have before packing.
     """
     if type(parameter).__name__ != "Params4bit":
         return None
@@ -102,8 +105,8 @@ def four_bit_entries(parameter: nn.Parameter) -> int | None:
 def keep_freed_memory() -> None:
     """Let glibc keep the memory of large tensors between steps.
 
-    By default it returns each block to the kernel at once, and page faults take half of the time of
-    a training step on a CPU.
+    By default, glibc returns each freed block to the kernel at once, and page faults take half of
+    the time of a training step on a CPU.
     """
     if not sys.platform.startswith("linux"):
         return

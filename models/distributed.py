@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 @contextmanager
 def main_first() -> Iterator[None]:
-    """Run a block on the main rank first; the others wait as long as it takes, then run it too.
+    """Run a block on the main rank first, and on the other ranks after the main rank has finished.
 
-    Work whose result is kept on disk is thus done once.
+    Work whose result the main rank writes to disk is thus done only once.
     """
     if world_size() == 1:
         yield
@@ -27,7 +27,7 @@ def main_first() -> Iterator[None]:
     from torch import distributed
 
     rank_device()
-    # The default group has a timeout for the steps of training, which preparations may exceed.
+    # The timeout of the default group suits training steps; preparations may take longer.
     group = distributed.new_group(backend="gloo", timeout=timedelta(days=30))
     if rank() > 0:
         distributed.barrier(group)
@@ -38,7 +38,7 @@ def main_first() -> Iterator[None]:
 
 
 def rank_device() -> torch.device:
-    """Return this rank's GPU, or the CPU; the first call connects the ranks."""
+    """Return this rank's GPU, or the CPU. The first call initialises torch.distributed."""
     import torch
     from accelerate import PartialState
 
@@ -46,10 +46,10 @@ def rank_device() -> torch.device:
 
 
 def split_batch(batch: int, micro_batch: int = 1) -> int:
-    """Return how many micro-batches each rank takes of a step of `batch` samples over all ranks.
+    """Return the number of micro-batches per rank of a step of `batch` samples over all ranks.
 
     Raises:
-        UserError: not all of them would be full.
+        UserError: The batch cannot be split into full micro-batches, equally many on each rank.
     """
     samples = micro_batch * world_size()
     if batch % samples:
@@ -57,7 +57,7 @@ def split_batch(batch: int, micro_batch: int = 1) -> int:
         raise UserError(
             f"train.batch={batch} cannot be split over {world_size()} ranks{parts}: set "
             f"train.batch to a multiple of {samples}, such as "
-            f"{max(1, round(batch / samples)) * samples}, or start another number of ranks",
+            f"{max(1, round(batch / samples)) * samples}, or change the number of ranks",
             code="uneven-batch",
         )
     return batch // samples

@@ -1,7 +1,7 @@
-"""Digests of a model's weights and processor, and the commits of models from the hub.
+"""Identify models: digests of weights and processors in folders, commits of models on the hub.
 
-A measurement or a resumed run is only valid for the model that it began with. A folder is
-identified by a digest of its files, a model of the hub by its name and commit.
+Stored results and checkpoints may only be used with the model that produced them. A folder is
+identified by a digest of its files, a model on the hub by its name and commit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from conf.schema import RetrieverConfig, StudentConfig
 Preset = TypeVar("Preset", StudentConfig, RetrieverConfig)
 
 BLOCK = 1 << 12
-"""Bytes of each tensor that enter the digest."""
+"""Number of bytes of each tensor that are hashed."""
 PROCESSOR_FILES = (
     "*processor_config.json",
     "*token*.json",
@@ -29,21 +29,21 @@ PROCESSOR_FILES = (
     "tokenizer.model",
     "vocab.*",
 )
-"""Files that define how text and pixels become a model's input."""
+"""Patterns of the files that define how text and pixels become a model's input."""
 
 
 def settings_key(settings: Any) -> str:
-    """Return a short hash of settings as JSON: the name under which their results are stored."""
+    """Return a short hash of settings, under which results with these settings are stored."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def weights_digest(*models: str | Path | None) -> str:
     """Return a short hash of the weights of several models.
 
-    A folder contributes the name and size of each safetensors file, the names and shapes of its
-    tensors, and a block from the middle of each tensor: training or merging changes every entry of
-    a tensor, so a block suffices. The folder's location does not matter. The name of a hub model
-    (with or without its commit) contributes as a string.
+    Of a folder, the hash covers the name and size of each safetensors file, the names and shapes of
+    its tensors, and a block from the middle of each tensor. A block suffices, because training and
+    merging change every entry of a tensor. The folder's location does not matter. Of a hub model,
+    the hash covers only the name (with the commit, if given).
     """
     whole = hashlib.sha256()
     for k, model in enumerate(models):
@@ -76,8 +76,8 @@ def _hash_tensors(file: BinaryIO, whole: Any) -> None:
 
 
 def processor_digest(model: str | Path | None) -> str:
-    """Return a short hash of a folder's tokenizer, processor and chat template files. The name of a
-    hub model is hashed as a string."""
+    """Return a short hash of the files of a folder's tokenizer, processor and chat template. Of a
+    hub model, only the name is hashed."""
     whole = hashlib.sha256()
     if model is None or not Path(model).is_dir():
         whole.update(f"{model}".encode())
@@ -89,11 +89,11 @@ def processor_digest(model: str | Path | None) -> str:
 
 
 def pin_revisions(cfg: Preset) -> Preset:
-    """Return a preset whose hub models have their current commit as revision.
+    """Return a preset in which the revisions of hub models (branches, tags or None) are commits.
 
-    The owner of a hub model can replace its weights under the same name. A commit in the local
-    cache takes precedence. If no commit can be determined the preset is returned unchanged, and
-    loading the model reports the reason.
+    The owner of a hub model can change what a branch or tag refers to. The commit comes from the
+    local cache or, if the model is not cached, from the hub. A revision whose commit cannot be
+    determined stays unchanged, and loading the model reports the reason.
     """
     commits = {}
     for model, revision in (("model", "revision"), ("image_model", "image_revision")):
@@ -108,11 +108,12 @@ def pin_revisions(cfg: Preset) -> Preset:
 
 
 def find_commit(model: str, revision: str | None = None) -> str:
-    """Return the commit of a hub model, in the local cache or else on the hub, with one request
-    (the libraries would retry for minutes).
+    """Return the commit of a hub model from the local cache or, if it is not cached, from the hub.
+
+    The hub gets a single request, whereas loading a model would retry for minutes.
 
     Raises:
-        Exception: the model is in neither, or the hub cannot be reached.
+        Exception: The model is neither in the cache nor on the hub, or the hub cannot be reached.
     """
     from huggingface_hub import model_info, try_to_load_from_cache
 
@@ -126,10 +127,10 @@ def find_commit(model: str, revision: str | None = None) -> str:
 
 
 def is_hub_model(model: str | None) -> bool:
-    """Whether a preset's model comes from the hub, not from a folder or from an architecture."""
+    """Whether `model` is a name on the hub: neither None (a built model) nor an existing folder."""
     return model is not None and not Path(model).is_dir()
 
 
 def model_id(model: str | None, revision: str | None) -> str | None:
-    """Return the folder of a model, or NAME@COMMIT of the hub."""
+    """Return NAME@REVISION for a hub model with a revision; otherwise `model` itself."""
     return f"{model}@{revision}" if is_hub_model(model) and revision else model

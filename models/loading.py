@@ -1,4 +1,4 @@
-"""Load a student with its base, 4-bit weights and adapters, and save what was trained."""
+"""Load students: bases, quantised or not, with or without adapters. Save trained students."""
 
 from __future__ import annotations
 
@@ -26,22 +26,23 @@ from transformers.utils import logging as transformers_logging
 from conf.errors import UserError
 from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
 from models.attention import choose_attention
-from models.checks import check_adapters, check_processor, check_tower
+from models.checks import check_adapters, check_processor, check_vision_tower
 from models.compat import keep_differentiable
 from models.fingerprints import find_commit
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
 UNQUANTIZED = ["model.visual", "visual", "lm_head"]
-"""Modules that are not quantised. Names match from their start: the tower has the first in a
-generative model, the second in a bare one."""
+"""Prefixes of the names of modules that are not quantised. The vision tower is model.visual in a
+generative model, and visual in a model without a language head."""
 DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, SafetensorError)
-"""Errors of the libraries for files that are missing, cut off or of another kind."""
+"""Errors that libraries raise for files that are missing, truncated or of another kind."""
 
 Corpus = Callable[[], Iterable[str]]
+"""Returns the texts on which the tokenizer of a built model is trained."""
 
-# Loading a model's shards takes moments, and peft uses a name that transformers deprecates.
+# Progress bars for a model's shards are noise, and peft uses a name that transformers deprecates.
 transformers_logging.disable_progress_bar()
 warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
 
@@ -49,13 +50,13 @@ warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
 def load_base(
     cfg: StudentConfig, precision: str, corpus: Corpus
 ) -> tuple[PreTrainedModel, ProcessorMixin]:
-    """Load the base that a preset names, or build it from a seed, with its processor.
+    """Load the base that a preset names and its processor, or build them from its architecture.
 
     Args:
-        corpus: Returns the texts that a built model's tokenizer is trained on.
+        corpus: Only called if the base is built.
 
     Raises:
-        UserError: the model is neither a local folder nor in the hub's cache and cannot be
+        UserError: The model is neither a local folder nor in the hub's cache and cannot be
             downloaded, it has no vision tower, or its processor belongs to another model.
     """
     if cfg.architecture is not None:
@@ -67,7 +68,7 @@ def load_base(
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     with explain_unloadable("student", cfg.model):
         config = AutoConfig.from_pretrained(cfg.model, **origin)
-        check_tower(cfg.model, config)
+        check_vision_tower(cfg.model, config)
         processor = AutoProcessor.from_pretrained(cfg.model, **origin)
         check_processor("student", cfg.model, config, processor)
         model = AutoModelForImageTextToText.from_pretrained(
@@ -82,8 +83,9 @@ def load_base(
 def weight_options(cfg: StudentConfig | RetrieverConfig, precision: str) -> dict[str, Any]:
     """Return the arguments of `from_pretrained` for the weights of a preset.
 
-    Weights are fp32 if all of them are trained: autocast computes in lower precision. Otherwise
-    they have the given precision, or 4 bits if the preset quantises the base.
+    If the whole model is trained, its weights are fp32; in bf16, autocast casts them for each
+    operation. Otherwise the base's weights are 4-bit or, if the preset does not quantise them, in
+    the given precision.
     """
     trains_all = cfg.quantization == "none" and cfg.lora.rank == 0
     dtype = torch.float32 if trains_all else DTYPES[precision]
@@ -94,7 +96,8 @@ def weight_options(cfg: StudentConfig | RetrieverConfig, precision: str) -> dict
 
 
 def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
-    """Return 4-bit NF4 for the language tower; vision tower and head keep their precision."""
+    """Return a configuration that quantises the language tower, but not its head, to 4-bit NF4.
+    Computations dequantise the weights to the type `compute`."""
     return BitsAndBytesConfig(
         load_in_4bit=True,
         bnb_4bit_quant_type="nf4",
@@ -104,15 +107,15 @@ def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
 
 
 def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
-    """Resize frames of image_size x image_size px to the nearest size on the tower's grid, in
-    images and in videos of up to `frames` alike.
+    """Make a processor resize frames to one size in images and in videos of up to `frames` frames.
 
-    By default a video is shrunk to a pixel budget that images do not have, and one frame gets two
-    sizes.
+    It is the multiple of the patch size nearest to image_size x image_size px. By default, a video
+    has another pixel budget than an image, and one frame could get two sizes.
     """
     step = processor.image_processor.patch_size * processor.image_processor.merge_size
     edge = round(image_size / step) * step
-    # Twice the pixels of the frames: the budget then shrinks no video with an odd number of them.
+    # Both edges are numbers of pixels. A video gets twice the pixels of its frames: then it is not
+    # shrunk if its number of frames is odd and the processor pads it.
     budgets = ((processor.image_processor, 1), (processor.video_processor, 2 * frames))
     for part, images in budgets:
         part.size = {"shortest_edge": step * step, "longest_edge": images * edge * edge}
@@ -123,9 +126,9 @@ def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
 def load_student(
     cfg: StudentConfig, precision: str, corpus: Corpus
 ) -> tuple[nn.Module, ProcessorMixin]:
-    """Load a student to train: its base, with adapters if the preset has them."""
+    """Load a student for training: its base, with new adapters if the preset has adapters."""
     base, processor = load_base(cfg, precision, corpus)
-    # Each tower has its own setting.
+    # The language tower has its own setting.
     base.config.use_cache = base.config.get_text_config().use_cache = False
     keep_differentiable(base)
     return (add_adapters(base, cfg.lora) if cfg.lora.rank else base), processor
@@ -134,10 +137,10 @@ def load_student(
 def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
     """Freeze the base and add LoRA to the projections of its language tower.
 
-    Adapters are fp32 even over a bf16 base: updates of their size vanish in bf16's rounding.
+    Adapters are fp32 even on a bf16 base, because updates of their size vanish in bf16's rounding.
 
     Raises:
-        UserError: the pattern is invalid or matches no module that can be adapted.
+        UserError: `lora.targets` is an invalid pattern or matches no module that can be adapted.
     """
     import peft
 
@@ -148,10 +151,11 @@ def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
 
 @contextmanager
 def lora_config(group: str, lora: LoraConfig, task_type: str | None = None) -> Iterator[Any]:
-    """Yield peft's settings of adapters.
+    """Yield peft's configuration of adapters, for adding them to a model in the block.
 
     Raises:
-        UserError: in the block, peft finds the pattern invalid, or no module that it can adapt.
+        UserError: In the block, `lora.targets` is an invalid pattern or matches no module that can
+            be adapted. The message names it as a key of `group`.
     """
     import peft
 
@@ -165,8 +169,8 @@ def lora_config(group: str, lora: LoraConfig, task_type: str | None = None) -> I
         )
     except (ValueError, re.error) as error:
         raise UserError(
-            f"{group}.lora.targets={lora.targets} adapts nothing in this model: give a pattern "
-            "that matches whole names of linear layers, such as "
+            f"{group}.lora.targets={lora.targets} is invalid or adapts no layer of this model: "
+            "give a pattern that matches full names of linear layers, such as "
             "model.language_model.layers.0.self_attn.q_proj",
             code="no-lora-targets",
         ) from error
@@ -175,18 +179,20 @@ def lora_config(group: str, lora: LoraConfig, task_type: str | None = None) -> I
 def load_trained(
     cfg: StudentConfig, precision: str, folder: Path
 ) -> tuple[nn.Module, ProcessorMixin]:
-    """Load a trained student for inference: adapters over their base, or a whole model.
+    """Load a trained student for inference: adapters and their base, or a whole model.
+
+    A merged export keeps the precision of its weights instead of `precision`.
 
     Raises:
-        UserError: `folder` holds no student or one of another base or rank, or its base cannot be
-            loaded.
+        UserError: `folder` contains no student, or adapters of another base or rank; or it is
+            damaged; or the base cannot be loaded.
     """
     import peft
 
     if (folder / "adapter_config.json").exists():
         # Without safetensors, peft would read a pickle.
         if not (weights := folder / "adapter_model.safetensors").exists():
-            raise UserError(f"{folder} holds no student: {weights} is missing", code="missing-run")
+            raise UserError(f"{folder} has no student: {weights} is missing", code="missing-run")
         base, processor = load_base(cfg, precision, list)
         with explain_damage(folder):
             check_adapters(folder, base, cfg.lora.rank, cfg.model)
@@ -201,11 +207,10 @@ def load_trained(
 
 
 def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
-    """Load a student that `train.export` merged into its base, in the precision of its weights and
-    with the standard classes only.
+    """Load a student that `train.export` merged into its base, with transformers' classes only.
 
     Raises:
-        UserError: the folder is damaged.
+        UserError: The folder is damaged.
     """
     with explain_damage(folder):
         processor = AutoProcessor.from_pretrained(folder)
@@ -219,10 +224,10 @@ def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
 def merge_adapters(
     base: PreTrainedModel, adapters: Path, quantization: str, precision: str
 ) -> PreTrainedModel:
-    """Dequantise a base and add the adapters in a folder, in `precision`.
+    """Dequantise a base to `precision`, and merge the adapters in the folder `adapters` into it.
 
-    Merged into the 4-bit weights, most of the training would be rounded away; over the base as it
-    was before quantisation, the adapters would miss the errors that they were trained with.
+    Merging into the 4-bit weights would round most of the training away. The weights before
+    quantisation lack the quantisation errors with which the adapters were trained.
     """
     import peft
 
@@ -233,8 +238,8 @@ def merge_adapters(
 
 
 def for_inference(model: nn.Module) -> nn.Module:
-    """Move a model to the GPU, if there is one, and switch it to inference. A quantised model is
-    loaded on the GPU, others are loaded on the CPU."""
+    """Set a model to evaluation mode on the GPU, if there is one. Without quantisation, models are
+    loaded on the CPU."""
     return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
 
 
@@ -245,13 +250,13 @@ def save_student(
     precision: str,
     weights: dict[str, torch.Tensor] | None = None,
 ) -> None:
-    """Save the adapters, or the whole model in `precision`, and the processor.
+    """Save the processor, and the adapters or, without adapters, the whole model in `precision`.
 
     Args:
-        weights: The model's weights if the model itself holds a part of them.
+        weights: All weights of the model, if it is sharded and contains only a part of them.
 
     Raises:
-        UserError: the files cannot be written.
+        UserError: The files cannot be written.
     """
     import peft
 
@@ -269,18 +274,21 @@ def write_model(
     folder: Path,
     weights: dict[str, torch.Tensor] | None = None,
 ) -> None:
-    """Save a model, or its adapters, and its processor unchanged.
+    """Save a processor, and a model in its own precision; of a model with adapters, only these.
+
+    Args:
+        weights: As in `save_student`.
 
     Raises:
-        UserError: the files cannot be written.
+        UserError: The files cannot be written.
     """
     try:
         model.save_pretrained(folder, state_dict=weights)
     except SafetensorError as error:
-        # Unlike the OSError of a full disk, this one names no file.
+        # Unlike an OSError, this error does not name the file.
         raise UserError(
-            f"the weights cannot be written to {folder.parent} ({error}); correct this, then run "
-            "the same command again",
+            f"the weights cannot be written to {folder.parent} ({error}); correct this and run the "
+            "same command again",
             code="cannot-write",
         ) from error
     processor.save_pretrained(folder)
@@ -288,11 +296,11 @@ def write_model(
 
 @contextmanager
 def explain_unloadable(group: str, model: str, key: str = "model") -> Iterator[None]:
-    """Load the model that GROUP.KEY names in the block.
+    """Turn errors of loading a base in the block into UserErrors that name the setting GROUP.KEY.
 
     Raises:
-        UserError: the model is no local folder, is not in the hub's cache and cannot be downloaded;
-            or its files cannot be read.
+        UserError: The model is neither a local folder nor in the hub's cache and cannot be
+            downloaded; or its files cannot be read.
     """
     try:
         if not Path(model).is_dir():
@@ -325,11 +333,7 @@ def _unloadable_error(key: str, model: str, error: Exception) -> UserError:
 
 @contextmanager
 def explain_damage(folder: Path) -> Iterator[None]:
-    """Load a trained or exported model in the block.
-
-    Raises:
-        UserError: the model cannot be read.
-    """
+    """Turn errors of loading a trained or exported model in the block into a UserError."""
     try:
         yield
     except UNREADABLE as error:

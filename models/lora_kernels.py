@@ -1,9 +1,9 @@
-"""Faster operations with the same results, for a model in training.
+"""Faster layers for training a Qwen3-VL. Up to rounding, they give the same results.
 
-Patches do not overlap, so the convolution over them is one matrix product, which is several times
-as fast. The output of an adapter is scaled while it is as narrow as its rank, and added in place to
-the base's output by the product that widens it. peft scales and adds over the whole width, keeps
-the intermediate results, and copies the output of a 4-bit layer first.
+The convolution over patches, which do not overlap, is one matrix product: several times as fast.
+Adapters scale the narrow output of A, and add its product with B in place to the base layer's
+output. peft scales and adds B's wide output, keeps the intermediate results, and first copies the
+output of a 4-bit layer.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from torch import nn
 from torch.nn.functional import linear
 
 
-def fuse(model: nn.Module) -> None:
-    """Switch a Qwen3-VL, with or without adapters, to these operations in place. Parameters, their
-    names and saved files do not change."""
+def use_fast_layers(model: nn.Module) -> None:
+    """Replace layers of a model, with or without adapters, in place. Parameters, their names and
+    saved files do not change."""
     for module in list(model.modules()):
         if fused := FUSED.get(type(module)):
             module.__class__ = fused
@@ -34,7 +34,7 @@ class PatchProduct(nn.Conv3d):
     (N, channels, 1, 1, 1)."""
 
     def forward(self, patches: torch.Tensor) -> torch.Tensor:
-        # A convolution of another model may take whole clips.
+        # In other models, a convolution may have larger inputs than its kernel.
         if patches.shape[2:] != self.kernel_size or any(self.padding) or self.groups > 1:
             return super().forward(patches)
         embedded = linear(patches.flatten(1), self.weight.flatten(1), self.bias)
@@ -42,22 +42,23 @@ class PatchProduct(nn.Conv3d):
 
 
 class AddedInPlace(LoraVariant):
-    """Plain LoRA over rows. It has only a forward: models are loaded without it for merging."""
+    """Plain LoRA for (rows, features), added to `result` in place. It cannot merge: models are
+    loaded without it for merging."""
 
     @staticmethod
     def forward(
         module: LoraLayer, active_adapter: str, x: torch.Tensor, result: torch.Tensor, **_: Any
     ) -> torch.Tensor:
         dropped = module.lora_dropout[active_adapter](x)
-        narrow = module.lora_A[active_adapter](dropped) * module.scaling[active_adapter]
-        widening = module.lora_B[active_adapter].weight.T
-        # Without autocast the base may be in bf16 beside adapters in fp32.
-        return result.to(narrow.dtype).addmm_(narrow, widening.to(narrow.dtype))
+        scaled = module.lora_A[active_adapter](dropped) * module.scaling[active_adapter]
+        b = module.lora_B[active_adapter].weight.T
+        # Without autocast, the base may be in bf16 and its adapters in fp32.
+        return result.to(scaled.dtype).addmm_(scaled, b.to(scaled.dtype))
 
 
 class RowsLinear(Linear):
-    """Adapters over a layer whose input is flattened to rows: its output is then no view, and
-    autograd lets it be changed in place at no cost."""
+    """A linear layer with adapters that flattens its input to (rows, features): the base layer's
+    output is then not a view, and autograd allows changing it in place without a copy."""
 
     def forward(self, x: torch.Tensor, *args: Any, **settings: Any) -> torch.Tensor:
         rows = super().forward(x.flatten(0, -2), *args, **settings)
@@ -65,14 +66,15 @@ class RowsLinear(Linear):
 
 
 class RowsLinear4bit(Linear4bit):
-    """The same for a 4-bit layer, with the forward of other layers, which copies nothing."""
+    """`RowsLinear` for a 4-bit layer. It uses the `forward` of unquantised layers, which copies
+    nothing."""
 
     def forward(self, x: torch.Tensor, *args: Any, **settings: Any) -> torch.Tensor:
         rows = Linear.forward(self, x.flatten(0, -2), *args, **settings)
         return rows.unflatten(0, x.shape[:-1])
 
     def _cast_input_dtype(self, x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-        # Autocast would cast it back.
+        # With autocast a cast is useless, because autocast would undo it.
         enabled = torch.is_autocast_enabled(x.device.type)
         return x if enabled else super()._cast_input_dtype(x, dtype)
 

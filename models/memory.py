@@ -1,4 +1,4 @@
-"""Available memory, and the error for running out of it."""
+"""Determine the available memory, and report running out of memory as a UserError."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ import torch
 from conf.errors import UserError
 
 CGROUP = Path("/sys/fs/cgroup")
-"""Files of the container (version 2 of the kernel's interface)."""
+"""Folder of the files (cgroup v2) that describe the limits of a container."""
 OUT_OF_MEMORY = ("can't allocate memory", "CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED")
-"""Messages of torch for errors that have no class of their own."""
+"""Messages of torch's out-of-memory errors that are plain RuntimeErrors."""
 
 
 def available_cpu_bytes() -> int:
-    """Return the free bytes of the machine, or of the container that limits this process."""
+    """Return the free memory (bytes) of the machine, or of this process's container if it has
+    less."""
     free = psutil.virtual_memory().available
-    # Without a limit, the file is missing or holds a word.
+    # If there is no limit, memory.max is missing or contains "max" instead of a number.
     with suppress(OSError, ValueError):
         limit, used = (int((CGROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
         stat = dict(line.split() for line in (CGROUP / "memory.stat").read_text().splitlines())
@@ -30,11 +31,11 @@ def available_cpu_bytes() -> int:
 
 @contextmanager
 def explain_out_of_memory(when: str, lower: str) -> Iterator[None]:
-    """Turn a lack of memory into a UserError.
+    """Turn an out-of-memory error of the block into a UserError.
 
     Args:
-        when: What the program was doing.
-        lower: The settings to lower.
+        when: What the program was doing, as in "out of memory {when}".
+        lower: The advice which settings to lower.
     """
     try:
         yield

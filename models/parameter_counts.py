@@ -1,4 +1,4 @@
-"""Counts of a model's parameters by tower: quantised, adapted and trained ones."""
+"""Count a model's parameters by tower: all, 4-bit, LoRA and trainable ones."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from models.compat import four_bit_entries
 
 TOWERS = ["vision", "language", "embeddings and head"]
 PROJECTION = "projection"
-"""The module of a multi-vector retriever after its base, which is always trained whole."""
+"""The projection of a multi-vector retriever's token states, all of whose weights are trained."""
 
 
-def count_towers(model: nn.Module) -> pd.DataFrame:
-    """Count the parameters, and those that are 4-bit, LoRA or trainable, with a row for each tower.
-    A 4-bit weight counts as the entries that it stands for."""
+def count_parameters(model: nn.Module) -> pd.DataFrame:
+    """Return a table with a row per tower and the columns parameters, 4-bit, LoRA and trainable.
+
+    Packed 4-bit parameters are counted by the number of weights that they contain.
+    """
     rows = []
     for name, parameter in model.named_parameters():
         four_bit = four_bit_entries(parameter)
@@ -37,15 +39,9 @@ def _tower_of(name: str) -> str:
     return "language" if re.search(r"(^|\.)layers\.\d+\.", name) else "embeddings and head"
 
 
-def check_towers(towers: pd.DataFrame, preset: str, quantization: str, rank: int) -> None:
-    """Raise UserError if a tower of a loaded model is quantised, adapted or trained that should not
-    be, or the reverse.
-
-    Args:
-        preset: Name of the preset.
-        quantization: nf4 or none.
-        rank: Of the adapters; 0 for a whole model.
-    """
+def check_parameter_counts(towers: pd.DataFrame, preset: str, quantization: str, rank: int) -> None:
+    """Raise UserError unless exactly the towers that a preset's quantisation (nf4 or none) and rank
+    (0 without adapters) imply are quantised, adapted and trained."""
     lora = rank > 0
     problems = []
     for name, counts in towers.iterrows():

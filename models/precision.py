@@ -1,4 +1,4 @@
-"""The precision of a model's passes."""
+"""The precision of a model's forward and backward passes."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import torch
 
 
 def resolve_precision(precision: str) -> str:
-    """Return bf16 or fp32 for bf16, fp32 or auto.
+    """Resolve auto to bf16 or fp32; return bf16 and fp32 unchanged.
 
-    auto is bf16 where this machine has instructions for it: a CPU without them takes several times
+    auto is bf16 if the GPU or CPU has instructions for bf16. A CPU without them takes several times
     as long in bf16 as in fp32.
     """
     if precision != "auto":

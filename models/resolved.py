@@ -1,12 +1,13 @@
-"""`resolved.yaml`: what a training run resolves before its first step, in the run's folder.
+"""`resolved.yaml`, the values that a training run determines once, before its first step.
 
-    precision: bf16                  of the passes; train.precision=auto depends on the machine
+    precision: bf16                  precision of the forward and backward passes
     base: Qwen/Qwen3-VL-8B-Instruct@0c351dd01ed8...
                                      name and commit of a hub model, or a digest of local weights
-    data: 5f0f9a4a3c1d2e77           digest of everything that the run learns from
+    data: 5f0f9a4a3c1d2e77           digest of the training data
 
-A run that resumes, is evaluated or is exported takes these values, whatever the machine and the hub
-offer by then. Another base or other data are refused.
+Resuming, evaluating or exporting the run uses this precision (an evaluation may override it) and
+this commit, and is refused if a local base has changed. Resuming is also refused if the data have
+changed.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ RESOLVED = "resolved.yaml"
 
 
 def resolve_run(folder: Path, precision: str, preset: Preset, data: str) -> tuple[str, Preset]:
-    """Resolve a run's precision and its base's commit, and write them with the digest of its data.
+    """Resolve a run's precision and its base's commit, or read them if the run is resumed.
 
-    In `models.distributed.main_first`, the main rank resolves and writes; the others read.
+    Call this in `main_first`: the main rank writes resolved.yaml, and the other ranks read it.
 
     Args:
         folder: The run's folder.
@@ -37,34 +38,34 @@ def resolve_run(folder: Path, precision: str, preset: Preset, data: str) -> tupl
         data: What `data_digest` returns for the run.
 
     Returns:
-        The precision, bf16 or fp32, and the preset with the commit.
+        The precision, bf16 or fp32, and the preset with the commit as revision.
 
     Raises:
-        UserError: the folder holds a run on other data or over another base.
+        UserError: The folder contains a run with other data or another base.
     """
-    preset = pin_revisions(pin_base(folder, preset))
+    preset = pin_revisions(with_resolved_commit(folder, preset))
     check_base(folder, preset)
     if resolved := read_resolved(folder):
         if resolved["data"] != data:
             raise UserError(
-                f"{folder} was started on other data: the benchmark, its rationales or the prompts "
-                "have changed since. Restore them, or train in another folder (run=NAME)",
+                f"{folder} was started with other training data: the benchmark, its rationales or "
+                "the prompts have changed. Restore them, or train in another folder (run=NAME)",
                 code="other-data",
             )
         return resolved["precision"], preset
     precision = resolve_precision(precision)
-    # A hub's base without a commit cannot be loaded, which loading it reports.
+    # If the commit of a hub model cannot be determined, loading the model reports the reason.
     if not is_hub_model(preset.model) or preset.revision:
-        resolved = {"precision": precision, "base": base_identity(preset), "data": data}
+        resolved = {"precision": precision, "base": base_id(preset), "data": data}
         write_text(folder / RESOLVED, yaml.safe_dump(resolved, sort_keys=False))
     return precision, preset
 
 
 def read_resolved(folder: Path) -> dict[str, str]:
-    """Return the content of a folder's resolved.yaml; empty if the file does not exist.
+    """Return the content of a run's resolved.yaml, or an empty dict if the file does not exist.
 
     Raises:
-        UserError: the file is damaged.
+        UserError: The file is damaged.
     """
     path = folder / RESOLVED
     try:
@@ -78,35 +79,37 @@ def read_resolved(folder: Path) -> dict[str, str]:
         ) from error
 
 
-def pin_base(folder: Path, preset: Preset) -> Preset:
-    """Return a run's preset with the commit of the hub's base that the run resolved."""
+def with_resolved_commit(folder: Path, preset: Preset) -> Preset:
+    """Return a run's preset whose revision is the commit of its hub model in resolved.yaml."""
     name, _, commit = read_resolved(folder).get("base", "").rpartition("@")
     return replace(preset, revision=commit) if name and name == preset.model else preset
 
 
 def check_base(folder: Path, preset: Preset) -> None:
-    """Raise UserError if the weights in a local base are not those that a run was trained over."""
+    """Raise UserError if a local base has other weights than when the run in `folder` started."""
     resolved = read_resolved(folder)
     if not resolved or is_hub_model(preset.model):
         return
-    if resolved["base"] != base_identity(preset):
+    if resolved["base"] != base_id(preset):
         raise UserError(
-            f"the weights in {preset.model} are not those that {folder} is trained over: restore "
-            "them, or delete that run and train again",
+            f"the weights in {preset.model} have changed since the run in {folder} was started: "
+            "restore them, or delete the run and train again",
             code="other-base",
         )
 
 
-def base_identity(preset: Preset) -> str:
-    """Return NAME@COMMIT of a hub's base, or the digest of a local one."""
+def base_id(preset: Preset) -> str:
+    """Return NAME@COMMIT of a hub model, or the digest of a local base."""
     if is_hub_model(preset.model):
         return model_id(preset.model, preset.revision)
     return weights_digest(preset.model)
 
 
 def data_digest(store_identity: str, texts: Iterable[str]) -> str:
-    """Return a digest of what a run learns from: the benchmark, and texts that are not part of it
-    (rationales, prompts), in order."""
+    """Return a digest of a run's training data.
+
+    `texts` are those of a student's samples, or the ids of a retriever's queries, in order.
+    """
     whole = hashlib.sha256(store_identity.encode())
     for text in texts:
         whole.update(hashlib.sha256(text.encode()).digest())

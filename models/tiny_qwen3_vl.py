@@ -1,7 +1,7 @@
-"""Build a small Qwen3-VL with its tokenizer and processor, offline, from sizes and a seed.
+"""Build a small Qwen3-VL and its processor without a download, from sizes and a seed.
 
-All classes are the standard ones of transformers. Module names, chat format, timestamps and vision
-tokens are those of the released models.
+All classes are transformers' own. Module names, chat format, timestamps and vision tokens are those
+of the released Qwen3-VL models.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditi
     """Return a Qwen3-VL in fp32 with random weights from `sizes.seed`.
 
     Args:
-        vocabulary: Size of the tokenizer of `build_processor`, which also has the special tokens.
+        vocabulary: Number of tokens of the tokenizer of `build_processor`, including special ones.
     """
     half = sizes.head // 2
     height = width = half // 3
@@ -94,6 +94,8 @@ def build_processor(corpus: Iterable[str], vocabulary: int, image_size: int) -> 
     """Return a processor with a byte-level BPE tokenizer that is trained on `corpus`.
 
     The same texts in the same order give the same tokenizer.
+
+    `vocabulary` is the maximum number of tokens, including the special ones.
     """
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)

@@ -1,4 +1,4 @@
-"""Find a training run's product (student or retriever) and its settings."""
+"""Find the product (student or retriever) of a training run or an export, and its settings."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from yaml import YAMLError
 
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
-from models.resolved import pin_base, read_resolved
+from models.resolved import read_resolved, with_resolved_commit
 
 EXPORT = "export.json"
-"""A file that only folders of `train.export` have."""
+"""A file that only the folders that `train.export` writes contain."""
 
-MEASURED_BY = {
+EVALUATION_SETTINGS = {
     "student": ("temperature", "top_p", "top_k", "max_new_tokens", "max_length"),
     "retriever": ("widths", "max_length"),
     "train": ("precision",),
 }
-"""Settings of a run that an evaluation may override, by group: they change neither the trained
-weights nor the model's input."""
+"""Settings of a training run that an evaluation may override, by group. They change neither the
+trained weights nor the model's input."""
 
 Command = TypeVar("Command")
 
 
 def run_title(folder: Path) -> str:
-    """Return a run's name for a table: SWEEP/NUMBER for a sweep's job, RUN FORMAT for an export."""
+    """Return a run's name in tables: its folder's name, SWEEP/NUMBER for a job of a sweep, or "RUN
+    FORMAT" for an export."""
     if (folder / EXPORT).exists():
         record = export_record(folder)
         return f"{record['run']} {record['format']}"
@@ -38,11 +39,11 @@ def run_title(folder: Path) -> str:
 
 
 def export_record(folder: Path) -> dict[str, Any]:
-    """Return the record of an export: its `run` and `format`, the SHA-256 of the exported adapters
-    as `weights`, and the differences that were `measured`.
+    """Return the record of an export: the exported `run`, the `format`, the SHA-256 of the adapters
+    (`weights`), and the differences from the trained model's outputs (`measured`).
 
     Raises:
-        UserError: the file is missing or damaged.
+        UserError: The file is missing or damaged.
     """
     try:
         record = json.loads((folder / EXPORT).read_text())
@@ -55,22 +56,24 @@ def export_record(folder: Path) -> dict[str, Any]:
 
 
 def product_folder(folder: Path, product: str) -> Path:
-    """Return the folder of the weights and the processor; an export is that folder itself."""
+    """Return the folder of the weights and processor of a run; an export is itself this folder."""
     return folder if (folder / EXPORT).exists() else folder / product
 
 
 def trained_settings(
     folder: Path, schema: type[Command], product: str, key: str = "model"
 ) -> Command:
-    """Return the settings of a finished training run or of an export, with the precision and the
-    base's commit that the run resolved.
+    """Return the settings of a finished training run or of an export.
+
+    The precision and the commit of the base are those in the run's resolved.yaml.
 
     Args:
         product: student or retriever.
-        key: The setting by which the user named the folder.
+        key: The setting with which the user named the folder.
 
     Raises:
-        UserError: `folder` is not a run's folder, has no finished product, or has damaged settings.
+        UserError: `folder` is not the folder of a run or an export of this product, the run is not
+            finished, or its settings are damaged.
     """
     config = folder / "config.yaml"
     try:
@@ -103,7 +106,7 @@ def trained_settings(
             f"{config} is damaged or of another version of DynaPix ({first}); train again",
             code="damaged-file",
         ) from error
-    setattr(settings, product, pin_base(folder, getattr(settings, product)))
+    setattr(settings, product, with_resolved_commit(folder, getattr(settings, product)))
     settings.train.precision = read_resolved(folder).get("precision", settings.train.precision)
     return settings
 
@@ -121,12 +124,13 @@ def resolve_model(
     If `cfg.model` is None, return None and `cfg` itself, which has the settings of a preset.
 
     Args:
-        benchmark: What the model is to be evaluated on.
-        overrides: What the user typed. Settings of `MEASURED_BY` replace those of the run.
+        benchmark: The benchmark on which the model is evaluated.
+        overrides: The overrides of the command line. Those of `EVALUATION_SETTINGS` replace
+            settings of the run.
 
     Raises:
-        UserError: as `trained_settings` and `check_unseen`; or the overrides have other settings of
-            the model, which the run determines.
+        UserError: As `trained_settings` and `check_unseen`; or an override changes another setting
+            of the model or its training, which the run has fixed.
     """
     if cfg.model is None:
         return None, cfg
@@ -141,32 +145,33 @@ def _apply_overrides(
     settings: Any, cfg: Any, product: str, overrides: Sequence[str], key: str
 ) -> None:
     prefix = key.removesuffix("model")
-    options = [f"{prefix}{group}.{k}" for group in (product, "train") for k in MEASURED_BY[group]]
+    groups = (product, "train")
+    options = [f"{prefix}{group}.{name}" for group in groups for name in EVALUATION_SETTINGS[group]]
     for override in overrides:
         typed = override.lstrip("+~").partition("=")[0]
         group, _, setting = typed.removeprefix(prefix).partition(".")
         preset = typed == prefix.removesuffix(".")
         if typed in options:
             setattr(getattr(settings, group), setting, getattr(getattr(cfg, group), setting))
-        elif preset or (typed.startswith(prefix) and group in (product, "train")):
+        elif preset or (typed.startswith(prefix) and group in groups):
             raise UserError(
-                f"{typed} does nothing beside {key}={cfg.model}, which is evaluated as it was "
-                f"trained: leave it out; the options are {', '.join(options)}",
+                f"{typed} has no effect with {key}={cfg.model}, which is evaluated as it was "
+                f"trained: leave it out; the settings that can be given are {', '.join(options)}",
                 code="unused-setting",
             )
 
 
 def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) -> None:
-    """Check that no training scene is tested.
+    """Check that no scene on which a model was trained is in the test split of a benchmark.
 
-    Two benchmarks have the same scenes if they simulate with one seed or read one release. A split
-    with one seed tests the same scenes, and more of them with a greater share.
+    Two benchmarks have the same scenes if they simulate with one seed or read one release. If their
+    splits have one seed, a greater test share adds test scenes and removes none.
 
     Args:
-        model: How the error names the model.
+        model: The model's name in the error message.
 
     Raises:
-        UserError: training scenes may be among the tested ones.
+        UserError: Training scenes may be among the test scenes.
     """
     scenes = ["simulator", "standin", "folder"] + ["seed"] * (trained.simulator == "bullet")
     if any(getattr(trained, key) != getattr(tested, key) for key in scenes):
@@ -174,21 +179,21 @@ def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) 
     if trained.seed != tested.seed or tested.test_share > trained.test_share:
         raise UserError(
             f"{model} was trained with benchmark.seed={trained.seed} and "
-            f"benchmark.test_share={trained.test_share}, and may have seen scenes that a split by "
-            f"benchmark.seed={tested.seed} and benchmark.test_share={tested.test_share} tests: set "
-            "both as in training",
+            f"benchmark.test_share={trained.test_share}; with benchmark.seed={tested.seed} and "
+            f"benchmark.test_share={tested.test_share}, the test split may contain scenes that it "
+            "was trained on: set both as in training",
             code="training-scenes-tested",
         )
 
 
-def modes_of(regime: str) -> list[str]:
-    """Return the modes in which a regime trains students to answer."""
+def modes_of_regime(regime: str) -> list[str]:
+    """Return the modes (reasoning, answer) in which a regime trains students to answer items."""
     return {"describe": [], "answer_only": ["answer"]}.get(regime, ["reasoning", "answer"])
 
 
 def check_modes(folder: Path, regime: str, modes: Sequence[str]) -> None:
     """Raise UserError if a student is evaluated in a mode that it was not trained in."""
-    trained = modes_of(regime)
+    trained = modes_of_regime(regime)
     if set(modes) <= set(trained):
         return
     if trained:

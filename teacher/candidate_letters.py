@@ -1,4 +1,4 @@
-"""Find the candidates' letters in a rationale, and relabel a rationale for permuted candidates."""
+"""Find the letters of candidates in a rationale, and replace them when candidates are permuted."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ FOLLOWS_LETTER = re.compile(
     "and|or|nor|alone|also|too|then|still|never|always|only|itself|again|cannot|can|will|would"
     "|should|could|must|may|might|did|had|now|likewise|here|thus|therefore|instead|however|meanwhile"
 )
-"""If one of these words follows an "A" at the start of a sentence, the "A" is a letter and not the
-article. The same holds if a verb that ends in "s" follows, or punctuation."""
+"""Words that can follow the letter "A" but not the article. An "A" at the start of a sentence names
+a candidate if one of these words, a verb that ends in "s", or punctuation follows it."""
 
 
 def find_letters(text: str) -> list[tuple[int, int]]:
-    """Return the spans of the letters that name candidates, in order, without the article "A"."""
+    """Return the spans of the letters that name candidates, in text order, without articles "A"."""
     return [
         m.span() for m in LETTER.finditer(text) if m[0] != "A" or not _is_article(text, *m.span())
     ]
 
 
 def relabel_text(text: str, order: Sequence[int]) -> str:
-    """Return a rationale with its letters replaced for the same candidates in another order.
+    """Return a rationale whose letters name the same candidates after these are reordered.
 
     Args:
-        text: A rationale that passes the validator, for the old order.
+        text: A rationale for the old order that the validator accepts.
         order: `order[new]` is the old position of the candidate at the position `new`.
     """
     letter_of = {LETTERS[old]: LETTERS[new] for new, old in enumerate(order)}
@@ -49,7 +49,7 @@ def reorder_candidates(item: SelectionItem, order: Sequence[int]) -> SelectionIt
 
 def _is_article(text: str, start: int, stop: int) -> bool:
     """Return whether an "A" is the article of a noun phrase at the start of a sentence, as in "A
-    slowly moving cube"."""
+    slowly moving cube". Adverbs in "-ly" are skipped: the word after them decides."""
     if not SENTENCE_START.search(text, max(0, start - 4), start):
         return False
     while following := NEXT_WORD.match(text, stop):

@@ -1,7 +1,8 @@
 """Write a rationale for every training item of the selection track.
 
-Every response is appended to the store's rationales.jsonl, accepted or not, so that a killed run
-resumes. The built-in narrator then writes the same bytes as an uninterrupted run.
+Every response, accepted or rejected, is appended to rationales.jsonl in the benchmark's folder, so
+that a killed run resumes. With the built-in narrator, a resumed run leaves the same bytes in this
+file as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -35,16 +36,16 @@ log = logging.getLogger(__name__)
 
 JOURNAL_FILE = "rationales.jsonl"
 LISTED_REASONS = 3
-"""Number of reasons for rejections in the progress bar: the most frequent ones."""
+"""Number of reasons for rejection in the progress bar, which lists the most frequent ones."""
 
 
 @dataclass(frozen=True)
 class Narration:
-    """The result of a narration.
+    """The result of `narrate_store`.
 
     Attributes:
-        rationales: The accepted rationale of each training item that has one, in item order.
-        figures: Figures of all responses; see `teacher.report.summarize`.
+        rationales: One accepted rationale of each training item that has any, in item order.
+        figures: Statistics of all responses; see `teacher.report.summarize`.
     """
 
     rationales: list[Rationale]
@@ -82,7 +83,7 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
 
 
 def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
-    """The accepted rationales of the training items in item order; missing ones are requested.
+    """Write the missing rationales, and return the accepted ones in the order of their items.
 
     Raises:
         UserError: See `narrate_store`.
@@ -93,7 +94,7 @@ def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
 
 
 def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
-    """Request the missing rationales, and save the accepted ones to rationales.parquet too.
+    """Write the missing rationales of training items, and save the accepted ones as parquet too.
 
     Raises:
         UserError: rationales.jsonl is damaged or belongs to another benchmark, or the servers
@@ -111,7 +112,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
         def is_settled(item: SelectionItem) -> bool:
             return any(r.accepted for r in responses[item.item_id])
 
-        # Without the finished items, every concurrent job has a request to send.
+        # Finished items are left out, so that every concurrent job has a request to send.
         jobs = [
             (item, attempts)
             for item in items
@@ -147,7 +148,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
 
 
 class Progress:
-    """A bar with accepted and rejected responses, tokens per second and the remaining time."""
+    """A progress bar with the numbers of accepted and rejected responses, and tokens per second."""
 
     def __init__(self, total: int, done: int) -> None:
         self.bar = tqdm(total=total, initial=done, desc="narrating", unit="item", mininterval=1.0)
@@ -167,13 +168,13 @@ class Progress:
 
 
 def check_items(journal: Journal, items: list[SelectionItem]) -> None:
-    """Raises UserError if a journal has responses to items that are not among `items`."""
+    """Raises UserError if a journal has responses for items that are not in `items`."""
     unknown = {r.item_id for r in journal.rationales} - {item.item_id for item in items}
     if unknown:
         raise UserError(
             f"{journal.path} has rationales for {len(unknown)} items that the training split does "
-            f"not have, such as {min(unknown)}, so it belongs to another benchmark. Replace it by "
-            "the file of this benchmark, or delete it to narrate again",
+            f"not have, such as {min(unknown)}, so it belongs to another benchmark. Replace it "
+            "with the file of this benchmark, or delete it to narrate again",
             code="other-data",
         )
 
@@ -181,8 +182,8 @@ def check_items(journal: Journal, items: list[SelectionItem]) -> None:
 def _write_rationales(
     item: SelectionItem, store: Store, grader: RationaleGrader, first: int = 0
 ) -> list[Rationale]:
-    """The built-in narrator's rationales from attempt `first` up to the first accepted one; none
-    for a too short prefix."""
+    """Write rationales of an item with the built-in narrator, from attempt `first` until one is
+    accepted or no attempt is left. An item whose prefix is too short gets none."""
     predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
     rationales: list[Rationale] = []
     for attempt in range(first, grader.cfg.attempts if predicates else 0):

@@ -1,7 +1,7 @@
-"""Built-in narrator: writes rationales from predicates with templates, without a model.
+"""The built-in narrator: writes rationales from predicates with templates, without a model.
 
-Each statement has a few phrasings (templates/phrases.yaml) over a small vocabulary, so that a small
-student can learn it.
+Each statement has a few phrasings (templates/phrases.yaml). Their vocabulary is small, so that a
+small student can learn it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from teacher.predicates import (
 PHRASES = yaml.safe_load((files("teacher") / "templates" / "phrases.yaml").read_text())
 NARRATOR_VERSION = "5"
 SHORT, LONG = 110, 250
-"""A rationale of fewer words than SHORT is rewritten in full detail, one of more than LONG in
-brief. SHORT is well above the minimum length, 80 words (paper, Rationale construction)."""
+"""A rationale with more than LONG words is written again with less detail, one of fewer than SHORT
+words with more. SHORT is well above the minimum, 80 words (paper, Rationale construction)."""
 
 
 class Detail(NamedTuple):
-    """Maximum numbers of objects and pairs that a text mentions."""
+    """Maximum numbers of objects and pairs that the sections of a text mention."""
 
     parsed: int
     """Objects in the scene parse."""
@@ -53,7 +53,7 @@ def write_rationale(
 ) -> str:
     """Return a rationale of 80 to 250 words.
 
-    The same arguments give the same text; another `attempt` gives another choice of phrasings.
+    The same arguments give the same text. Another `attempt` chooses other phrasings.
     """
     keys = (seed, item.item_id, attempt)
     text = _Writer(predicates, SPARSE, *keys).text()
@@ -65,7 +65,7 @@ def write_rationale(
 
 
 def write_description(scene: Scene, start: int, stop: int, target: int, seed: int) -> str | None:
-    """Describe what happens between the prefix [start, stop] and the target frame.
+    """Describe what happens from the end of the prefix [start, stop] to the target frame.
 
     The description mentions no candidates. Returns None if the prefix is too short.
     """
@@ -76,7 +76,7 @@ def write_description(scene: Scene, start: int, stop: int, target: int, seed: in
 
 
 def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
-    """Return one line per candidate that says whether it matches the prediction, and why.
+    """Return a line for each candidate: whether it matches the prediction, and if not, why.
 
     The same arguments give the same lines.
     """
@@ -85,10 +85,11 @@ def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str,
 
 
 def most_discriminative_object(predicates: Predicates) -> ObjectFacts:
-    """Return the object whose place distinguishes the largest number of wrong candidates.
+    """Return the object that distinguishes the most wrong candidates from the target: the object is
+    in another region there, or missing.
 
-    Of tied objects, the most relevant is returned. The candidate analysis says where each candidate
-    shows this object before it judges the candidate.
+    Of tied objects, the most relevant one is returned (see `_rank_objects`). The candidate analysis
+    says where each candidate shows this object before it judges the candidate.
     """
     wrong = [c.differences for c in predicates.candidates if not c.agrees]
 
@@ -120,7 +121,7 @@ def _toward(heading: str | None) -> str:
 
 
 def _rank_objects(facts: Facts) -> list[ObjectFacts]:
-    """The objects by relevance: first those that meet or may meet another, then moving ones."""
+    """Sort objects by relevance: first those that collide or may collide, then moving ones."""
     met = {name for m in (*facts.courses, *facts.contacts) for name in m.objects}
     return sorted(
         facts.objects,
@@ -135,7 +136,7 @@ class _Writer:
         facts: Content of the text. Predicates add the candidate analysis and the answer.
         detail: How many objects and pairs each section mentions.
         keys: Seed of the random choice of phrasings.
-        padded: Whether to add two general sentences that lengthen a short text.
+        padded: Whether to lengthen the text by two sentences that hold for every scene.
     """
 
     def __init__(
@@ -149,12 +150,12 @@ class _Writer:
         self.key = most_discriminative_object(facts) if isinstance(facts, Predicates) else None
 
     def say(self, statement: str, **values: Any) -> str:
-        """A random phrasing of a statement in PHRASES."""
+        """Fill a random phrasing of a statement with values."""
         phrasings = PHRASES[statement]
         return phrasings[self.rng.integers(len(phrasings))].format(**values)
 
     def text(self) -> str:
-        """A rationale from predicates, or a description from facts without candidates."""
+        """Return a rationale from predicates, or a description from facts without candidates."""
         facts, answer = self.facts, None
         sections = {
             "Scene parse": self.scene_parse(),
@@ -222,8 +223,8 @@ class _Writer:
     def prediction(self) -> list[str]:
         close = self.facts.close[: self.detail.pairs]
         parts = [f"{_pair(c.objects)} will be very close {c.region}" for c in close]
-        first_key = sorted(self.ranked, key=lambda o: self.key is not None and o is not self.key)
-        parts += [self.expected(o) for o in first_key[: self.detail.predicted]]
+        key_first = sorted(self.ranked, key=lambda o: self.key is not None and o is not self.key)
+        parts += [self.expected(o) for o in key_first[: self.detail.predicted]]
         parts[0] = f"{self.facts.moment}, {parts[0]}"
         if self.padded:
             parts.append("the layout at the target moment follows from these motions")
@@ -236,7 +237,7 @@ class _Writer:
         return self.say("remains" if remains else "will_be", o=o)
 
     def judgement(self, candidate: CandidateFacts) -> str:
-        """Where the candidate shows the key object, and whether the candidate agrees."""
+        """State where a candidate shows the key object, and whether the candidate agrees."""
         if candidate.agrees:
             return self.say("agrees", key=self.key)
         d = {d.object: d for d in candidate.differences}.get(self.key.object)

@@ -1,7 +1,8 @@
-"""Predicates: qualitative facts that a rationale may state, read from the oracle.
+"""Predicates: qualitative facts from the oracle that a rationale may state.
 
-Facts describe the scene at two frames: the target, and the cut, which is the end of the prefix or,
-if a collision follows shortly, an earlier frame. No fact contains a number.
+They describe the scene at two frames, the cut and the target. The cut is the last frame that the
+rationale treats as observed: the end of the prefix, or an earlier frame if a collision follows
+shortly (see `find_cut`). No fact contains a number.
 """
 
 from __future__ import annotations
@@ -15,39 +16,41 @@ import numpy as np
 from data.records import LETTERS, Candidate, Scene, SelectionItem
 
 CUT_MARGIN = 12
-"""Frames between the cut and the first collision (paper, Rationale construction)."""
+"""Minimum number of frames from the cut to the next collision (paper, Rationale construction)."""
 COURSE_FRAMES = 5
-"""Frames up to the cut that determine headings and collision courses; also the length of the
-shortest prefix (paper, Rationale construction)."""
+"""Number of frames up to the cut that determine headings and collision courses, and the minimum
+number of observed frames (paper, Rationale construction)."""
 STATIONARY = 0.05
 """Speed (simulator units/s) below which an object is stationary (paper, Rationale construction)."""
 SPEEDS = ((0.6, "slowly"), (1.5, "steadily"), (3.0, "quickly"))
-"""Upper bounds (simulator units/s) of the speed words; anything faster is VERY_FAST."""
+"""Words for speeds and their upper bounds (simulator units/s); above these, it is VERY_FAST."""
 VERY_FAST = "very quickly"
 IMMINENT, SOON = 15, 40
-"""Most frames from the cut to an imminent event, and to one that comes soon (paper, Rationale
-construction)."""
+"""Maximum numbers of frames from the cut to a collision that is "imminent", and to a collision that
+comes "soon" (paper, Rationale construction)."""
 CONTACT = 0.4
 """Ground-plane distance (simulator units) at which two objects of radius 0.2 touch."""
 COURSE_MARGIN = 0.1
-"""Gap (simulator units) at the closest approach up to which a pass counts as a collision course."""
+"""Maximum gap (simulator units) between two objects on a collision course when they would pass."""
 COURSE_HORIZON = 60
-"""Frames over which straight paths are extrapolated."""
+"""Number of frames over which straight paths are extrapolated."""
 VERY_CLOSE = 0.6
-"""Ground-plane distance (simulator units) below which a pair is very close."""
+"""Ground-plane distance (simulator units) below which two objects are very close."""
 MIN_VISIBLE = 0.05
-"""Visible fraction at or below which an object in view is hidden."""
+"""Visible fraction up to which an object in view counts as hidden."""
 IMAGE_SIZE = 336
 """Side (px) of the square image in which displacements are measured: the models' input size."""
 STAYS, SHIFTS = 8.0, 60.0
-"""Upper bounds (px at 336) of "stays" and "shifts slightly"; anything further "moves across"."""
+"""Upper bounds of the displacement (px of the square image) of an object that "stays", and of one
+that "shifts slightly". An object that moves further "moves across"."""
 BORDER = 6.0
-"""Displacement (px at 336) below which a change of region is ignored."""
+"""Displacement (px of the square image) below which a change of region is ignored."""
 DISPLACED, CLEARLY = 12.0, 40.0
-"""Lower bounds (px at 336) of a displacement, and of a clear one."""
+"""Displacements (px of the square image) from which an object counts as displaced, and as displaced
+"clearly" rather than "slightly"."""
 
 COMPASS = ("east", "southeast", "south", "southwest", "west", "northwest", "north", "northeast")
-"""Directions in the image plane, clockwise from the x axis; south is down."""
+"""Directions in the image, clockwise from the x axis, which points right; south is down."""
 REGIONS = (
     ("near the top-left", "near the top", "near the top-right"),
     ("near the left", "near the center", "near the right"),
@@ -61,10 +64,11 @@ class ObjectFacts:
     """One object at the cut and at the target.
 
     `sight` and `target_sight` are "shown", "hidden" (in view but covered) or "out of view". `speed`
-    is "stationary" or a speed word; None if the object is out of view at the cut. `heading` is the
-    compass word of the motion at the cut; None if stationary or hit at the cut. `extent` describes
-    the displacement from cut to target, "unseen" if the object is out of view at both; `travel` is
-    its compass word, None if the object stays or is unseen.
+    is "stationary" or a word for the speed at the cut, and `heading` the compass word of the motion
+    at the cut. Both are None if the object is out of view; `heading` is also None if the object is
+    stationary or is hit at the cut. `extent` describes the displacement from the cut to the target;
+    it is "unseen" if the object is out of view at both. `travel` is the compass word of this
+    displacement; None if the object stays or is unseen.
     """
 
     object: str
@@ -88,10 +92,10 @@ class ObjectFacts:
 
 @dataclass(frozen=True)
 class Meeting:
-    """A pair of objects and when it collides, counted from the cut.
+    """Two objects, and when they collide after the cut.
 
-    `when` is "imminent", "soon" or "later"; None if the pair never collides, and "unseen" if the
-    scene ends while the pair still approaches.
+    `when` is "imminent", "soon" or "later"; None if they do not collide any more, or "unseen" if
+    the scene ends while they still approach each other.
     """
 
     objects: tuple[str, str]
@@ -100,7 +104,7 @@ class Meeting:
 
 @dataclass(frozen=True)
 class Closeness:
-    """A pair that is very close at the target, and the region of its midpoint."""
+    """Two objects that are very close at the target, and the region midway between them."""
 
     objects: tuple[str, str]
     region: str
@@ -108,11 +112,12 @@ class Closeness:
 
 @dataclass(frozen=True)
 class Difference:
-    """A difference between a candidate and the target in one object.
+    """One object that a candidate shows differently from the target.
 
-    `kind` is "region" (the object is in another `region`), "displaced" (same region, but displaced
-    "slightly" or "clearly", the `extent`, toward `heading`), "missing" (visible only in the target)
-    or "extra" (visible only in the candidate).
+    `kind` is "region" (the candidate shows the object in another region, `region`), "displaced"
+    (it shows the object in the same region, but displaced toward `heading` by an `extent` of
+    "slightly" or "clearly"), "missing" (the object is visible only in the target) or "extra" (it is
+    visible only in the candidate).
     """
 
     object: str
@@ -124,8 +129,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class CandidateFacts:
-    """A candidate compared with the target: its differences, the largest first.
+    """A candidate compared with the target.
 
+    `agrees` is true for the target itself. `differences` are sorted, the largest first.
     `other_objects` is true if the candidate's scene has a different set of objects.
     """
 
@@ -137,11 +143,11 @@ class CandidateFacts:
 
 @dataclass(frozen=True)
 class Facts:
-    """A scene at the cut and at the target; `instant` and `moment` name the two in words.
+    """A scene at the cut and at the target; `instant` names the cut in words, `moment` the target.
 
-    `entering` and `leaving` are objects that come into view or go out of it from cut to target.
-    `courses` are pairs on a collision course at the cut; `contacts` are pairs that collide between
-    cut and target, on a course or not; `close` are pairs that are very close at the target.
+    `entering` and `leaving` are the objects that come into view and go out of view from the cut to
+    the target. `courses` are pairs on a collision course at the cut. `contacts` are all pairs that
+    collide from the cut to the target. `close` are pairs that are very close at the target.
     """
 
     instant: str
@@ -156,7 +162,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Predicates(Facts):
-    """Facts of an item's scene and of its four candidates."""
+    """Facts about an item's scene and about its four candidates."""
 
     candidates: tuple[CandidateFacts, ...]
 
@@ -166,10 +172,10 @@ class Predicates(Facts):
 
 
 def find_cut(scene: Scene, start: int, stop: int) -> int | None:
-    """The cut for the prefix [start, stop]; None if it leaves too short a prefix.
+    """Return the cut of the prefix [start, stop].
 
-    The cut is the end of the prefix, or CUT_MARGIN frames before the first collision at or after
-    the end, whichever is earlier.
+    The cut is `stop`, or the frame CUT_MARGIN frames before the first collision at or after `stop`,
+    whichever is earlier. Returns None if fewer than COURSE_FRAMES frames remain up to the cut.
     """
     upcoming = [c.frame for c in scene.collisions if c.frame >= stop]
     cut = min([stop, *(frame - CUT_MARGIN for frame in upcoming)])
@@ -179,10 +185,8 @@ def find_cut(scene: Scene, start: int, stop: int) -> int | None:
 def extract_facts(
     scene: Scene, start: int, stop: int, target: int, moment: str = "at the target moment"
 ) -> Facts | None:
-    """Facts for the prefix [start, stop] and a target frame; None if the prefix is too short.
-
-    `moment` names the target's moment in words.
-    """
+    """Return the facts for the prefix [start, stop] and a target frame; None if the prefix is too
+    short (see `find_cut`). `moment` names the target in words."""
     cut = find_cut(scene, start, stop)
     if cut is None:
         return None
@@ -203,9 +207,9 @@ def extract_facts(
 def extract_predicates(
     item: SelectionItem, scene: Scene, scene_of: Callable[[str], Scene]
 ) -> Predicates | None:
-    """Predicates of an item; None if the cut leaves too short a prefix.
+    """Return the predicates of an item; None if the prefix is too short (see `find_cut`).
 
-    `scene_of` returns the scene of a candidate from another scene, by its id.
+    `scene_of` returns a scene by its id; it is called for candidates from other scenes.
     """
     moment = {"future": "at the collision", "contact": "just after the collision"}.get(
         item.framing or "", "at the target moment"
@@ -223,10 +227,12 @@ def extract_predicates(
 
 
 def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
-    """Pairs that collide if both objects move on in straight lines.
+    """Return the pairs that would collide within COURSE_HORIZON frames if both objects kept their
+    velocity on the ground.
 
-    A line goes through an object's last COURSE_FRAMES frames, or those of them since its last
-    contact. Pairs that have met within these frames are left out.
+    The velocity is the mean over an object's last COURSE_FRAMES frames up to the cut, or over those
+    since its last collision. Left out are pairs that collided with each other within these frames,
+    pairs with an object that is hit at the cut, and pairs that hardly move relative to each other.
     """
     ground = scene.positions[:, :, :2]
     count = len(scene.objects)
@@ -248,14 +254,14 @@ def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
 
 
 def motion_start(scene: Scene, index: int, cut: int) -> int:
-    """First of the frames up to the cut from which an object's heading follows: COURSE_FRAMES
-    frames, or fewer if the object is hit within them."""
+    """Return the first of the frames up to the cut that determine an object's motion: the last
+    COURSE_FRAMES frames, or those since the object was hit."""
     hits = [c.frame for c in scene.collisions if index in c.objects and c.frame <= cut]
     return max([cut - COURSE_FRAMES + 1, *hits])
 
 
 def _meeting(scene: Scene, pair: tuple[int, int], cut: int) -> Meeting:
-    """When a pair collides after the cut, if it does."""
+    """Return a pair, and when it collides after the cut, if at all."""
     i, j = pair
     collisions = [c.frame for c in scene.collisions if set(c.objects) == {i, j}]
     frames = next((frame - cut for frame in collisions if frame > cut), None)
@@ -270,7 +276,7 @@ def _meeting(scene: Scene, pair: tuple[int, int], cut: int) -> Meeting:
 
 
 def compass_direction(delta: np.ndarray) -> str | None:
-    """Compass word of a displacement in the image plane (x right, y down); None for zero."""
+    """Return the compass word of a displacement in the image (x right, y down); None for zero."""
     if np.hypot(*delta) < 1e-6:
         return None
     eighth = round(float(np.arctan2(delta[1], delta[0])) / (np.pi / 4))
@@ -278,7 +284,7 @@ def compass_direction(delta: np.ndarray) -> str | None:
 
 
 def object_region(scene: Scene, frame: int, index: int) -> str:
-    """Cell of the 3x3 grid that contains an object's center, in words, or "out of view"."""
+    """Return the region of an object's center in a 3x3 grid, or "out of view"."""
     if not scene.in_view[frame, index]:
         return OUT_OF_VIEW
     return _cell(scene, scene.image_positions[frame, index])
@@ -291,14 +297,14 @@ def _cell(scene: Scene, point: np.ndarray) -> str:
 
 
 def _position(scene: Scene, frame: int, index: int) -> np.ndarray:
-    """An object's center (x, y) in px of the square image."""
+    """Return the center (x, y) of an object in px of the square image."""
     return scene.image_positions[frame, index] * IMAGE_SIZE / np.asarray(scene.image_size)
 
 
 def _sight(scene: Scene, frame: int, index: int) -> str:
     if not scene.in_view[frame, index]:
         return OUT_OF_VIEW
-    # NaN: the simulator's record has no visible fraction, so an object in view is shown.
+    # The fraction is NaN if the simulator does not record it; the object then counts as shown.
     return "hidden" if scene.visible_fraction[frame, index] <= MIN_VISIBLE else "shown"
 
 
@@ -331,8 +337,8 @@ def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFact
 
 
 def object_heading(scene: Scene, index: int, since: int, frame: int) -> str | None:
-    """Compass word of an object's displacement since an earlier frame; None if it is stationary at
-    `frame`."""
+    """Return the compass word of an object's displacement from the frame `since` to `frame`; None
+    if the object is stationary at `frame` or has not moved."""
     if _speed(scene, index, frame) == "stationary":
         return None
     return compass_direction(_position(scene, frame, index) - _position(scene, since, index))
@@ -391,7 +397,7 @@ def _candidate_facts(
                 bound = DISPLACED
             ranked.append(((visible and distance >= bound, visible, distance), difference))
     ranked.sort(key=lambda entry: entry[0], reverse=True)
-    # Two candidates always differ: name the largest difference even if it is below its bound.
+    # If every difference is below its bound, name the largest: the candidate is not the target.
     differences = tuple(d for (clear, *_), d in ranked if clear) or (ranked[0][1],)
     other_objects = in_target.keys() != in_candidate.keys()
     return CandidateFacts(letter, False, other_objects, differences)

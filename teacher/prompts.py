@@ -1,6 +1,6 @@
 """Prompts for a teacher on a server.
 
-The instructions come first and are the same for every item, so that prefix caching applies.
+The instructions come first and are the same for every item, so that the server can cache them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SYSTEM = (files("teacher") / "templates" / "system_prompt.txt").read_text().rstr
 def build_messages(
     predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
 ) -> list[dict[str, str]]:
-    """The chat messages that request an item's rationale."""
+    """Return the chat messages that request an item's rationale."""
     system = SYSTEM.format(sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words)
     facts = json.dumps(asdict(predicates), separators=(",", ":"))
     user = f"Question: {item.question}\nFacts: {facts}\nAnswer to reach: {item.letter}"

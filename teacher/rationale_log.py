@@ -1,4 +1,4 @@
-"""Files of a teacher's responses: an append-only journal and a table of accepted rationales."""
+"""Files of a teacher's responses: a journal of all of them, and a table of accepted rationales."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from data.store import write_atomically
 from teacher.sections import SECTIONS
 
 DIGEST = "sha256"
-"""Key of a line's checksum."""
+"""Key of the checksum in a line of the journal."""
 LINE_ERRORS = (ValueError, TypeError, KeyError, AttributeError)
 """Errors that a damaged line raises when it is decoded."""
 
 
 class Journal:
-    """An open rationales.jsonl with one response per line, safe against kills.
+    """An open rationales.jsonl: one response per line, to which new ones are appended.
 
-    Opening waits while another process has the file open. A kill may have cut off the last line: a
-    complete record gets the missing line break, and a partial one is removed, so that its response
-    is requested again.
+    Opening waits while another process has the file open. If a killed process left a last line
+    without a line break, a complete record gets its line break, and an incomplete one is removed,
+    so that its response is requested again.
 
     Attributes:
-        rationales: The responses in the file when it was opened.
+        rationales: The responses that the file had when it was opened.
 
     Raises:
-        UserError: A line before the last is damaged.
+        UserError: Another line is damaged; see `read_rationales`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -87,7 +87,7 @@ def _digest(row: dict[str, Any]) -> str:
 
 
 def read_rationales(path: Path) -> list[Rationale]:
-    """Every response in a rationales.jsonl.
+    """Return every response in a rationales.jsonl.
 
     Raises:
         UserError: A line is damaged or was edited; the message names the file and the line.
@@ -110,7 +110,8 @@ def save_accepted(rationales: list[Rationale], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    # All columns are text but these. The counts of claims are left out: some kinds occur in no row.
+    # All columns but these are text. The counts of claims have no column: a struct needs the same
+    # fields in every file, but some kinds of claims may not occur.
     types = dict.fromkeys(("attempt", "seed", "prompt_tokens", "completion_tokens"), pa.int64())
     types |= {"accepted": pa.bool_(), "fallback": pa.bool_(), "finished": pa.float64()}
     types["reasons"] = pa.list_(pa.string())

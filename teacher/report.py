@@ -1,4 +1,4 @@
-"""Report of a narration: figures of all responses, and random rationales beside their frames."""
+"""Report on a teacher's responses: their statistics, and random rationales with their frames."""
 
 from __future__ import annotations
 
@@ -26,28 +26,29 @@ if TYPE_CHECKING:
 Figures = dict[str, Any]
 
 EXAMPLES = 3
-"""Rejected responses that are quoted for each reason."""
+"""Maximum number of rejected responses that are quoted for each reason."""
 COMMON_WORDS = 20
-"""Most frequent words that are listed."""
+"""Number of the most frequent words that are listed."""
 IDLE_SECONDS = 60.0
-"""Time without a response after which the servers count as idle."""
+"""Time (s) without any response from which the servers count as idle."""
 OBJECT_NAME = re.compile(rf"\b(?:{'|'.join(COLORS)}) (?:{'|'.join(MATERIALS)}) \w+")
 
 
 def summarize(
     items: Sequence[SelectionItem], responses: Mapping[str, Sequence[Rationale]]
 ) -> Figures:
-    """Figures of the responses to each item, which are in the order of their attempts.
+    """Return statistics of the responses to each item, which are in the order of their attempts.
 
-    Counts of items: `accepted`; `fallback`, those of them with a rationale of the built-in
-    narrator instead of the teacher's; `set_aside`, without an accepted response; `too_short`,
-    without any response because the prefix is too short. `responses` and `accepted_responses`
-    count the teacher's, by attempt. `rejected` counts responses by kind of reason, the most
-    frequent first, and `examples` has items and details of some. `lengths` are words of each
-    accepted rationale, `words` the most frequent ones. `same_text` counts accepted rationales that
-    repeat another one's text, `same_but_names` those that do so up to the objects' names. `claims`
-    are the supported, contradicted and unknown ones, by kind. `hours` is the time in which servers
-    were in use; multiplied by their number of GPUs, it gives GPU hours.
+    - Numbers of items: `accepted`; `fallback`, the accepted ones whose rationale the built-in
+      narrator wrote instead of the teacher; `set_aside`, without an accepted response; `too_short`,
+      without any response because the prefix is too short.
+    - `responses` and `accepted_responses`: numbers of the teacher's responses, by attempt.
+    - `rejected`: number of responses by kind of reason; `examples`: items and details of some.
+    - `lengths`: number of words of each accepted rationale; `words`: the most frequent words.
+    - `same_text`: number of accepted rationales with the text of an earlier one; `same_but_names`:
+      the same if the names of objects are ignored.
+    - `claims`: numbers of supported, contradicted and unknown claims, by kind.
+    - `hours`: time in which the servers were in use. Multiply it by their GPUs to get GPU hours.
     """
     every = [r for item in items for r in responses.get(item.item_id, ())]
     accepted = select_accepted(items, responses)
@@ -92,7 +93,7 @@ def summarize(
 def select_accepted(
     items: Sequence[SelectionItem], responses: Mapping[str, Sequence[Rationale]]
 ) -> list[Rationale]:
-    """The first accepted rationale of each item that has one, in item order."""
+    """Return the first accepted rationale of each item that has any, in item order."""
     firsts = (
         next((r for r in responses.get(item.item_id, ()) if r.accepted), None) for item in items
     )
@@ -100,14 +101,14 @@ def select_accepted(
 
 
 def rejection_reasons(rationale: Rationale) -> dict[str, str]:
-    """Each kind of reason for which a response was rejected, with its first detail: a response with
-    several numbers has one entry, "number"."""
+    """Return the kinds of reasons for which a response was rejected, each with its first detail. A
+    response with several numbers, for example, has one entry, "number"."""
     reasons = (reason.partition(":") for reason in reversed(rationale.reasons))
     return {kind: detail.strip() for kind, _, detail in reasons}
 
 
 def format_figures(figures: Figures) -> str:
-    """The figures as plain text."""
+    """Format the statistics of `summarize` as plain text."""
     import pandas as pd
 
     f = figures
@@ -182,7 +183,8 @@ def write_report(
     seed: int,
     folder: Path,
 ) -> Path:
-    """Write report.json, report.txt, and report.html with `count` random accepted rationales."""
+    """Write report.json, report.txt and report.html, which shows `count` accepted rationales,
+    sampled with `seed`. Return the path of report.html."""
     import jinja2
 
     from data.publish.contact_sheets import SheetRows, draw_sheet

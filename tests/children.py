@@ -9,17 +9,22 @@ from collections.abc import Sequence
 from typing import Any
 
 TIMEOUT = 500
-"""Seconds after which a child is killed: fewer than pytest gives a test, so that nothing is left
-behind."""
+"""Time (s) after which a child is killed. It is below pytest's timeout of a test, so that no child
+outlives its test."""
 
 
 def run_child(
     command: Sequence[object], check: bool = False, **options: Any
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end and capture its output; with `check`, it must succeed.
+    """Run a command to its end and capture its output.
 
-    If it takes longer than `TIMEOUT`, or the test is interrupted, it is killed together with its
-    own children, such as ranks that wait for each other.
+    If the command takes longer than `TIMEOUT`, or the test is interrupted, it is killed together
+    with its own children, such as ranks that wait for each other.
+
+    Args:
+        command: The program and its arguments, which are converted to strings.
+        check: Fail if the exit status is not 0.
+        options: Further arguments of `subprocess.Popen`.
     """
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     command = [str(part) for part in command]

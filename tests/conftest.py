@@ -1,4 +1,4 @@
-"""Shared fixtures: a small benchmark that is simulated, rendered and built once a session."""
+"""Shared fixtures: a small benchmark that is simulated, built and rendered once per session."""
 
 from __future__ import annotations
 
@@ -6,12 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from conf.schema import (
-    BenchmarkConfig,
-    Quota,
-    RetrievalTrackConfig,
-    SelectionConfig,
-)
+from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import ensure_benchmark
 from data.store import Store, open_store
 from data.tracks.selection import event, time, window
@@ -53,14 +48,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--benchmark",
         type=Path,
-        help="a built benchmark, such as store/tiny, for the tests of built benchmarks, instead of "
-        "the small one",
+        help="folder of a built benchmark, such as store/tiny, that the tests of built benchmarks "
+        "use instead of the small one",
     )
 
 
 @pytest.fixture(scope="session")
 def benchmark_store(request: pytest.FixtureRequest) -> Store:
-    """The benchmark of the tests of built benchmarks."""
+    """The benchmark that `--benchmark` names, otherwise the small one."""
     folder = request.config.getoption("--benchmark")
     return open_store(folder) if folder else request.getfixturevalue("micro_store")
 

@@ -1,4 +1,4 @@
-"""Ports of this machine, and a small HTTP server with JSON requests and responses."""
+"""A free port of this machine, and a small HTTP server with JSON requests and responses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def free_port() -> int:
 
 
 class LocalServer(ThreadingHTTPServer):
-    """A server that starts when it is created. Set the attributes of its handler before."""
+    """A server that starts when it is created, so the handler's attributes must be set before."""
 
     daemon_threads = True
 

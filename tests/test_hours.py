@@ -1,4 +1,4 @@
-"""GPU hours follow from measured rates only; a missing rate gives no figure."""
+"""GPU hours are computed from measured rates; a run without a measured rate has no hours."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_hours_are_samples_divided_by_the_rate(runs) -> None:
     assert "python -m benchmarks.speed.contrastive qwen3_vl_emb_8b --quantization nf4" in missing
 
 
-def test_the_last_rate_of_a_card_counts(tmp_path: Path, runs) -> None:
+def test_the_last_rate_of_a_card_is_used(tmp_path: Path, runs) -> None:
     path = tmp_path / "rates.jsonl"
     assert hours.read_rates(path) == []
     for rate, card in ((1.0, "a card"), (4.0, "another card"), (8.0, "a card")):

@@ -1,4 +1,4 @@
-"""Rules for the whole tree: imports, commands, folders, errors."""
+"""Rules for the whole repository: imports, commands, folders, error codes, package registries."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("conf", "data", "teacher", "models", "train", "evaluation")
-"""In the order of the data flow: a package imports only from itself and from those before it."""
+"""The packages in the order of the data flow: each imports only from itself and those before it."""
 HEAVY = {"torch", "transformers", "sentence_transformers", "pybullet", "matplotlib", "datasets"}
+"""Packages that take long to import."""
 MODULES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 COMMANDS = sorted(
     name
@@ -22,9 +23,10 @@ COMMANDS = sorted(
     for name in re.findall(r'^@command\("([\w.]+)"', path.read_text(), re.MULTILINE)
 )
 LARGEST_FOLDER = 14
+"""Maximum number of modules in a folder."""
 
 
-def test_every_command_is_known() -> None:
+def test_all_commands_are_found() -> None:
     assert {"data.build", "train.sft", "train.contrastive", "evaluation.report"} <= set(COMMANDS)
     assert len(COMMANDS) == 16
 

@@ -1,4 +1,4 @@
-"""The commands of `make paper-tiny` and `make paper` compose and have a valid order."""
+"""The commands of `make paper-tiny` and `make paper` have valid settings and a valid order."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from pathlib import Path
 import pytest
 
 from tests.children import run_child
-from tests.conf.test_presets import settings
+from tests.conf.test_presets import compose_line
 
 ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture(scope="module", params=["paper-tiny", "paper"])
 def lines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """The commands of a target, printed instead of run."""
+    """The commands of a make target, which `PY=echo python -m` prints instead of running."""
     releases = tmp_path_factory.mktemp("releases")
     for suite in ("movi_a", "physion"):
         (releases / suite).mkdir()
     done = run_child(
-        # -o keeps make from creating the environment.
+        # With -o, make treats the environment as up to date and does not create it.
         ["make", "-s", "-o", ".venv/.ready", request.param, "PY=echo python -m",
          f"RELEASES={releases}"],
         cwd=ROOT, check=True,
@@ -29,30 +29,30 @@ def lines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.mark.slow
-def test_every_command_composes(lines: list[str]) -> None:
+def test_settings_of_every_command_are_valid(lines: list[str]) -> None:
     for line in lines:
-        settings(line)
+        compose_line(line)
 
 
 def test_a_model_is_trained_before_it_is_evaluated(lines: list[str]) -> None:
     trained = set()
     for line in lines:
         _, _, command, *overrides = shlex.split(line)
-        settings_of_line = dict(o.lstrip("+").split("=", 1) for o in overrides)
+        settings = dict(o.lstrip("+").split("=", 1) for o in overrides)
         for key in ("model", "matcher.model"):
-            assert settings_of_line.get(key) is None or settings_of_line[key] in trained, line
+            assert settings.get(key) is None or settings[key] in trained, line
         if command.startswith("train."):
-            trained.add(f"checkpoints/{command.removeprefix('train.')}/{settings_of_line['run']}")
+            trained.add(f"checkpoints/{command.removeprefix('train.')}/{settings['run']}")
 
 
 def test_every_experiment_runs_and_the_report_is_last(lines: list[str]) -> None:
-    chain = "\n".join(lines)
+    text = "\n".join(lines)
     for regime in ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout"):
-        assert f"train.sft +exp={regime} " in chain
+        assert f"train.sft +exp={regime} " in text
     for control in ("candidate_only", "shuffled_prefix", "matched_anchor"):
-        assert chain.count(f"evaluation.select +exp={control} ") == 2
+        assert text.count(f"evaluation.select +exp={control} ") == 2
     for command in ("train.contrastive", "retrieve", "similarity", "two_stage"):
-        assert command in chain
+        assert command in text
     assert lines[-1] == "python -m evaluation.report"
 
 

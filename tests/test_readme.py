@@ -1,5 +1,5 @@
-"""The commands in README.md and docs/ have valid settings, and other commands there produce the
-runs that they name."""
+"""Commands in README.md and docs/ exist and have valid settings, and the runs that they name are
+produced by other documented commands."""
 
 from __future__ import annotations
 
@@ -9,23 +9,31 @@ from pathlib import Path
 
 import pytest
 
-from conf.compose import preflight
+from conf.compose import config_name, preflight
 from conf.multirun.sweep import Sweep
-from conf.runs import run_name
+from conf.runs import TRAINER_FOLDERS, run_name
 from tests.conf.test_presets import SCHEMAS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-LINE = re.compile(r"^    python -m ((?:data|teacher|train|evaluation)\.\S+)(.*)$", re.MULTILINE)
-TYPED = sorted({typed for page in PAGES for typed in LINE.findall(page.read_text())})
-COMMANDS = [(command, shlex.split(rest, comments=True)) for command, rest in TYPED]
+LINE = re.compile(r"^    python -m (\S+)(.*)$", re.MULTILINE)
+LINES = sorted({line for page in PAGES for line in LINE.findall(page.read_text())})
+COMMANDS = [(command, shlex.split(rest, comments=True)) for command, rest in LINES]
+"""The command and the overrides of each line of a code block that starts with `python -m`."""
 
 
 def run_folder(command: str, overrides: list[str]) -> str:
     """The run's folder below checkpoints/."""
     settings = dict(o.lstrip("+").split("=", 1) for o in overrides if "=" in o)
-    kind = {"evaluation.study.export": "export_study"}.get(command, command.rpartition(".")[2])
-    return f"{kind}/{run_name(settings.get('run'), overrides)}"
+    return f"{config_name(command)}/{run_name(settings.get('run'), overrides)}"
+
+
+def test_named_modules_exist() -> None:
+    for page in PAGES:
+        for module in re.findall(r"python -m\s+([\w.]+)", page.read_text()):
+            is_benchmark = module.startswith("benchmarks.")
+            path = ROOT / f"{module.replace('.', '/')}.py"
+            assert path.exists() if is_benchmark else module in SCHEMAS, f"{page.name}: {module}"
 
 
 @pytest.mark.slow
@@ -33,13 +41,11 @@ def run_folder(command: str, overrides: list[str]) -> str:
 def test_settings_of_a_documented_command_are_valid(command: str, overrides: list[str]) -> None:
     check = Sweep if "-m" in overrides else preflight
     settings = [o.replace("=RUN", "=checkpoints/sft/exp-cot") for o in overrides if o != "-m"]
-    if command in SCHEMAS:
-        check(command, SCHEMAS[command], settings)
+    check(command, SCHEMAS[command], settings)
 
 
 def test_named_runs_are_produced_by_other_commands() -> None:
     produced = {run_folder(command, o) for command, o in COMMANDS if "-m" not in o}
-    produced |= {"sft/search"}
     named = set()
     for command, overrides in COMMANDS:
         for override in overrides:
@@ -48,6 +54,9 @@ def test_named_runs_are_produced_by_other_commands() -> None:
                 named.add(value.removeprefix("checkpoints/"))
             if (command, key) == ("evaluation.study.export", "run"):
                 named.add(f"study/{value}")
+            if (command, key) == ("train.export", "run"):
+                product = "retriever" if "product=retriever" in overrides else "student"
+                named.add(f"{TRAINER_FOLDERS[product]}/{value}")
     assert len(named) > 3
     assert named <= produced
 

@@ -1,4 +1,4 @@
-"""Fixtures of a student and a retriever with a few thousand weights."""
+"""Fixtures of a student and a retriever that are small enough to train in seconds."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def model(processor: ProcessorMixin) -> PreTrainedModel:
 
 @pytest.fixture(scope="session")
 def saved_base(tmp_path_factory: pytest.TempPathFactory, processor: ProcessorMixin) -> str:
-    """The folder of a saved base."""
+    """The folder of a base with random weights."""
     folder = tmp_path_factory.mktemp("base")
     build_model(SMALL, len(processor.tokenizer)).save_pretrained(folder)
     processor.save_pretrained(folder)
@@ -90,7 +90,7 @@ def nf4_cfg(saved_base: str) -> StudentConfig:
 
 
 def randomize_adapters(model: nn.Module, std: float) -> None:
-    """Give LoRA an effect on the outputs: its B matrices start at zero."""
+    """Randomize LoRA's B matrices, which are zero at first, so that adapters change the outputs."""
     for name, weight in model.named_parameters():
         if "lora_B" in name:
             nn.init.normal_(weight, std=std)
@@ -105,9 +105,12 @@ def frames(micro_store: Store) -> FrameReader:
 def few_steps(
     micro: BenchmarkConfig, micro_store: Store, nf4_cfg: StudentConfig
 ) -> Callable[..., SftCommand]:
-    """A function from overrides of `train` to settings of `train.sft` for a few steps."""
+    """A function that returns settings of `train.sft` for a few steps.
 
-    def settings(**train: object) -> SftCommand:
+    Its arguments replace settings of the group `train`.
+    """
+
+    def settings(**overrides: object) -> SftCommand:
         few = SftTrainConfig(
             lr=1e-3, max_steps=4, batch=2, micro_batch=2, precision="fp32", evaluations=2,
             gradient_checkpointing=False, validation_items=2, generated_items=0,
@@ -118,7 +121,7 @@ def few_steps(
             workers=1,
             teacher=TeacherConfig(name="template"),
             student=nf4_cfg,
-            train=replace(few, **train),
+            train=replace(few, **overrides),
         )
 
     return settings
@@ -144,7 +147,7 @@ def contrastive_settings(
 
 @pytest.fixture(scope="session")
 def queries(micro_store: Store) -> list[RetrievalQuery]:
-    """Ten queries; some share a prefix, some share a frame."""
+    """Ten queries, some of which share a prefix or a frame."""
     queries = micro_store.retrieval("train")[:6]
     longer = [
         replace(

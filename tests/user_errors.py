@@ -1,4 +1,4 @@
-"""Assertions about UserError by its stable code instead of its wording."""
+"""Assertions that check the stable code of a UserError instead of its wording."""
 
 from __future__ import annotations
 

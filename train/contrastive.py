@@ -1,5 +1,5 @@
-"""Train a retriever with a ranking loss over the other frames of a batch and hard negatives, summed
-over Matryoshka widths."""
+"""Train a retriever with a ranking loss: each query's target must score above its hard negatives
+and the frames of the other queries in its batch, at every width of the embeddings (Matryoshka)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
     from models.compat import keep_freed_memory
     from models.distributed import is_sharded, main_first, split_batch
-    from models.lora_kernels import fuse
+    from models.lora_kernels import use_fast_layers
     from models.resolved import data_digest, resolve_run
     from models.retriever.embedder import load_retriever, tokenizer_texts
     from train.common.checkpoints import newest_checkpoint
@@ -42,14 +42,14 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     keep_freed_memory()
     if is_sharded():
         raise UserError(
-            "a retriever cannot be trained with FSDP: sentence-transformers reads each checkpoint "
-            "as a whole model; replace --use_fsdp by --multi_gpu, which works on CPUs too",
+            "a retriever cannot be trained with FSDP, because sentence-transformers cannot load a "
+            "sharded checkpoint: replace --use_fsdp by --multi_gpu, which works on CPUs too",
             code="unsupported-with-fsdp",
         )
     rank_batch = split_batch(cfg.train.batch)
     checkpoint = newest_checkpoint(run.folder)
 
-    # The main rank builds what is missing; then every rank reads it from the disk.
+    # The main rank builds the benchmark if it is missing; then every rank reads it from the disk.
     with main_first():
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     training, validation = split_queries(
@@ -67,7 +67,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     texts = tokenizer_texts(store.retrieval("train"), retriever)
     with explain_load_errors("retriever"):
         model = load_retriever(retriever, precision, texts, run.folder / "untrained")
-    fuse(model)
+    use_fast_layers(model)
 
     trainer = build_trainer(cfg, run, store, model, training, validation, rank_batch, checkpoint)
     memory_settings = "train.mini_batch, retriever.image_size or retriever.frames"

@@ -1,15 +1,15 @@
 """Export a trained student or retriever: merged into its base, or its adapters alone.
 
     checkpoints/export_<product>/<run>/<format>/<product>/
-        config.json, model.safetensors         bf16 and fp32: for the libraries' own classes
+        config.json, model.safetensors         bf16 and fp32: for the libraries alone
         adapter_config.json, adapter_model.safetensors, resolved.yaml    adapter: for peft
         modules.json and the modules' folders  of a retriever
         tokenizer and processor files
         README.md      the model card
         config.yaml, run.json, metrics.json    copied from the training run
-        export.json    what was exported, and how far it differs from what was trained
+        export.json    the run, the format, a digest of the adapters, and measured differences
 
-The folder is written under another name and renamed when it is complete.
+Until it is complete, the folder has a temporary name.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
                 f"{folder} and export again",
                 code="other-adapters",
             )
-        log.info("%s is exported already; delete it to export again", folder)
+        log.info("%s is already exported; delete it to export again", folder)
         return record["measured"]
     measured: dict[str, float] = {}
     with renamed_when_complete(folder) as partial:
@@ -89,8 +89,8 @@ def find_run(
     """Return the name, the folder and the settings of the run to export.
 
     Raises:
-        UserError: The run does not exist, is not finished or trained the whole model, its adapters
-            are missing, or its base has changed.
+        UserError: The run does not exist, is not finished or trained all weights; its adapters are
+            missing; or its base has changed.
     """
     from models.resolved import check_base
     from models.trained_runs import trained_settings
@@ -118,8 +118,8 @@ def find_run(
 def write_merged(
     merge: StudentMerge | RetrieverMerge, folder: Path, cfg: ExportModelCommand
 ) -> dict[str, float]:
-    """Write a merged model, and return how its outputs differ from the trained model's: relative
-    differences, and the fraction of equal choices. Empty with `verify=false`.
+    """Write a merged model, and return the comparison of its outputs with those of the trained
+    model (see `train.common.merge.compare`), which is empty with `verify=false`.
 
     Raises:
         UserError: The outputs differ too much, or the benchmark or its rationales are missing.
@@ -137,12 +137,12 @@ def write_merged(
     log.info("running the merged %s", cfg.product)
     measured = compare(trained, merge.merged_outputs(folder, items))
     for name, value in measured.items():
-        # The negation also refuses NaN.
+        # Unlike >, "not <=" also refuses NaN.
         if name.endswith("_difference") and not value <= merge.max_difference:
             raise UserError(
                 f"the relative {name.replace('_', ' ')} between the merged and the trained "
-                f"{cfg.product} is {value:.3g}, above the limit of {merge.max_difference}; nothing "
-                "was exported. Try format=fp32 or format=adapter",
+                f"{cfg.product} is {value:.3g}, above the limit of {merge.max_difference}, so "
+                "nothing was exported: try format=fp32 or format=adapter",
                 code="merge-difference",
             )
     return measured
@@ -150,8 +150,8 @@ def write_merged(
 
 @contextmanager
 def renamed_when_complete(folder: Path) -> Iterator[Path]:
-    """Yield a folder to write into, and rename it to `folder` at the end. Leftovers of an
-    interrupted export are deleted."""
+    """Yield a temporary folder, and rename it to `folder` at the end of the block. It is deleted
+    after a UserError or Ctrl-C, and emptied first if a killed export left files in it."""
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(exist_ok=True)
     with lock_folder(partial, f"{folder} is being written by another process"):

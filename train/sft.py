@@ -1,6 +1,6 @@
 """Train a student on rationales or answers, by default with LoRA over a frozen 4-bit base.
 
-`+exp=base` trains the whole tiny base on descriptions instead.
+With `+exp=base`, it trains all weights of the tiny base on descriptions instead.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
     from models import compat, distributed, loading
     from models.checks import check_adapters
-    from models.lora_kernels import fuse
+    from models.lora_kernels import use_fast_layers
     from models.resolved import data_digest, resolve_run
     from teacher.narrate import ensure_rationales
     from train.common import training_loop
@@ -50,8 +50,8 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.
     with distributed.main_first():
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-        needs_none = cfg.train.regime in WITHOUT_RATIONALES
-        rationales = [] if needs_none else ensure_rationales(store, cfg.teacher)
+        without = cfg.train.regime in WITHOUT_RATIONALES
+        rationales = [] if without else ensure_rationales(store, cfg.teacher)
     training, validation = load_datasets(cfg, store, rationales)
 
     data = data_digest(store.identity, training.texts)
@@ -67,7 +67,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         model, processor = loading.load_student(student, precision, corpus)
         if not distributed.is_sharded():
             model.to(distributed.rank_device())
-    fuse(model)
+    use_fast_layers(model)
     if checkpoint is not None:
         check_adapters(checkpoint, model, student.lora.rank, student.model)
 
@@ -77,7 +77,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
 
     weights = training_loop.gather_weights(trainer)
     if rank() == 0:
-        # A base is saved in bf16, whatever precision it was trained in: released bases are bf16.
+        # A base is saved in bf16, as released bases are, whatever its precision in training.
         saved_precision = "bf16" if cfg.train.regime == "describe" else precision
         loading.save_student(model, processor, run.folder / "student", saved_precision, weights)
     log.info("the student is in %s", run.folder / "student")

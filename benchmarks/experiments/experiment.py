@@ -1,7 +1,8 @@
 """Trains and evaluates variants with several seeds, and records their results in a parquet file.
 
-A run that is recorded is not trained again. The project's own commands do the work in subprocesses;
-they resume, so an interrupted experiment resumes when its script is started again.
+A variant and a seed whose results are recorded are not run again. The project's commands train and
+evaluate in subprocesses. They resume, so an interrupted experiment resumes when its script is
+started again.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ Job = tuple[str, int]
 
 
 def create_parser(description: str, benchmark: str, record: Path) -> argparse.ArgumentParser:
-    """A parser of the options of every experiment, with their defaults."""
+    """Return a parser with the options of every experiment, some with an experiment's defaults."""
     parser = argparse.ArgumentParser(description=description.partition("\n\n")[0])
     parser.add_argument("--benchmark", default=benchmark)
     parser.add_argument("--store", default="store")
@@ -34,29 +35,29 @@ def create_parser(description: str, benchmark: str, record: Path) -> argparse.Ar
 
 @dataclass(frozen=True)
 class Experiment:
-    """The runs that an experiment compares."""
+    """An experiment that trains and evaluates variants of a model."""
 
     args: argparse.Namespace
-    """Options of `create_parser`."""
+    """The parsed options of `create_parser`."""
     identity: dict[str, str]
-    """Values of the record's columns that the rows of this experiment share."""
-    variant: str
-    """Column of the record with the variant."""
+    """Columns that tell the rows of this experiment from other rows of the record, with values."""
+    variant_column: str
+    """Name of the column with the variant."""
     trainer: str
     """Command that trains a variant, such as train.sft."""
     evaluator: str
     """Command that evaluates a variant, such as evaluation.select."""
 
     @property
-    def shared(self) -> list[str]:
-        """Overrides of all commands."""
+    def shared_overrides(self) -> list[str]:
+        """Overrides of every command."""
         args = self.args
         return [
             f"benchmark={args.benchmark}", f"store={args.store}", f"checkpoints={args.checkpoints}",
         ]  # fmt: skip
 
     def read_results(self, seeds: int | None = None) -> pd.DataFrame:
-        """The recorded results, of the first `seeds` seeds."""
+        """Return the recorded results with seeds below `seeds`; all by default."""
         table = pd.read_parquet(self.args.record)
         for column, value in self.identity.items():
             table = table[table[column] == value]
@@ -65,17 +66,18 @@ class Experiment:
     def run(
         self, jobs: Sequence[Job], evaluate: Callable[[Job], list[dict[str, Any]]]
     ) -> pd.DataFrame:
-        """Run the jobs that are not recorded, and return all results.
+        """Run the jobs that are not recorded, and return the results of the seeds to compare.
 
         Args:
-            evaluate: Returns the rows of a job in the record.
+            evaluate: Runs a job and returns its rows of the record, without the columns that the
+                experiment adds: its identity, the variant and the seed.
         """
         if not self.args.table:
-            run_command(["data.build", *self.shared[:2]])
+            run_command(["data.build", *self.shared_overrides[:2]])
             recorded = self.read_results()
-            done = set(zip(recorded[self.variant], recorded.seed, strict=True))
+            done = set(zip(recorded[self.variant_column], recorded.seed, strict=True))
             for variant, seed in (job for job in jobs if job not in done):
-                shared = {**self.identity, self.variant: variant, "seed": seed}
+                shared = {**self.identity, self.variant_column: variant, "seed": seed}
                 rows = pd.DataFrame([shared | row for row in evaluate((variant, seed))])
                 table = pd.concat([pd.read_parquet(self.args.record), rows])
                 table.to_parquet(self.args.record, index=False, compression="zstd")
@@ -87,13 +89,13 @@ class Experiment:
     def train_and_evaluate(
         self, name: str, training: Sequence[str] | None, evaluation: Sequence[str] = ()
     ) -> Path:
-        """Train and evaluate a run, and return the folder of its evaluation.
+        """Train and evaluate a variant, and return the folder of the evaluation.
 
         Args:
-            training: Overrides of the trainer; None evaluates without training.
-            evaluation: Further overrides of the evaluation.
+            training: Overrides of the training; None evaluates an untrained model.
+            evaluation: Overrides of the evaluation.
         """
-        shared = [*self.shared, f"run={name}"]
+        shared = [*self.shared_overrides, f"run={name}"]
         if training is not None:
             run_command([self.trainer, *training, *shared])
             kind = self.trainer.partition(".")[2]
@@ -105,7 +107,7 @@ class Experiment:
 
 
 def run_command(command: Sequence[str]) -> None:
-    """Run `python -m` with a command and wait for it.
+    """Run `python -m` with a command, and wait until it ends.
 
     Raises:
         SystemExit: The command fails; the message holds the end of its standard error.

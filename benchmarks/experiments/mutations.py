@@ -1,12 +1,14 @@
-"""How many false words of rationales the validator detects, and how many true ones it contradicts.
+"""Measures which false words in rationales the validator detects, and which true claims it rejects.
 
     python -m benchmarks.experiments.mutations store/small
     python -m benchmarks.experiments.mutations tests/teacher/prose.jsonl
 
-The rationales are those of the built-in narrator for the training items of a built benchmark, or
-those of a JSON lines file with the fields item_id, text and predicates. Each rationale is read as
-it is and after one word of each kind was replaced by a false one. Prints the detected share of each
-kind with some of the missed words, and the claims of the unchanged rationales by kind and verdict.
+The built-in narrator writes rationales for the training items of a built benchmark, or they are
+read from a JSON lines file with the fields item_id, text and predicates. For each kind of word,
+such as speed, one word of each rationale is replaced by a false word, which is detected if the
+validator finds a contradicted claim in the changed text. The script prints the detected share of
+each kind, some of the undetected words, and the claims of the unchanged rationales by kind and
+verdict.
 """
 
 from __future__ import annotations
@@ -78,7 +80,7 @@ def main() -> None:
 
 
 def read_rationales(source: Path) -> Iterator[tuple[str, str, Predicates]]:
-    """The item id, text and predicates of each rationale."""
+    """Yield the item id, text and predicates of each rationale."""
     if source.is_file():
         for line in source.read_text().splitlines():
             record = json.loads(line)
@@ -103,10 +105,10 @@ def parse_predicates(record: dict[str, Any]) -> Predicates:
 def replace_words(
     text: str, words: Sequence[str], rng: Random, predicates: Predicates | None = None
 ) -> Iterator[Mutation]:
-    """Replace each of `words` by another one of them.
+    """Yield one text for each occurrence of one of `words`, in which another of them replaces it.
 
-    With `predicates`, words about an object of unknown motion are not replaced, because no word
-    about it would be false.
+    With `predicates`, a word about an object whose motion is unknown is not replaced, because no
+    word for this motion would be false.
     """
     pattern = "|".join(sorted(words, key=len, reverse=True))
     for match in re.finditer(rf"\b(?:{pattern})\b(?!-)", text):
@@ -120,14 +122,14 @@ def replace_match(text: str, match: re.Match[str], word: str) -> Mutation:
 
 
 def is_motion_known(text: str, position: int, predicates: Predicates) -> bool:
-    """Whether the predicates know the motion of the last object named before `position`."""
+    """Return whether the last object named before `position` in its sentence has a known speed."""
     before = text[text.rfind(".", 0, position) + 1 : position].lower()
     last = max(predicates.objects, key=lambda facts: before.rfind(facts.object))
     return last.object not in before or last.speed is not None
 
 
 def replace_colors(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """Replace the colour of an object so that the name fits no object of the scene."""
+    """Replace the colour of an object so that the name fits no object in the predicates."""
     known = str(asdict(predicates))
     for match in re.finditer(rf"\b({'|'.join(COLORS)})( (?:metal|rubber) \w+)", text):
         free = [color for color in COLORS if f"{color}{match[2]}" not in known]
@@ -136,7 +138,7 @@ def replace_colors(text: str, predicates: Predicates, rng: Random) -> Iterator[M
 
 
 def replace_partners(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """Replace the partner in each clause of the motion analysis that states exactly one pair."""
+    """Replace the second object in clauses of the motion analysis that state that a pair meets."""
     names = [facts.object for facts in predicates.objects]
     met = {frozenset(m.objects) for m in (*predicates.courses, *predicates.contacts)}
     start, stop = text.find("Motion analysis:"), text.find("Prediction:")
@@ -159,10 +161,8 @@ def replace_answer(text: str, predicates: Predicates, rng: Random) -> Iterator[M
 
 
 def swap_candidates(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """Exchange the letters of the right candidate and of another one before the answer.
-
-    Letters without the word "candidate", which occur in free prose, stay.
-    """
+    """Exchange the letters of the target and of another candidate after the word "candidate", from
+    the candidate analysis up to the answer."""
     right = predicates.answer
     other = rng.choice([letter for letter in LETTERS if letter != right])
     start, stop = text.find("Candidate analysis:"), text.find("Answer:")
@@ -182,7 +182,7 @@ MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = 
     "answer": replace_answer,
     "candidate": swap_candidates,
 }
-"""The generator of false texts of each kind of word."""
+"""For each kind of word, a function that yields texts in which one such word is false."""
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""The paper's comparison of training regimes at tiny scale: zero-shot, answer-only, CoT, and CoT
-without each of its parts, three seeds each, on more than a thousand test items.
+"""Compares the paper's training regimes at tiny scale: zero-shot, answer-only, CoT, CoT without the
+candidate analysis, and CoT without the match layout, on more than a thousand test items.
 
     python -m benchmarks.experiments.regimes            # train and evaluate what is missing
     python -m benchmarks.experiments.regimes --table    # print the recorded results
 
-Every chosen letter is recorded in `letters.parquet`, one row per test item, run and mode, under the
-hash of the base's weights. Accuracies are means over the seeds; intervals are 95% percentile
-intervals of a bootstrap that resamples scenes and seeds.
+Every chosen letter is recorded in `letters.parquet`, one row per test item, run and mode, together
+with the hash of the base's weights. Accuracies are means over three seeds; intervals are 95%
+percentile intervals of a bootstrap that resamples scenes and seeds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MODES = {
     "cot_no_candidate_analysis": ("reasoning", "answer"),
     "cot_no_match_layout": ("reasoning", "answer"),
 }
-"""The modes in which each regime is evaluated. Zero-shot decoding is greedy and has one seed."""
+"""The modes in which each regime is evaluated. Zero-shot decodes greedily, so it has one seed."""
 PAIRS = (
     (("cot", "reasoning"), ("answer_only", "answer")),
     (("cot", "answer"), ("answer_only", "answer")),
@@ -42,8 +42,9 @@ PAIRS = (
     (("cot", "reasoning"), ("cot_no_match_layout", "reasoning")),
     (("cot", "reasoning"), ("zero-shot", "reasoning")),
 )
-"""The differences in the second table: first minus second."""
+"""The regimes and modes that the second table compares: first minus second."""
 DRAWS = 4000
+"""Number of bootstrap samples."""
 
 
 def main() -> None:
@@ -59,7 +60,7 @@ def main() -> None:
         regime, seed = job
         student = f"student={args.student}"
         training = [f"+exp={regime}", f"seed={seed}", student]
-        # By default a base is prompted for the structured record, unknown to the tiny base.
+        # The default modes ask a base for a structured record, which the tiny base cannot write.
         zero_shot = regime == "zero-shot"
         folder = experiment.train_and_evaluate(
             f"{args.benchmark}-{base[:8]}-{regime}-{seed}",
@@ -68,14 +69,14 @@ def main() -> None:
         )
         return read_letters(folder, Path(args.store), args.benchmark, regime)
 
-    # Ordered by seed, so that an interrupted experiment compares all regimes over fewer seeds.
+    # Sorted by seed, so that an interrupted experiment has fewer seeds of every regime.
     trained = [regime for regime in MODES if regime != "zero-shot"]
     jobs = [("zero-shot", 0), *((r, seed) for seed in range(args.seeds) for r in trained)]
     print_tables(experiment.run(jobs, evaluate))
 
 
 def read_letters(folder: Path, store: Path, benchmark: str, regime: str) -> list[dict[str, Any]]:
-    """The letter of each test item in each mode of a run."""
+    """Return the rows of a run: the chosen letter for each test item in each mode."""
     cfg = compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
     lines = [json.loads(line) for line in (folder / "answers.jsonl").read_text().splitlines()]
     letters = {(r["item_id"], r["mode"]): r["letter"] for r in lines if "item_id" in r}
@@ -90,7 +91,7 @@ def read_letters(folder: Path, store: Path, benchmark: str, regime: str) -> list
 
 
 def print_tables(table: pd.DataFrame) -> None:
-    """Print accuracies by regime and mode, then differences between them, in percent."""
+    """Print the accuracies of regimes and modes, then the differences in `PAIRS`, in percent."""
     groups = [(regime, mode) for regime in MODES for mode in MODES[regime]]
     correct = {g: credit_matrix(table, *g) for g in groups}
     correct = {group: credits for group, credits in correct.items() if credits.shape[1]}
@@ -99,7 +100,7 @@ def print_tables(table: pd.DataFrame) -> None:
     print("|---" * (len(FAMILIES) + 5) + "|")
     for (regime, mode), credits in correct.items():
         rows = table[(table.regime == regime) & (table["mode"] == mode)]
-        seeds = [100 * resampling.point(credits[[seed]])[-1] for seed in credits]
+        seeds = [100 * resampling.means(credits[[seed]])[-1] for seed in credits]
         cells = [
             f"{m:.1f} [{low:.1f}, {high:.1f}]" for m, low, high in resampling.intervals(credits)
         ]
@@ -116,17 +117,17 @@ def print_tables(table: pd.DataFrame) -> None:
 
 
 def credit_matrix(table: pd.DataFrame, regime: str, mode: str) -> pd.DataFrame:
-    """Whether each answer is right: a row per item, a column per seed."""
+    """Return 1 for each right answer and 0 for each wrong one, (items, seeds)."""
     rows = table[(table.regime == regime) & (table["mode"] == mode)]
     credits = (rows.letter == rows.answer).astype(float)
     return credits.groupby([rows.family, rows.scene_id, rows.item_id, rows.seed]).sum().unstack()
 
 
 class Resampling:
-    """A bootstrap over scenes and seeds of the family means and of their plain mean, the macro.
+    """A bootstrap over scenes and seeds of the accuracy in each family and their mean, the macro.
 
-    Compared runs share the resampled scenes. Their seeds are resampled independently, since runs
-    of the same seed number have nothing else in common.
+    All regimes share the resampled scenes. Their seeds are resampled independently, since runs of
+    two regimes with the same seed have nothing in common but its number.
     """
 
     def __init__(self, items: pd.MultiIndex) -> None:
@@ -135,27 +136,27 @@ class Resampling:
         self._members = [families == family for family in FAMILIES]
         self._rng = np.random.default_rng(0)
         share = np.full(len(scenes), 1 / len(scenes))
-        # (draws, scenes): how often each draw holds each scene.
+        # (draws, scenes) how often each draw contains each scene.
         self._weights = self._rng.multinomial(len(scenes), share, size=DRAWS).astype(float)
 
-    def point(self, credits: pd.DataFrame) -> np.ndarray:
-        """(families + 1,) the means over all items and seeds, and their macro."""
+    def means(self, credits: pd.DataFrame) -> np.ndarray:
+        """Return (families + 1,) means over all items and seeds: of each family, and the macro."""
         means = [credits[members].to_numpy().mean() for members in self._members]
         return np.array([*means, np.mean(means)])
 
     def intervals(
         self, first: pd.DataFrame, second: pd.DataFrame | None = None
     ) -> list[tuple[float, float, float]]:
-        """Mean, low and high, in percent, of each family and the macro of `first`, or of the
-        difference `first` minus `second`."""
-        point, draws = self.point(first), self._draws(first)
+        """Return the mean and the bounds of its interval, in percent, for each family and the macro
+        of `first`, or of the difference `first` minus `second`."""
+        means, draws = self.means(first), self._draws(first)
         if second is not None:
-            point, draws = point - self.point(second), draws - self._draws(second)
+            means, draws = means - self.means(second), draws - self._draws(second)
         low, high = np.percentile(draws, [2.5, 97.5], axis=0)
-        return [tuple(100 * np.array(t)) for t in zip(point, low, high, strict=True)]
+        return [tuple(100 * np.array(t)) for t in zip(means, low, high, strict=True)]
 
     def _draws(self, credits: pd.DataFrame) -> np.ndarray:
-        """(draws, families + 1)."""
+        """Return the means of each draw, (draws, families + 1)."""
         seeds = credits.shape[1]
         seed_shares = self._rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=DRAWS) / seeds
         means = []

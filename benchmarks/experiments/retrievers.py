@@ -1,13 +1,13 @@
-"""The tiny retriever trained in several ways on the small benchmark: in-batch negatives, same-scene
-hard negatives and late interaction, three seeds each, at every width.
+"""Compares ways to train the tiny retriever on the small benchmark: with in-batch negatives only,
+with same-scene hard negatives, and with late interaction; three seeds each, at every width.
 
     python -m benchmarks.experiments.retrievers            # train and evaluate what is missing
     python -m benchmarks.experiments.retrievers --table    # print the recorded results
 
 Results are recorded in `ranks.parquet`, one row per run and width. The table has means over the
-seeds with the least and the greatest value. It also has variants whose settings no longer exist:
-`hard-scenes` composed batches scene by scene, and `masked` masked near-identical frames in such
-batches.
+seeds, each with the smallest and the largest value. It also has variants whose settings no longer
+exist: `hard-scenes` (batches composed scene by scene), `masked` (the same, with near-identical
+frames masked) and `mined` (negatives mined during training).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ VARIANTS: dict[str, list[str]] = {
     "hard": [],
     "late": ["+exp=late_interaction"],
 }
-"""Overrides of `train.contrastive`; without any it takes one same-scene hard negative a query."""
+"""Overrides of `train.contrastive`, which by default uses one hard negative per query."""
 MEASURES = {"recall@1": 1, "recall@10": 1, "recall@50": 1, "mrr": 3, "median_rank": 1}
 """The printed measures and their decimals; recalls are in percent."""
 
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def read_ranks(folder: Path) -> list[dict[str, Any]]:
-    """The results of a run over all builders, by width."""
+    """Return the rows of a run: its results at each width over the queries of all builders."""
     report = json.loads((folder / "report.json").read_text())
     results = from_json(list[RetrievalResult], report["rows"])
     return [
@@ -64,7 +64,7 @@ def read_ranks(folder: Path) -> list[dict[str, Any]]:
 
 
 def print_table(table: pd.DataFrame) -> None:
-    # Every run also measures the untrained preset, which is the same in all of them.
+    # Every run also measures the untrained retriever. It is the same in all of them: print it once.
     untrained = table[table.untrained & (table.variant == "in-batch") & (table.seed == 0)]
     trained = table[~table.untrained]
     print("| negatives | width | " + " | ".join(MEASURES) + " |\n" + "|---" * 7 + "|")
@@ -75,7 +75,7 @@ def print_table(table: pd.DataFrame) -> None:
 
 
 def summarize(values: pd.Series, measure: str) -> str:
-    """The mean, with the least and the greatest of several."""
+    """Format the mean, followed by the smallest and the largest value if there are several."""
     digits = MEASURES[measure]
     scaled = 100 * values if measure.startswith("recall") else values
     mean = f"{scaled.mean():.{digits}f}"

@@ -1,12 +1,12 @@
-"""Measure the time and memory of building benchmarks, without their frames.
+"""Measures the time and memory of building benchmarks, without rendering their frames.
 
     python -m benchmarks.speed.build 100 1000 10000
 
-For each number of scenes, the dynapix preset is built with proportional quotas in three stages:
-scenes with their oracle, items and queries, databases. Prints the seconds of each stage, scenes per
-second per worker, and the largest sum of the resident memory of all processes (GiB). The benchmarks
-are built below `--folder` (store/growth). An interrupted build resumes; its measurements then cover
-only the remaining work.
+For each number of scenes, the dynapix preset with proportional quotas is built in three stages:
+scenes with their oracle, items and queries, databases. The script prints the seconds of each stage,
+the number of scenes per second and worker, and the peak of the resident memory of all processes
+together (GiB). The benchmarks are built in `--folder`. An interrupted build resumes; the
+measurements then cover only the remaining work.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from data.tracks.shortfalls import summarize_store
 
 PAPER_SCENES = 10_000
 STAGES = ("make_scenes", "make_items_and_queries", "make_databases")
-"""Names of the functions of `data.build` that run the stages. `measure` replaces them by timed
+"""Names of the functions of `data.build` that run the stages. `measure` replaces them with timed
 versions."""
 
 
 def scale_preset(scenes: int) -> BenchmarkConfig:
-    """Return the dynapix preset for another number of scenes. Quotas, the standard test and the
-    databases change in proportion."""
+    """Return the dynapix preset for another number of scenes. The quotas and the sizes of the
+    standard test and of the databases change in proportion."""
     cfg = compose("data.build", BuildCommand, ["benchmark=dynapix"]).benchmark
     cfg.name, cfg.scenes, share = f"growth-{scenes}", scenes, scenes / PAPER_SCENES
 
@@ -58,8 +58,8 @@ def scale_preset(scenes: int) -> BenchmarkConfig:
 
 
 def watch_memory(row: dict[str, float], finished: threading.Event) -> None:
-    """Keep the largest summed memory of this process and its children in `row`, until `finished` is
-    set."""
+    """Until `finished` is set, keep the peak of the resident memory of this process and all its
+    children together in `row`."""
     parent = psutil.Process()
     while not finished.wait(0.5):
         total = 0
@@ -70,11 +70,11 @@ def watch_memory(row: dict[str, float], finished: threading.Event) -> None:
 
 
 def measure(scenes: int, folder: Path, workers: int) -> dict[str, float]:
-    """Build a benchmark, print how many records it has, and return the measurements."""
+    """Build a benchmark, print its numbers of records, and return the measurements."""
     cfg = scale_preset(scenes)
     if (folder / cfg.name).exists():
         raise SystemExit(
-            f"error: {folder / cfg.name} exists, so its build cannot be measured: delete it first"
+            f"error: {folder / cfg.name} is already built, so its build cannot be timed: delete it"
         )
     row = {"scenes": scenes, "peak GiB": 0.0}
     finished = threading.Event()

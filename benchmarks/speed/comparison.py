@@ -1,4 +1,4 @@
-"""Measures variants of a training in turns, each in a process of its own, and prints a table."""
+"""Measures the speed and memory of variants of a training in several rounds, and prints a table."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ from models.tiny_qwen3_vl import SPECIAL_TOKENS, build_processor
 from train.common.arguments import common_arguments
 
 OURS = "ours"
-"""Name of the variant with our trainer and the preset's settings."""
+"""Name of the variant that uses this project's trainer with the preset's settings."""
 SEED = 0
 TRAINING_ONLY = {
     "eval_strategy": "no", "eval_on_start": False, "save_strategy": "no",
     "load_best_model_at_end": False, "disable_tqdm": True,
 }  # fmt: skip
-"""Training arguments without evaluations and checkpoints."""
+"""Arguments of a trainer that disable evaluations, checkpoints and the progress bar."""
 CONFIGS = Path(__file__).parents[2] / "tests/models/configs"
 """The configurations of the released models."""
 
@@ -55,7 +55,7 @@ class Measurements:
     """Measurements of a training."""
 
     rate: float
-    """Samples or queries per second after the first step, including the loading of their inputs."""
+    """Samples or queries per second after the first step; the time to load inputs is included."""
     peak: float
     """Peak memory (GiB) of tensors on the GPU, or of the process on a CPU."""
     losses: list[float]
@@ -75,7 +75,7 @@ class Clock(TrainerCallback):
 
 
 def train(trainer: Trainer, batch: int) -> Measurements:
-    """Train without evaluations and checkpoints; `batch` is the number of samples or queries of a
+    """Train without evaluations and checkpoints; `batch` is the number of samples or queries per
     step."""
     clock = Clock()
     trainer.add_callback(clock)
@@ -92,14 +92,14 @@ def train(trainer: Trainer, batch: int) -> Measurements:
 
 
 def timing_arguments(train: TrainConfig, folder: Path) -> dict[str, Any]:
-    """The training arguments of the project, without evaluations and checkpoints."""
+    """Return this project's training arguments, without evaluations and checkpoints."""
     return {**common_arguments(train, Run("benchmark", folder), SEED, None), **TRAINING_ONLY}
 
 
 def run_in_process(
     function: Callable[..., Any], *arguments: Any, environment: Mapping[str, str] = {}
 ) -> Any:
-    """Call a function in a new process with further environment variables; returns its result."""
+    """Call a function in a new process with additional environment variables; return its result."""
     with (
         patch.dict(os.environ, {"HF_HUB_OFFLINE": "1", **environment}),
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
@@ -112,7 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser, steps: int, variants: Sequenc
     parser.add_argument("preset", nargs="?", default="tiny", help="tiny or a released preset")
     parser.add_argument("--quantization", choices=["nf4", "none"], default="nf4")
     parser.add_argument("--precision", default="auto", help="bf16, fp32 or auto")
-    parser.add_argument("--steps", type=int, default=steps, help="timed steps after a first one")
+    parser.add_argument("--steps", type=int, default=steps, help="steps to time, after the first")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--store", default="store", help="folder of the built benchmarks")
     parser.add_argument("--only", nargs="*", choices=list(variants), help="variants to measure")
@@ -126,20 +126,21 @@ def compare(
     unit: str,
     args: argparse.Namespace,
 ) -> None:
-    """Measure variants in turns, and print medians over the rounds and medians of their ratios.
+    """Measure each variant once per round, and print the medians over the rounds.
 
-    On a GPU, the rate of our trainer with a released preset is recorded.
+    For rates and memory, the medians of the ratios to a reference variant are printed too. A
+    variant that runs out of memory or cannot be trained with its settings is left out. On a GPU,
+    the rate of our trainer with a released preset is appended to `hours.RATES`.
 
     Args:
         benchmark: Module of `benchmarks.speed` that measures.
-        measure: Measures the variant of a name. One that has too little memory or cannot be
-            trained with its settings is left out.
-        reference: Variant that all others are compared with.
+        measure: Measures a variant by its name.
+        reference: Name of the reference variant.
         unit: What a rate counts, such as samples.
-        args: Options of `add_arguments`.
+        args: Parsed options of `add_arguments`.
     """
     rows, failures = [], {}
-    for turn, name in tqdm(list(product(range(args.rounds), names)), unit="training"):
+    for number, name in tqdm(list(product(range(args.rounds), names)), unit="training"):
         try:
             found = measure(name)
         except torch.OutOfMemoryError:
@@ -147,7 +148,7 @@ def compare(
         except UserError as error:
             failures[name] = str(error)
         else:
-            rows.append((name, turn, found.rate, found.peak, found.losses[-1]))
+            rows.append((name, number, found.rate, found.peak, found.losses[-1]))
     for name, failure in failures.items():
         print(f"{name}: {failure}")
     table = pd.DataFrame(rows, columns=["variant", "round", f"{unit}/s", "peak GiB", "loss"])
@@ -165,8 +166,8 @@ def compare(
 
 
 def write_random_base(preset: str, texts: list[str], image_size: int, folder: Path) -> None:
-    """Save a base of a released model's shape with random bf16 weights, so that nothing is
-    downloaded. Its tokenizer is trained on `texts`."""
+    """Save a base with the architecture of a released model and random bf16 weights, for which
+    nothing is downloaded. Its tokenizer is trained on `texts`."""
     config = Qwen3VLConfig.from_dict(json.loads((CONFIGS / f"{preset}.json").read_text()))
     for key, token in (
         ("image_token_id", "<|image_pad|>"),
@@ -182,19 +183,19 @@ def write_random_base(preset: str, texts: list[str], image_size: int, folder: Pa
 
 
 def reset_peak_memory() -> None:
-    """Start to count the memory for `peak_memory`."""
+    """Restart the measurement of `peak_memory`."""
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
         return
     with suppress(OSError, AttributeError):
-        # Memory that earlier steps freed would hide what this one allocates.
+        # Memory that was freed but not returned to the system would hide later allocations.
         ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def peak_memory() -> int:
-    """Return the maximum memory (bytes) since `reset_peak_memory`, or since the process started
-    where the system cannot reset its count."""
+    """Return the peak memory (bytes) since `reset_peak_memory`, or since the process started if the
+    system cannot reset it."""
     if torch.cuda.is_available():
         return torch.cuda.max_memory_allocated()
     if sys.platform.startswith("linux"):

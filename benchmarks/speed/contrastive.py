@@ -1,18 +1,18 @@
-"""The speed and memory of the retriever trainer, compared with plain sentence-transformers.
+"""Compares the retriever trainer with plain sentence-transformers in speed and memory.
 
     python -m benchmarks.speed.contrastive                      # a tiny retriever, on any machine
-    python -m benchmarks.speed.contrastive --batch 32 128 512   # by the number of queries a step
+    python -m benchmarks.speed.contrastive --batch 32 128 512   # with several batch sizes
     python -m benchmarks.speed.contrastive qwen3_vl_emb_8b      # a released size, on a GPU
 
-Every variant trains on the same batches of the queries of `benchmark=small`, in its own process;
-variants take turns. Printed are medians over the rounds and the ratios to the plain library. The
-rate of our trainer with the preset's settings on a GPU is recorded for benchmarks.speed.hours.
-The tiny retriever has adapters over the tiny base in 4 bits; a released size has random weights, so
-nothing is downloaded.
+Every variant trains on the same batches of queries of `benchmark=small`, in a process of its own.
+The script prints medians over the rounds and the ratios to plain sentence-transformers. On a GPU,
+the rate of our trainer with the preset's settings is recorded for benchmarks.speed.hours. The tiny
+retriever has adapters over the 4-bit tiny base. A released size has random weights, so that nothing
+is downloaded.
 
-The plain library uses its own collator and losses, and reads pixels batch by batch, as ours does.
-One variant of it limits mini-batches by their tokens, and one has this project's attention and
-memory settings.
+Plain sentence-transformers uses the library's trainer, collator and losses. Like our trainer, it
+reads the pixels of one batch at a time. In one variant, its mini-batches have a maximum number of
+tokens; another has this project's attention and memory settings.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from data.build import ensure_benchmark
 from data.records import RetrievalQuery
 from data.render.frame_cache import FrameReader
 from models import compat
-from models.lora_kernels import fuse
+from models.lora_kernels import use_fast_layers
 from models.precision import resolve_precision
 from models.retriever import embedder
 from models.retriever.embedder import Retriever
@@ -58,14 +58,16 @@ TINY = [
 
 @dataclass(frozen=True)
 class Variant:
-    """A trainer and the settings of `train` in which it differs from the preset."""
+    """A trainer and its settings."""
 
     overrides: tuple[str, ...] = ()
+    """Settings of `train` that differ from the preset."""
     plain: bool = False
+    """Train with plain sentence-transformers instead of our trainer."""
     tokens: int | None = None
-    """Tokens in a mini-batch of the plain library, instead of `train.mini_batch`."""
+    """Maximum tokens of a plain mini-batch; by default, `train.mini_batch` limits its inputs."""
     helped: bool = False
-    """Give the plain library this project's attention and memory settings."""
+    """Give plain sentence-transformers this project's attention and memory settings."""
 
 
 PLAIN = "plain sentence-transformers"
@@ -82,7 +84,7 @@ VARIANTS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--batch", type=int, nargs="+", default=[128], help="queries a step")
+    parser.add_argument("--batch", type=int, nargs="+", default=[128], help="queries per step")
     parser.add_argument("--benchmark", default="small")
     comparison.add_arguments(parser, steps=3, variants=VARIANTS)
     args = parser.parse_args()
@@ -112,7 +114,7 @@ def main() -> None:
 
 
 def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
-    """Train a variant in this process for one step more than `steps`."""
+    """Train a variant in this process for `steps` steps after the first one."""
     changes = [f"train.{change}" for change in variant.overrides]
     overrides = [*overrides, *changes, f"train.max_steps={steps + 1}"]
     cfg = compose("train.contrastive", ContrastiveCommand, overrides)
@@ -130,9 +132,9 @@ def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
         if variant.plain:
             trainer = build_plain_trainer(cfg, model, queries, frames, Path(folder), variant.tokens)
         else:
-            fuse(model)
+            use_fast_layers(model)
             run, batch = Run("benchmark", Path(folder)), cfg.train.batch
-            # Nothing is evaluated, but the trainer needs a held-out query.
+            # Nothing is evaluated, but the trainer requires a held-out query.
             trainer = build_trainer(cfg, run, store, model, queries, queries[:1], batch, None)
         return comparison.train(trainer, cfg.train.batch)
 
@@ -145,7 +147,7 @@ def build_plain_trainer(
     folder: Path,
     tokens: int | None,
 ) -> Trainer:
-    """The library's trainer, collator and losses; its collator reads pixels batch by batch."""
+    """Return a trainer with the library's collator and losses."""
     columns = ["query", "target", *(f"negative_{k}" for k in range(cfg.train.hard_negatives))]
     prompts = dict.fromkeys(columns, cfg.retriever.frame_instruction)
     collator = FrameCollator(
@@ -177,21 +179,21 @@ def build_plain_trainer(
 def load_columns(
     query: RetrievalQuery, columns: Sequence[str], frames: FrameReader, cfg: ContrastiveCommand
 ) -> dict[str, Any]:
-    """The inputs of a query, of its target and of its hard negatives, with their pixels."""
+    """Return the inputs of a query, its target and its hard negatives, with their pixels."""
     images = (embedder.frame_input(f, frames) for f in (query.target, *query.hard_negatives))
     inputs = [embedder.query_input(query, frames, cfg.retriever), *images]
     return dict(zip(columns, inputs, strict=False))
 
 
 class FrameCollator(SentenceTransformerDataCollator):
-    """The library's collator over rows that name queries by number."""
+    """The library's collator for rows with the numbers of queries; `load` reads their inputs."""
 
     def __call__(self, rows: list[dict[str, int]]) -> dict[str, Any]:
         return super().__call__([self.load(row[NUMBER]) for row in rows])
 
 
 def write_base(overrides: list[str], preset: str, folder: Path) -> None:
-    """Save a random base of a preset's size with a tokenizer for the benchmark's texts."""
+    """Save a base of a preset's size, with random weights and a tokenizer for the benchmark."""
     cfg = compose("train.contrastive", ContrastiveCommand, overrides)
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     texts = embedder.tokenizer_texts(store.retrieval("train"), cfg.retriever)

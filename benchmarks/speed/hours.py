@@ -3,12 +3,15 @@
     python -m benchmarks.speed.hours
     python -m benchmarks.speed.hours --student qwen3_vl_2b --retriever qwen3_vl_emb_2b
 
-A run trains on its samples or queries once per epoch, so its hours are samples / (samples per
-second) / 3600. The rates are lines of rates.jsonl beside this file, to which benchmarks.speed.sft
-and benchmarks.speed.contrastive append; the last line of a card and a preset counts. If a rate is
-missing, the output names the benchmark that measures it. The estimate is slightly high: a tenth of
-the training scenes is held out, and answer-only samples are shorter than the measured mix of
-rationales and answers. Evaluation and narration are not included.
+A run trains on each sample or query once per epoch, so it takes samples * epochs / rate / 3600
+hours. The rates (samples per second) are in rates.jsonl beside this file, to which the scripts
+benchmarks.speed.sft and benchmarks.speed.contrastive append a line per measurement. If a preset and
+a GPU have several lines, the last one counts. If a rate is missing, the output names the script
+that measures it.
+
+The estimates are slightly too high: a tenth of the training scenes is held out, and answer-only
+samples are shorter than the measured samples, of which half have rationales. Evaluation and
+narration are not included.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ REGIMES = ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layo
 
 @dataclass(frozen=True)
 class Rate:
-    """A measured rate: samples or queries per second of a preset on a card."""
+    """A line of rates.jsonl: samples or queries per second of a preset on a GPU, the `card`."""
 
     benchmark: str
     preset: str
@@ -42,13 +45,13 @@ class Rate:
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """A training run of the paper's scale."""
+    """A training run at the paper's scale."""
 
     name: str
     samples: float
-    """Samples or queries, over all epochs."""
+    """Number of samples or queries, summed over all epochs."""
     measured_by: tuple[str, str, str]
-    """Benchmark, preset and quantization of its rate."""
+    """Benchmark, preset and quantization of the rate that applies to this run; see `Rate`."""
 
 
 def main() -> None:
@@ -63,7 +66,7 @@ def main() -> None:
 
 
 def list_runs(student: str, retriever: str) -> list[TrainingRun]:
-    """The training runs of `make paper`."""
+    """Return the training runs of `make paper`, with another student and retriever."""
     runs = []
     for regime in REGIMES:
         overrides = [f"+exp={regime}", "benchmark=dynapix", f"student={student}"]
@@ -82,12 +85,12 @@ def list_runs(student: str, retriever: str) -> list[TrainingRun]:
 
 
 def format_table(runs: list[TrainingRun], rates: list[Rate]) -> str:
-    """Format the hours by run and card, and the commands that measure missing rates."""
+    """Format the hours of each run on each GPU, and the commands that measure missing rates."""
     head = f"{'on one GPU':<40}{'samples':>9}{'a second':>10}{'hours':>8}  measured on"
     lines: list[str] = []
     missing: dict[tuple[str, str, str], list[str]] = {}
     for run in runs:
-        # Later lines of a card replace earlier ones.
+        # A later rate on a GPU replaces an earlier one.
         known = {
             r.card: r for r in rates if (r.benchmark, r.preset, r.quantization) == run.measured_by
         }
@@ -108,7 +111,7 @@ def format_table(runs: list[TrainingRun], rates: list[Rate]) -> str:
 
 
 def read_rates(path: Path) -> list[Rate]:
-    """Read the measured rates, oldest first; an absent file has none.
+    """Read the measured rates, oldest first; none if the file does not exist.
 
     Raises:
         UserError: A line is not a valid rate.
@@ -130,7 +133,7 @@ def read_rates(path: Path) -> list[Rate]:
 def add_rate(
     benchmark: str, preset: str, quantization: str, rate: float, card: str, path: Path = RATES
 ) -> None:
-    """Append a rate measured today."""
+    """Append a rate to the file, with today's date."""
     line = Rate(benchmark, preset, quantization, round(rate, 4), card, date.today().isoformat())
     with path.open("a") as file:
         file.write(json.dumps(asdict(line)) + "\n")

@@ -1,17 +1,18 @@
-"""The time and memory of ranking a database, compared with one matrix product.
+"""Measures the time and memory of ranking the frames of a database for queries.
 
     python -m benchmarks.speed.retrieval ranks
     python -m benchmarks.speed.retrieval large
 
 `ranks` computes the exact ranks of 2,002 queries over 10,000 frames at all seven widths up to
-4,096, alternating with one fp32 product of the same two tables; medians of the rounds.
+4,096. Each round also times one fp32 matrix product of the same queries and frames. The script
+prints medians over the rounds.
 
-`large` ranks 256 queries over 1,000,000 frames in cache files, which it writes first (16 GiB,
-deleted at the end): seconds and peak memory. Time is linear in the queries; memory grows by 100 KiB
-per query.
+`large` ranks 256 queries over 1,000,000 frames. It first writes their embeddings to cache files
+(16 GiB), which it deletes at the end. The script prints seconds and peak memory. Time is linear in
+the number of queries; memory grows by 100 KiB per query.
 
-Embeddings are random but clustered: the 128 frames of a scene lie around one point, and a query
-lies near its target. OMP_NUM_THREADS=1 restricts it to one thread.
+Embeddings are random but clustered: those of the 128 frames of a scene lie around one point, and
+that of a query lies near its target. OMP_NUM_THREADS=1 restricts the script to one thread.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def main() -> None:
         if measure is measure_ranks:
             command.add_argument("--rounds", type=int, default=3)
         else:
-            command.add_argument("--folder", help="parent of the cache's folder, by default /tmp")
+            command.add_argument("--folder", help="where to write the cache files, by default /tmp")
     args = parser.parse_args()
     cores = len(os.sched_getaffinity(0))
     print(f"{cores} core(s), OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS', 'unset')}")
@@ -66,7 +67,7 @@ def measure_ranks(args: argparse.Namespace) -> None:
         product, _ = timed(lambda: queries @ database.T)
         ranking, ranks = timed(lambda: exact_ranks(queries, database[targets], [database], WIDTHS))
         rounds.append((product, ranking, ranking / product))
-    # The first round warms caches and is not counted.
+    # The first round, which fills the processor's caches, is not counted.
     product, ranking, ratio = map(statistics.median, zip(*rounds[1:], strict=True))
     print(f"one fp32 product {product:.2f} s, ranks {ranking:.2f} s, ratio {ratio:.2f}")
     print_ranks(ranks)
@@ -79,7 +80,7 @@ def measure_large(args: argparse.Namespace) -> None:
         needed, free = 4.2 * args.frames * WIDTHS[0], shutil.disk_usage(folder).free
         if free < needed:
             sizes = f"{needed / 2**30:.0f} GiB are needed and {free / 2**30:.0f} free"
-            raise SystemExit(f"error: {sizes}: give another --folder")
+            raise SystemExit(f"error: {sizes}: name another --folder")
         cache = EmbeddingCache(Path(folder), "frame", {"weights": "random", "entries": WIDTHS[0]})
         frames = dict(zip(names, range(args.frames), strict=True))
         writing, _ = timed(lambda: cache.complete(frames, embed_frames, SCENE))
@@ -94,7 +95,7 @@ def measure_large(args: argparse.Namespace) -> None:
 
 
 def embed_frames(frames: range | list[int]) -> np.ndarray:
-    """Embeddings of frames; the row of a frame does not depend on the other frames."""
+    """Return embeddings (frames, entries). That of a frame does not depend on the other frames."""
     rows = np.empty((len(frames), WIDTHS[0]), np.float32)
     for k, frame in enumerate(frames):
         if k == 0 or frame // SCENE != frames[k - 1] // SCENE:
@@ -108,7 +109,7 @@ def random_vector(*seed: int) -> np.ndarray:
 
 
 def embed_queries(args: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
-    """Query embeddings, and the indices of their target frames."""
+    """Return the embeddings of queries, and the indices of their target frames."""
     rng = np.random.default_rng(2)
     targets = np.sort(rng.choice(args.frames, args.queries, replace=args.queries > args.frames))
     rows = embed_frames(targets.tolist())
@@ -116,14 +117,14 @@ def embed_queries(args: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """The duration (s) of a call and its result."""
+    """Call a function, and return the duration (s) and the result."""
     start = time.perf_counter()
     result = work()
     return time.perf_counter() - start, result
 
 
 def print_ranks(ranks: Ranks) -> None:
-    """Print the peak memory, and how often the target is first (random ranks: almost never)."""
+    """Print the peak memory, and the shares of queries whose target is first, or ties, by width."""
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     for k, width in enumerate(ranks.widths):
         first = (ranks.found & (ranks.greater[k] == 0)).mean()

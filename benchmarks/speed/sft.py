@@ -1,22 +1,23 @@
-"""The speed and memory of the student trainer, compared with TRL's SFTTrainer (extra `bench`).
+"""Compares the student trainer with TRL's SFTTrainer (extra `bench`) in speed and memory.
 
     python -m benchmarks.speed.sft                # the tiny student, on any machine
     python -m benchmarks.speed.sft qwen3_vl_8b    # a released size, on a GPU
     python -m benchmarks.speed.sft --losses
 
 Every variant trains on the same samples of the tiny benchmark in the same order, with the same base
-and hyperparameters, in its own process; variants take turns. Printed are medians over the rounds
-and the ratios to our trainer with the preset's settings, whose rate on a GPU is recorded for
-benchmarks.speed.hours. A released size has random weights, so nothing is downloaded. Each loss
-follows its trainer's own convention.
+and hyperparameters, in a process of its own. The script prints medians over the rounds and the
+ratios to our trainer with the preset's settings, whose rate on a GPU is recorded for
+benchmarks.speed.hours. A released size has random weights, so that nothing is downloaded. Losses of
+our trainer and of TRL are not comparable here, because each uses its own convention.
 
 TRL runs with its default settings, and with each setting that could make it faster. Among these are
-the MALLOC_* variables, which have the effect of our trainer's calls of mallopt. TRL's collator does
-not support videos, so TRL uses ours. It casts adapters over 4-bit weights to bf16. Without TRL only
-our trainer is measured.
+the MALLOC_* environment variables, which have the effect of our trainer's calls of mallopt. TRL
+uses our collator, because its own does not support videos. TRL casts adapters over 4-bit weights to
+bf16. If TRL is not installed, only our trainer is measured.
 
-`--losses` compares the losses of all steps in fp32 over the unquantised base; our trainer then uses
-TRL's convention, the mean over a micro-batch's tokens and over micro-batches.
+`--losses` compares the losses of all steps instead, in fp32 with a base that is not quantised. Our
+trainer then uses TRL's convention: the mean over the tokens of a micro-batch, then over
+micro-batches.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from conf.schema import SftCommand
 from data.build import ensure_benchmark
 from models import compat, loading
 from models.attention import flash_attention
-from models.lora_kernels import fuse
+from models.lora_kernels import use_fast_layers
 from models.precision import resolve_precision
 from models.student.collator import Collator, encode, pad
 from models.student.prompts import Sample
@@ -58,15 +59,17 @@ MALLOC = {
     "MALLOC_TRIM_THRESHOLD_": str((1 << 31) - 1),
     "MALLOC_TOP_PAD_": str(64 << 20),
 }
-"""The environment variables for what `models.compat.keep_freed_memory` sets in the process."""
+"""Environment variables with the effect of `models.compat.keep_freed_memory`."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A trainer and the settings of `train` in which it differs from the preset."""
+    """A trainer and its settings."""
 
     overrides: tuple[str, ...] = ()
+    """Settings of `train` that differ from the preset."""
     trl: bool = False
+    """Train with TRL instead of our trainer."""
     flash: bool = False
     """Let TRL use flash attention if it is installed."""
     environment: dict[str, str] = field(default_factory=dict)
@@ -89,7 +92,7 @@ VARIANTS = {
     "TRL, kept, flash attention": Variant(TRL_SETTINGS, trl=True, flash=True),
     "TRL, kept, MALLOC_*": Variant(TRL_SETTINGS, trl=True, environment=MALLOC),
 }
-"""The variants by name; "kept" keeps activations, 4 is the micro-batch instead of 8."""
+"""Variants by name. "kept": activations are not recomputed. "4": micro-batches of 4, not 8."""
 
 
 def main() -> None:
@@ -126,7 +129,7 @@ def main() -> None:
 
 
 def compare_losses(overrides: list[str], steps: int) -> None:
-    # TRL's loss depends on the micro-batch, so both trainers have the same one.
+    # TRL's loss depends on the micro-batch, so both trainers use the same micro-batch.
     ours = measure_in_process(overrides, Variant(TRL_SETTINGS), steps, True)
     theirs = measure_in_process(overrides, Variant(TRL_SETTINGS, trl=True), steps)
     print(f"{'step':>4}{'ours':>12}{'TRL':>12}{'difference':>12}")
@@ -143,7 +146,7 @@ def measure_in_process(
 
 
 def measure(overrides: list[str], variant: Variant, steps: int, trl_loss: bool) -> Measurements:
-    """Train a variant in this process for one step more than `steps`."""
+    """Train a variant in this process for `steps` steps after the first one."""
     changes = [f"train.{change}" for change in variant.overrides]
     cfg = compose("train.sft", SftCommand, [*overrides, *changes, f"train.max_steps={steps + 1}"])
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
@@ -160,7 +163,7 @@ def measure(overrides: list[str], variant: Variant, steps: int, trl_loss: bool) 
             samples = Subset(training, list(islice(order, (steps + 1) * cfg.train.batch)))
             trainer = build_trl_trainer(cfg, model, processor, samples, Path(folder), variant.flash)
         else:
-            fuse(model)
+            use_fast_layers(model)
             run = Run("benchmark", Path(folder))
             trainer = build_trainer(cfg, run, model, processor, training, validation, None)
             if trl_loss:
@@ -172,7 +175,7 @@ def measure(overrides: list[str], variant: Variant, steps: int, trl_loss: bool) 
 def mean_of_means(
     micro_batches: int, outputs: Any, labels: torch.Tensor, num_items_in_batch: Any = None
 ) -> torch.Tensor:
-    """TRL's loss for this model: the mean over a micro-batch's tokens, then over micro-batches."""
+    """Return a micro-batch's share of TRL's loss: the mean of the token means of micro-batches."""
     return token_mean(outputs, labels) / micro_batches
 
 
@@ -184,7 +187,7 @@ def build_trl_trainer(
     folder: Path,
     flash: bool,
 ) -> Trainer:
-    """Return TRL's trainer with the same hyperparameters; other settings have TRL's defaults.
+    """Return TRL's trainer with our hyperparameters; its other settings have TRL's defaults.
 
     TRL accepts only a dataset of the `datasets` library, so the dataset contains sample indices and
     the collator looks up the samples.
@@ -204,7 +207,7 @@ def build_trl_trainer(
             per_device_train_batch_size=train.micro_batch,
             gradient_accumulation_steps=train.batch // train.micro_batch,
             train_sampling_strategy="sequential",
-            # The default of 1,024 tokens would truncate within an image.
+            # TRL's default of 1,024 tokens would cut an image.
             max_length=cfg.student.max_length,
             dataset_kwargs={"skip_prepare_dataset": True},
         ),
@@ -215,7 +218,7 @@ def build_trl_trainer(
 
 
 class FullCollator(Collator):
-    """Makes batches with labels at every position, as TRL expects them."""
+    """Makes batches with labels at every position, as TRL requires."""
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         encoded = [encode(s, self._processor, self._max_length) for s in samples]
@@ -227,7 +230,7 @@ class FullCollator(Collator):
 
 
 def write_base(overrides: list[str], preset: str, folder: Path) -> None:
-    """Save a random base of a preset's size with a tokenizer for the benchmark's texts."""
+    """Save a base of a preset's size, with random weights and a tokenizer for the benchmark."""
     cfg = compose("train.sft", SftCommand, overrides)
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     texts = tokenizer_corpus(store, ensure_rationales(store, cfg.teacher))

@@ -1,4 +1,4 @@
-"""Launchers of the jobs of a sweep: child processes of this machine, or jobs of a cluster."""
+"""Launchers, which run the jobs of a sweep as processes of this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ GRACE = 10.0
 
 @dataclass(frozen=True)
 class Job:
-    """A job of a sweep: its run folder and the command that runs it."""
+    """A job of a sweep: its run folder and the command line that runs it."""
 
     folder: Path
     title: str
+    """Number and swept values of the job, for the log."""
     overrides: list[str]
     command: list[str]
 
@@ -41,15 +42,15 @@ class Job:
 
 
 class ProcessLauncher:
-    """Runs one job at a time on each visible GPU, or one job at a time without a GPU.
+    """Runs one job at a time on each visible GPU, or one job at a time if there is no GPU.
 
-    Each job is a child process, so that failures and memory leaks stay in it.
+    Each job is a child process, so that a crash or a memory leak affects no other job.
     """
 
     def run(self, jobs: list[Job]) -> Iterator[tuple[Job, bool]]:
-        """Run jobs, and yield each as it ends with whether it succeeded.
+        """Run jobs. When a job ends, yield the job and whether it succeeded.
 
-        Closing the iterator ends the jobs that still run.
+        Closing the iterator terminates the jobs that are still running.
         """
         waiting, free = jobs[::-1], visible_gpus() or [None]
         running: dict[subprocess.Popen, tuple[Job, str | None]] = {}
@@ -74,7 +75,7 @@ class SubmititLauncher:
     Args:
         cluster: slurm, or local for processes of this machine.
         submitit_folder: Folder of submitit's own files.
-        parameters: Parameters of submitit.
+        parameters: Parameters of submitit's executor; those that are None are left out.
     """
 
     def __init__(self, cluster: str, submitit_folder: str, **parameters: Any) -> None:
@@ -113,13 +114,13 @@ class SubmititLauncher:
             return executor.map_array(
                 run_command, [job.command for job in jobs], [job.output for job in jobs]
             )
-        # No cluster on this machine, an unknown parameter, or one that the cluster refuses.
+        # The machine has no cluster, or submitit or the cluster refuses a parameter.
         except (RuntimeError, NameError) as error:
             raise UserError(f"{setting}: {error}", code="cluster-refused") from error
 
 
 def run_command(command: list[str], output: Path) -> int:
-    """Run a job on its node of the cluster; returns its exit status."""
+    """Run a job on its node of the cluster and return the exit status."""
     process = start_process(command, output)
     try:
         return process.wait()
@@ -128,7 +129,7 @@ def run_command(command: list[str], output: Path) -> int:
 
 
 def start_process(command: list[str], output: Path, gpu: str | None = None) -> subprocess.Popen:
-    """Start a process that writes to a file and sees one GPU, if any is given."""
+    """Start a process that writes its output to a file. It sees only `gpu`, if that is given."""
     output.parent.mkdir(parents=True, exist_ok=True)
     visible = {} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu}
     with output.open("wb") as out:
@@ -151,7 +152,7 @@ def end_processes(processes: list[subprocess.Popen]) -> None:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(max(0.0, deadline - time.monotonic()))
     finally:
-        # Also after a second Ctrl-C.
+        # Kill them also if a second Ctrl-C interrupts the waiting.
         for process in processes:
             process.kill()
             process.wait()

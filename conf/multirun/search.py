@@ -1,8 +1,8 @@
-"""Search for settings with Optuna: each job's settings depend on the results of earlier jobs.
+"""Search for settings with Optuna, which chooses a job's settings by the results of earlier jobs.
 
-study.json in the sweep's folder records the settings of each trial before its job starts; the
-results are in the jobs' folders. A killed search resumes with the jobs that it had started, and
-then samples the same trials as an uninterrupted search.
+Each Optuna trial is one job. study.json in the sweep's folder records the settings of each trial
+before its job starts; the results are in the jobs' folders. When a killed search is started again,
+it first completes the recorded trials, and then samples the same trials as an uninterrupted search.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 RunJobs = Callable[[list[list[str]], int], list[dict[str, Any]]]
-"""Runs jobs with the overrides of each, numbered from a first number, and returns their records."""
+"""`Sweep.run_jobs`: runs jobs, given their overrides and the first one's number."""
 STUDY_FILE = "study.json"
 METRICS = {"train.sft": "answer_letter_accuracy", "train.contrastive": "mrr"}
 """Default of hydra.sweeper.metric for each command."""
@@ -38,34 +38,34 @@ METRICS = {"train.sft": "answer_letter_accuracy", "train.contrastive": "mrr"}
 
 @dataclass(frozen=True)
 class Search:
-    """A search, with the keys of conf/hydra/sweeper/optuna.yaml."""
+    """A search. Its fields are the keys of conf/hydra/sweeper/optuna.yaml, which describes them."""
 
     metric: str | None
     n_trials: int
     n_jobs: int | None
     seed: int
     params: dict[str, str] | None
-    """Sweeps of a preset, which `conf.multirun.sweep.Sweep` adds to the overrides."""
+    """The sweeps of a sweep preset by key. They reach `run` through `Sweep.overrides`."""
 
     def run(
         self, command: str, overrides: dict[str, Override], folder: Path, run_jobs: RunJobs
     ) -> None:
         """Run trials in the sweep's folder until the study has `n_trials`.
 
-        `overrides` are the swept and the fixed overrides of the jobs, by key.
+        `overrides` contains the swept and the fixed overrides by key.
         """
         metric = self.metric or METRICS.get(command)
         if metric is None:
             raise SettingsError(
-                "this command has no default metric to search by: give "
-                "hydra.sweeper.metric=NAME, with a name in a run's metrics.json",
+                f"{command} has no default metric to optimise: give hydra.sweeper.metric=NAME, the "
+                "name of a metric in the metrics.json of a run",
                 code="missing-metric",
             )
         swept = {key: o for key, o in overrides.items() if o.is_sweep_override()}
         if not swept:
             raise SettingsError(
-                "the search has no parameters: give a key several values, or an interval such as "
-                "'train.lr=tag(log,interval(1e-5,1e-3))'",
+                "the search has no parameters: give at least one key several values, or an "
+                "interval such as 'train.lr=tag(log,interval(1e-5,1e-3))'",
                 code="nothing-to-search",
             )
         fixed = [str(o.input_line) for key, o in overrides.items() if key not in swept]
@@ -78,12 +78,12 @@ class Search:
         for params in _recorded_trials(folder, settings):
             study.enqueue_trial(params)
             study.ask(space)
-        log.info("search by %s: %d jobs", metric, self.n_trials)
+        log.info("search: %d jobs; %s %s", self.n_trials, direction, metric)
         _run_trials(study, 0, fixed, metric, run_jobs)
         batch = max(1, self.n_jobs or len(visible_gpus()))
         while (first := len(study.trials)) < self.n_trials:
             for number in range(first, min(first + batch, self.n_trials)):
-                # One seed per trial, so that a resumed search samples the same trials.
+                # With one seed per trial, a resumed search samples the same trials.
                 seed = random.Random(f"{self.seed}/{number}").getrandbits(32)
                 study.sampler = optuna.samplers.TPESampler(seed=seed, constant_liar=True)
                 study.ask(space)
@@ -100,10 +100,10 @@ class Search:
 def _run_trials(study: Study, first: int, fixed: list[str], metric: str, run_jobs: RunJobs) -> None:
     """Run the jobs of the trials from number `first` on, and report their metrics to the study.
 
-    A trial whose job failed gets no result, so that the same command runs it again.
+    A trial whose job failed gets no result: the same command, started again, repeats the job.
 
     Raises:
-        UserError: A job has no such metric.
+        UserError: A finished job has no such metric.
     """
     from optuna.trial import TrialState
 
@@ -125,7 +125,8 @@ def _run_trials(study: Study, first: int, fixed: list[str], metric: str, run_job
 
 
 def _recorded_trials(folder: Path, settings: dict[str, str]) -> list[dict[str, Any]]:
-    """Settings of the trials of an earlier start. Raises SettingsError for another search."""
+    """Settings of each trial that an earlier start of the search recorded in `folder`. Raises
+    SettingsError if the folder contains another search."""
     path = folder / STUDY_FILE
     if not path.exists():
         return []
@@ -136,13 +137,13 @@ def _recorded_trials(folder: Path, settings: dict[str, str]) -> list[dict[str, A
 
 
 def distribution(override: Override) -> BaseDistribution:
-    """The distribution that Optuna samples a key from.
+    """The distribution from which Optuna samples the values of a swept key.
 
-    An interval is continuous; int(interval(...)) has whole numbers and tag(log, interval(...)) a
-    logarithmic scale. A range of whole numbers has its step. Any other sweep is a choice.
+    interval(...) gives real numbers, int(interval(...)) integers, and tag(log,interval(...)) a
+    logarithmic scale. A range of integers is sampled as integers, any other sweep as categories.
 
     Raises:
-        SettingsError: The bounds are invalid.
+        SettingsError: The bounds of an interval or a range are invalid.
     """
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 

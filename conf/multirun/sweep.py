@@ -1,4 +1,4 @@
-"""Run the unfinished jobs of a sweep, and print the table of all its jobs."""
+"""Run the unfinished jobs of a sweep or a search, and print the table of all its jobs."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ log = logging.getLogger(__name__)
 
 LAUNCHERS = ("process", "submitit_local", "submitit_slurm")
 PARENT_ONLY = ("hydra.mode", "hydra.sweep", "hydra.launcher", "hydra/sweeper", "hydra/launcher")
-"""Beginnings of Hydra overrides that only the sweep itself uses. Jobs do not get these."""
+"""Prefixes of the Hydra overrides that configure the sweep itself. Jobs do not get them."""
 
 
 def run_sweep(command: str, schema: type, overrides: list[str]) -> None:
-    """Run a sweep or a search, print its table, and exit with status 1 if a job failed."""
+    """Run a sweep or a search and print its table. Exits with status 1 if a job failed."""
     sweep = Sweep(command, schema, overrides)
     configure_log(sweep.hydra.hydra_logging, sweep.hydra.verbose)
-    # On SIGTERM, as on Ctrl-C, the sweep ends its child processes.
+    # SIGTERM, like Ctrl-C, raises KeyboardInterrupt, on which the launcher ends its processes.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if sweep.is_search:
         search: Search = instantiate(sweep.hydra.sweeper)
@@ -56,9 +56,11 @@ class Sweep:
 
     Attributes:
         hydra: Hydra's settings.
-        overrides: The parsed overrides, swept and fixed ones, by key.
-        jobs: The overrides of each job. A search chooses its jobs while it runs, and uses these
-            only to check all listed values, and the ends of intervals, before it starts.
+        task_overrides: The overrides of the command line, without those of Hydra's settings.
+        overrides: The parsed overrides by key, both swept and fixed.
+        jobs: The overrides of each job. For a search, which chooses its jobs while it runs, these
+            are not the jobs: they cover all listed values and both ends of each interval, so that
+            `__init__` can check them.
     """
 
     def __init__(self, command: str, schema: type, overrides: list[str]) -> None:
@@ -96,13 +98,13 @@ class Sweep:
         return [list(job) for job in product(*values)]
 
     def run_jobs(self, overrides: list[list[str]], first: int = 0) -> list[dict[str, Any]]:
-        """Run the jobs that are not finished, and log each as it ends.
+        """Run the jobs that are not finished, and log how each job ended.
 
         A failed job does not stop the others.
 
         Args:
             overrides: The overrides of each job.
-            first: Number of the first job.
+            first: Number of the first job; the others follow.
 
         Returns:
             The record of each job (`conf.multirun.table.read_job`).
@@ -111,7 +113,7 @@ class Sweep:
         if len(jobs) > 1:
             log.info("sweep %s: %d jobs", self.folder, len(jobs))
         if first == 0:
-            # Remove the records of an earlier, longer sweep, which the table would show.
+            # Delete the records of additional jobs of an earlier sweep from the table.
             for number in [old["job"] for old in read_jobs(self.folder) if old["job"] >= len(jobs)]:
                 (self.folder / str(number) / JOB_FILE).unlink()
         unfinished = [job for job in jobs if not self._skip_if_finished(job)]
@@ -130,7 +132,7 @@ class Sweep:
         return Job(self.folder / str(number), f"#{number} {title}", overrides, command)
 
     def _skip_if_finished(self, job: Job) -> bool:
-        """Return whether the job was completed earlier with the same settings; if so, record it."""
+        """Whether the job finished earlier with the same settings; if so, record it as done."""
         if not (job.folder / "metrics.json").exists():
             return False
         settings = compose(self.command, self.schema, job.overrides)
@@ -142,8 +144,8 @@ class Sweep:
 
 
 def list_values(override: Override) -> list[str]:
-    """Return "key=value" for each swept value or for both ends of an interval; for another
-    override, return the override alone."""
+    """Return "key=value" for each value of a swept key, or for both ends of an interval; for an
+    override that is not swept, return a list with this override."""
     key = override.get_key_element()
     if override.is_interval_sweep():
         interval = override.value()
@@ -166,6 +168,6 @@ def _record_end(job: Job, succeeded: bool) -> None:
 
 
 def _record(job: Job, status: str) -> None:
-    # A job that the cluster did not start has no folder.
+    # The folder does not exist if the cluster never started the job.
     job.folder.mkdir(parents=True, exist_ok=True)
     write_json(job.folder / JOB_FILE, {"overrides": job.overrides, "status": status})

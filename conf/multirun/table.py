@@ -12,9 +12,10 @@ from conf.runs import write_text
 
 JOB_FILE = "job.json"
 AT_START_SUFFIX = "_at_start"
-"""End of the name of a metric that is measured before the first step of a run, and that most jobs
-of a sweep share."""
+"""Suffix of the metrics that are measured before the first training step. Tables of sweeps leave
+them out, because they have the same value in most jobs."""
 LOWER_IS_BETTER = r"loss|_rank$|set_aside|too_short|reject"
+"""Pattern in the names of the metrics of which lower values are better."""
 
 
 def read_jobs(folder: Path) -> list[dict[str, Any]]:
@@ -24,7 +25,8 @@ def read_jobs(folder: Path) -> list[dict[str, Any]]:
 
 
 def read_job(folder: Path) -> dict[str, Any]:
-    """The number (`job`), overrides, status (done or failed) and final metrics of an ended job."""
+    """The record of an ended job: its number (`job`), `overrides`, `status` (done or failed) and
+    `metrics`, without those that are measured before training."""
     job = json.loads((folder / JOB_FILE).read_text())
     path = folder / "metrics.json"
     metrics = json.loads(path.read_text()) if job["status"] == "done" and path.exists() else {}
@@ -33,7 +35,7 @@ def read_job(folder: Path) -> dict[str, Any]:
 
 
 def write_sweep_table(folder: Path) -> str:
-    """Write the table of a sweep as sweep.csv and, with the best values marked, as sweep.txt.
+    """Write the table of a sweep to sweep.csv and, with a * at the best values, to sweep.txt.
 
     Returns:
         The text of sweep.txt.
@@ -65,7 +67,7 @@ def write_sweep_table(folder: Path) -> str:
 
 
 def varying_overrides(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
-    """For each job, the overrides (key to value) that differ between jobs."""
+    """For each job, a dict of its overrides whose values differ between the jobs."""
     by_key = [dict(o.lstrip("+").split("=", 1) for o in job if "=" in o) for job in jobs]
     keys = dict.fromkeys(key for job in by_key for key in job)
     differ = [key for key in keys if len({job.get(key) for job in by_key}) > 1]
@@ -73,5 +75,6 @@ def varying_overrides(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
 
 
 def is_lower_better(metric: str) -> bool:
-    """Whether a metric is a loss, a rank or a number of rejected results."""
+    """Whether lower values of a metric are better: losses, ranks, and numbers of results that were
+    rejected, set aside or too short."""
     return re.search(LOWER_IS_BETTER, metric) is not None

@@ -1,8 +1,8 @@
 """Settings of every command: one dataclass per command and per group of settings.
 
 The docstring below a field is its description in `--help`. Defaults are the paper's values; a
-preset (`conf/<group>/<name>.yaml`) sets the values that differ. `check()` returns one sentence per
-invalid value or combination of values, with the keys as the user types them.
+preset (`conf/<group>/<name>.yaml`) sets the values that differ. `check()` returns one message for
+each invalid value or combination of values; a message names keys as the user types them.
 """
 
 from conf.schema.benchmark import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig

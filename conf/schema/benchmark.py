@@ -1,4 +1,8 @@
-"""Settings of a benchmark: its scenes, its cells with their quotas, and its databases."""
+"""Settings of a benchmark: its scenes, the numbers of its items and queries, and its databases.
+
+A cell is one kind of item, and a builder is the procedure that makes one kind of query. A quota is
+the number of items or queries to make of a cell or builder.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,9 @@ RENDERERS = ("bullet", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
 STANDINS = ("movi_a", "physion")
 WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
-"""Window families of each group: B needs a collision ahead, C leaves out G4 (paper, Window)."""
+"""Window families of each group (see `data.tracks.selection.window`). B needs a later collision."""
 WINDOW_HORIZONS = (8, 16, 24)
-"""Frames from the end of a window item's prefix to its target."""
+"""Number of frames from the last frame of a window item's prefix to its target."""
 WINDOW_DIFFICULTIES = ("easy", "hard")
 STANDIN_OBJECTS = 6
 DISTINCT_APPEARANCES = 48
@@ -25,7 +29,7 @@ DISTINCT_APPEARANCES = 48
 
 @dataclass
 class Quota(Settings):
-    """Number of items or queries of a cell in each split."""
+    """Number of items of a cell, or of queries of a builder, in each split."""
 
     train: int = setting(0, least=0)
     """Number of items or queries (for `matched`, pairs of items) in the training split."""
@@ -35,7 +39,7 @@ class Quota(Settings):
 
 @dataclass
 class SelectionConfig(Settings):
-    """Cells of the selection track and their quotas. The name of a cell is its items' `subtype`."""
+    """Quotas of the cells of the selection track. A cell's name is the `subtype` of its items."""
 
     min_displacement: float = setting(12.0, least=0)
     """Minimum displacement (px at 336 x 336) of at least one object between any two candidates."""
@@ -44,11 +48,11 @@ class SelectionConfig(Settings):
     time: dict[str, Quota] = field(default_factory=dict)
     """Quota of each time cell."""
     window: dict[str, Quota] = field(default_factory=dict)
-    """Quota of each window cell, such as G1_A_h8_easy; a group and family, such as G1_A, divides
-    its quota evenly among its six cells."""
+    """Quota of each window cell, such as G1_A_h8_easy. The quota of a group and family, such as
+    G1_A, is divided evenly among its six cells."""
     matched: Quota = field(default_factory=Quota)
-    """Pairs of matched-anchor items: the two questions differ only in the anchor (event or
-    time)."""
+    """Pairs of matched-anchor items. The two questions of a pair ask for the same target, one by an
+    event and the other by a time."""
 
     def __post_init__(self) -> None:
         self.window = divide_window_quotas(self.window)
@@ -56,22 +60,23 @@ class SelectionConfig(Settings):
 
 @dataclass
 class RetrievalTrackConfig(Settings):
-    """Builders 1 to 6 of the retrieval track, and its databases."""
+    """Quotas and databases of the retrieval track, which has the builders 1 to 6."""
 
     builders: dict[str, Quota] = field(default_factory=dict)
     """Quota of each builder."""
     counterfactual: Quota = field(default_factory=Quota)
-    """Queries about scenes that are simulated again without one of their objects."""
+    """Quota of counterfactual queries: a scene is simulated again without one of its objects."""
     hard_negatives: int = setting(3, least=1)
-    """Hard negatives per query: wrong-time frames of the query's own scene."""
+    """Hard negatives per query: frames of the target's scene at other moments and, for a
+    counterfactual query, the factual scene's frame at the target's moment."""
     standard: int = setting(2_002, least=0)
-    """Number of queries in the standard test, divided evenly among the builders."""
+    """Number of queries in the standard test, which samples them evenly from the builders."""
     database: int = setting(10_000, least=0)
-    """Frames in the database of the standard test, including every target."""
+    """Number of frames in the database of the standard test, including every target."""
     source: int = setting(30_000, least=0)
-    """Frames in the source database of the builders' queries, including every target."""
+    """Number of frames in the database of all queries of the builders, including every target."""
     counterfactual_source: int = setting(26_995, least=0)
-    """Frames in the source database of the counterfactual queries, including every target."""
+    """Number of frames in the database of all counterfactual queries, including every target."""
 
 
 @dataclass
@@ -79,19 +84,19 @@ class BenchmarkConfig(Settings):
     name: str = MISSING
     """Folder of the benchmark below `store`."""
     simulator: str = setting("bullet", SIMULATORS)
-    """Source of the scenes: bullet simulates them; clevrer, movi_a and physion read a release."""
+    """Source of the scenes: bullet simulates them; the others read a release from `folder`."""
     standin: str | None = setting(None, (*STANDINS, None))
-    """Transfer suite to imitate without its release: movi_a or physion. Bullet simulates scenes
-    with another camera, floor, light and physics, and the items follow that suite's recipe. null
+    """Dataset to imitate without its release: movi_a or physion. Bullet simulates scenes with
+    another camera, floor, light and physics, and items are built as for that dataset. null
     simulates standard scenes."""
     folder: str | None = None
-    """Folder of the release, when `simulator` reads one."""
+    """Folder of the release, if `simulator` reads one."""
     fps: float = setting(30.0, above=0)
     """Frame rate (frames per second) of Physion's trials, whose files do not record it."""
     seed: int = setting(0, least=0)
-    """Seed of the scenes, of the split and of the items."""
+    """Seed of the scenes, the split and the items."""
     scenes: int = setting(10_000, least=4)
-    """Number of scenes; for a release, the maximum number."""
+    """Number of scenes to simulate, or maximum number of scenes to read from a release."""
     test_share: float = setting(0.2, above=0, most=1)
     """Share of the scenes in the test split."""
     min_objects: int = 4
@@ -101,14 +106,14 @@ class BenchmarkConfig(Settings):
     max_collisions: int = setting(3, least=1)
     """Maximum number of collisions in a scene."""
     renderer: str = setting("bullet", RENDERERS)
-    """bullet (software, runs on every machine) or blender (the look of CLEVRER, needs the extra
-    `blender`)."""
+    """bullet renders on the CPU of any machine; blender renders scenes that look like CLEVRER's and
+    needs the extra `blender`."""
     width: int = 480
     """Width of a frame (px)."""
     height: int = 320
     """Height of a frame (px)."""
     prefix_frames: int = setting(12, least=2)
-    """Evenly spaced frames of each prefix to render during the build."""
+    """Number of evenly spaced frames of each prefix that are rendered during the build."""
     selection: SelectionConfig = field(default_factory=SelectionConfig)
     retrieval: RetrievalTrackConfig = field(default_factory=RetrievalTrackConfig)
 
@@ -123,21 +128,21 @@ class BenchmarkConfig(Settings):
             standin = f"{group}standin={self.standin}"
             if self.simulator != "bullet":
                 yield (
-                    f"{standin} with {simulator}: a stand-in is simulated; set "
+                    f"{standin} with {simulator}: a stand-in consists of simulated scenes; set "
                     f"{group}simulator=bullet"
                 )
             if self.renderer == "blender":
                 yield (
-                    f"{standin} with {group}renderer=blender: Blender only renders the standard "
-                    f"look; set {group}renderer=bullet"
+                    f"{standin} with {group}renderer=blender: Blender renders standard scenes "
+                    f"only; set {group}renderer=bullet"
                 )
             if self.max_objects > STANDIN_OBJECTS:
                 yield (
-                    f"{standin} with {group}max_objects={self.max_objects}: its view has room for "
-                    f"at most {STANDIN_OBJECTS} objects"
+                    f"{standin} with {group}max_objects={self.max_objects}: a stand-in's view has "
+                    f"room for at most {STANDIN_OBJECTS} objects"
                 )
             if has_counterfactuals:
-                yield f"{standin} has no counterfactual scenes: {remedy}"
+                yield f"{standin}: a stand-in has no counterfactual queries; {remedy}"
         if not 2 <= self.min_objects <= self.max_objects <= DISTINCT_APPEARANCES:
             yield (
                 f"{group}min_objects={self.min_objects} and {group}max_objects={self.max_objects}: "
@@ -152,9 +157,9 @@ class BenchmarkConfig(Settings):
 
 
 def divide_window_quotas(quotas: dict[str, Quota]) -> dict[str, Quota]:
-    """Divide the quota of a group and family evenly among its cells, the remainder to the first.
+    """Divide the quota of each group and family, such as G1_A, evenly among its cells.
 
-    A quota named by its cell replaces that cell's share.
+    The first cells get the remainder. A quota given under a cell's name replaces the cell's share.
     """
     cells: dict[str, Quota] = {}
     for name, quota in quotas.items():

@@ -1,4 +1,4 @@
-"""Settings of the commands that build, narrate, train and export."""
+"""Settings of the commands that build and export benchmarks, write rationales, and train."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class CommandConfig(Settings):
 class BuildCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     frames: str = setting("named", ("named", "all", "none"))
-    """Frames to render during the build: named (those that items, queries and databases use), all
-    or none. Other frames are rendered on demand."""
+    """Frames to render during the build: named (frames that an item, query or database uses), all
+    or none. Missing frames are rendered on demand."""
     frames_gb: float | None = setting(None, least=0)
     """Maximum disk space (GB) of rendered frames; null sets no limit."""
     strict: bool = False
-    """Stop the build at a bad record of a release instead of logging and skipping it."""
+    """Stop the build at an invalid record of a release instead of logging and skipping it."""
     parallel: str = setting("loky", PARALLEL_BACKENDS)
     """loky runs the work in processes of this machine, ray on a Ray cluster."""
 
@@ -54,9 +54,9 @@ class StatisticsCommand(CommandConfig):
 class ExportCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     folder: str = MISSING
-    """Folder to write; it must not contain an earlier export."""
+    """Folder to write to; it must not contain an earlier export."""
     images: bool = True
-    """Include the frames; without them, a row only names its scenes and frames."""
+    """Include the images of the frames; otherwise a row only names its scenes and frames."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         if not self.folder:
@@ -67,7 +67,8 @@ class ExportCommand(CommandConfig):
 class GalleryCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     examples: int = setting(3, least=1)
-    """Items per subtype, queries per builder, counterfactual queries and matched pairs."""
+    """Number of examples of each kind: items of each subtype, queries of each builder,
+    counterfactual queries, and pairs of matched-anchor items."""
     seed: int = setting(0, least=0)
     """Seed of the sample of examples."""
 
@@ -77,30 +78,31 @@ class NarrateCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     teacher: TeacherConfig = MISSING
     examples: int = setting(20, least=0)
-    """Rationales on the report's page, with their frames; sampled with `teacher.seed`."""
+    """Rationales shown with their frames on the report's page; sampled with `teacher.seed`."""
 
 
 @dataclass
 class ServeCommand(CommandConfig):
     teacher: TeacherConfig = MISSING
-    """The server listens at teacher.url and serves the model under the name teacher.model."""
+    """The server listens at `teacher.url` and serves the model under the name `teacher.model`."""
     model: str | None = None
-    """Folder of the model, or its name on the Hugging Face hub; null uses teacher.model."""
+    """Folder of the model, or its name on the Hugging Face hub; null uses `teacher.model`."""
     environment: str = ".venv-vllm"
     """Folder of the Python environment with vLLM, which `make vllm-env` creates."""
     prompt_tokens: int = setting(3072, least=1)
-    """Maximum length of a prompt (tokens); the context is this plus teacher.max_tokens."""
+    """Maximum length of a prompt (tokens). The context length is this value plus
+    `teacher.max_tokens`."""
     dtype: str = setting("auto", ("auto", "bfloat16", "float16", "float32"))
     """Data type of weights and activations: auto, bfloat16, float16 or float32."""
     gpus: int | None = setting(None, least=1)
-    """GPUs to split the model over; null uses the largest power of two that the machine has."""
+    """Number of GPUs to split the model over; null uses the largest possible power of two."""
     memory: float = setting(0.9, above=0, most=1)
     """Share of each GPU's memory that the server may use."""
     cache_gb: float = setting(4.0, above=0)
-    """Size (GiB) of the key-value cache of a server without a GPU."""
+    """Size (GiB) of the key-value cache if the server has no GPU."""
     frames: bool = False
-    """Accept requests with frames, which evaluation.select sends. Each request sets how its frames
-    are preprocessed, so serve only clients that you trust."""
+    """Accept requests with frames, such as those of evaluation.select. A request chooses how its
+    frames are preprocessed, so give access only to clients that you trust."""
     adapter: str | None = None
     """Folder of a student's adapters to serve under the model name `adapter`."""
 
@@ -138,7 +140,7 @@ class ContrastiveCommand(CommandConfig):
             )
         if self.retriever.encoder != "qwen3_vl":
             yield (
-                f"retriever.encoder={self.retriever.encoder} can be measured but not trained: "
+                f"retriever.encoder={self.retriever.encoder} can be evaluated but not trained: "
                 "choose a Qwen3-VL retriever, such as retriever=qwen3_vl_emb_8b"
             )
         weights, widths = self.train.width_weights, self.retriever.widths
@@ -156,8 +158,8 @@ class ContrastiveCommand(CommandConfig):
             )
         if self.train.reuse_features and not self.retriever.lora.rank:
             yield (
-                "train.reuse_features=true with retriever.lora.rank=0: training without adapters "
-                "changes the vision tower and so its features; set train.reuse_features=false or "
+                "train.reuse_features=true with retriever.lora.rank=0: without adapters, training "
+                "changes the vision tower and thus its features; set train.reuse_features=false or "
                 "retriever.lora.rank above 0"
             )
 
@@ -165,15 +167,15 @@ class ContrastiveCommand(CommandConfig):
 @dataclass
 class ExportModelCommand(CommandConfig):
     product: str = setting("student", tuple(TRAINER_FOLDERS))
-    """Model to export: a student (of train.sft) or a retriever (of train.contrastive)."""
+    """Model to export: student (trained by train.sft) or retriever (by train.contrastive)."""
     run: str = "default"
     """Training run to export: its name or its folder."""
     format: str = setting("bf16", ("bf16", "fp32", "adapter"))
-    """bf16 or fp32 merges the adapters into the dequantised base and writes the weights in that
+    """bf16 and fp32 merge the adapters into the dequantised base and write the weights in that
     precision; adapter writes only the adapters."""
     verify: bool = True
-    """Compare the merged model with the trained one on held-out items of the run's benchmark; false
-    needs no benchmark."""
+    """Compare the outputs of the merged model with those of the trained model on held-out items of
+    the run's benchmark. false skips the comparison and needs no benchmark."""
 
     def find_problems(self, group: str) -> list[str]:
         for other in TRAINER_FOLDERS:

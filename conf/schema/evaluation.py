@@ -24,7 +24,7 @@ class ItemsCommand(CommandConfig):
     """Settings of the commands that measure models on selection items."""
 
     limit: int | None = setting(None, least=1)
-    """Maximum number of test items, spread evenly over the families; null uses all."""
+    """Maximum number of test items, sampled evenly from the families; null uses all items."""
     suite: str | None = setting(None, ("matched_anchor", None))
     """matched_anchor uses pairs of items that differ only in how the question names the target's
     moment: by an event or by a time. null uses the benchmark's standard items."""
@@ -42,13 +42,13 @@ class GenerationCommand(CommandConfig):
     student: StudentConfig = MISSING
     server: ServerConfig = field(default_factory=ServerConfig)
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
-    """Training settings of the preset. For a base, only the precision is used and, in
-    evaluation.select, the regime, which determines the prompt."""
+    """Training settings of the preset. For a base, only train.precision is used and, in
+    evaluation.select, train.regime, which determines the prompt."""
     model: str | None = None
-    """Folder of a run of train.sft or of an export. Its saved settings replace `student` and
-    `train`. null measures the base that `student` names."""
+    """Folder of a run of train.sft, or of its export. The settings saved there replace `student`
+    and `train`. null measures the base that `student` names."""
     batch: int = setting(16, least=1)
-    """Number of items, queries or frames that are generated for together; not used with servers."""
+    """Number of prompts per generated batch; not used with servers."""
     seed: int = setting(0, least=0)
     """Seed for sampling items and responses, and for the bootstrap."""
 
@@ -57,12 +57,12 @@ class GenerationCommand(CommandConfig):
 class SelectCommand(GenerationCommand, ItemsCommand):
     modes: list[str] | None = None
     """Response modes to measure: reasoning (rationale, then answer), answer (only the answer),
-    record (structured record) and constrained (record, with decoding constrained to its JSON
-    schema). null uses the modes that the student was trained in and, for a base, record and
+    record (JSON object with the choice) and constrained (the same object, with decoding constrained
+    to its JSON schema). null uses the modes that the student was trained in; for a base, record and
     constrained."""
     control: str | None = setting(None, ("candidate_only", "shuffled_prefix", None))
-    """candidate_only leaves out the prefix, shuffled_prefix shuffles its frames. The unchanged
-    items are measured too. null measures only the unchanged items."""
+    """Control condition to measure besides the unchanged items: candidate_only leaves out the
+    prefix, shuffled_prefix shuffles its frames. null measures only the unchanged items."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
@@ -71,17 +71,17 @@ class SelectCommand(GenerationCommand, ItemsCommand):
 
 @dataclass
 class EmbedderConfig(Settings):
-    """A retriever to measure or, in evaluation.two_stage, to match generated texts to the
-    database."""
+    """A retriever to measure or, in evaluation.two_stage, to match generated texts to frames."""
 
     retriever: RetrieverConfig = MISSING
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
-    """Training settings of the preset, of which only the precision is used."""
+    """Training settings of the preset, of which only train.precision is used."""
     model: str | None = None
-    """Folder of a run of train.contrastive or of an export. Its saved settings replace `retriever`
-    and `train`. null uses the model that `retriever` names, without training."""
+    """Folder of a run of train.contrastive, or of its export. The settings saved there replace
+    `retriever` and `train`. null uses the model that `retriever` names as released, or untrained if
+    it is built from an architecture."""
     batch: int = setting(64, least=1)
-    """Number of queries, prefixes, texts or frames that are embedded together."""
+    """Number of queries, prefixes, texts or frames per embedded batch."""
 
 
 @dataclass
@@ -106,13 +106,13 @@ class SimilarityCommand(ItemsCommand, EmbeddingCommand):
 @dataclass
 class ReportCommand(CommandConfig):
     runs: list[str] | None = None
-    """Run folders below `checkpoints`, or glob patterns, such as [select/cot,retrieve/*]; null
-    reports every finished run."""
+    """Run folders below `checkpoints`, or glob patterns of them, such as [select/cot,retrieve/*];
+    null reports every finished run."""
     items: int = setting(120, least=0)
-    """Maximum number of items shown per benchmark, spread over the subtypes and over correct and
-    wrong answers."""
+    """Maximum number of items shown per benchmark, sampled evenly from the subtypes and from
+    correct and wrong answers."""
     seed: int = setting(0, least=0)
-    """Seed of the sample of these items."""
+    """Seed of the sample of items."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         if self.runs is not None and (not self.runs or not all(r.strip("/. ") for r in self.runs)):
@@ -126,10 +126,10 @@ class ReportCommand(CommandConfig):
 class TwoStageCommand(GenerationCommand):
     matcher: EmbedderConfig = field(default_factory=EmbedderConfig)
     routes: list[str] | None = None
-    """Routes to measure: cot_text (the future state in a rationale, matched to frames),
-    predict_caption (a description of the future frame, matched to the same model's captions of the
-    database's frames) and predict_image (a description of the future frame, matched to frames).
-    null uses cot_text for a student, and all three for a base."""
+    """Routes from a query to frames: cot_text (matches the outcome of the model's rationale to
+    frames), predict_image (matches the model's description of the future frame to frames) and
+    predict_caption (matches this description to the model's captions of the frames). null uses
+    cot_text for a student, and all three for a base."""
 
     def find_problems(self, group: str) -> list[str]:
         return check_choices("routes", self.routes, ROUTES)
@@ -139,13 +139,13 @@ class TwoStageCommand(GenerationCommand):
 class StudyCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     items: str = "60"
-    """Number of test items, sampled evenly from the families; or a file of items, with one item_id
-    or one JSON object with an item_id per line."""
+    """Number of test items, sampled evenly from the families; or a file that lists items, with one
+    item_id, or one JSON object with the key item_id, per line."""
     annotators: int = setting(3, least=1)
-    """Number of annotators, each with a personal link; each of them answers every item."""
+    """Number of annotators. Each has a personal link and answers every item."""
     practice: int = setting(3, least=0)
-    """Practice items from the training split, which each annotator answers first, with feedback and
-    without a score."""
+    """Number of practice items from the training split. Each annotator answers them first, with
+    feedback; these answers are not scored."""
     rest_every: int = setting(20, least=1)
     """Number of items between two breaks."""
     seed: int = setting(0, least=0)
@@ -160,7 +160,7 @@ class StudyCommand(CommandConfig):
 
     @property
     def address(self) -> str:
-        """Beginning of the annotators' links."""
+        """The address with which the annotators' links begin."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return (self.public or f"http://{host}:{self.port}").rstrip("/")
 
@@ -172,7 +172,7 @@ class StudyCommand(CommandConfig):
         example = "such as https://study.example.org"
         if self.public is None and self.host in ("0.0.0.0", "::"):
             yield (
-                f"host={self.host} is not an address that annotators can open: give "
+                f"host={self.host} is not an address that annotators can open in a browser: give "
                 f"public=ADDRESS, {example}"
             )
         if self.public is not None:

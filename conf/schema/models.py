@@ -14,13 +14,13 @@ ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")
 
 @dataclass
 class ArchitectureConfig(Settings):
-    """Sizes of a Qwen3-VL that is built offline with random weights, a tokenizer and a
-    processor."""
+    """Sizes of a Qwen3-VL that is built with random weights and its own tokenizer, without any
+    download."""
 
     seed: int = 0
     """Seed of the weights."""
     vocabulary: int = 1024
-    """Number of tokens."""
+    """Number of tokens of the vocabulary."""
     hidden: int = 192
     """Hidden size of the language tower."""
     layers: int = 4
@@ -30,7 +30,8 @@ class ArchitectureConfig(Settings):
     kv_heads: int = 6
     """Key and value heads per layer of the language tower."""
     head: int = 32
-    """Size of one attention head; half of it encodes position in time, height and width."""
+    """Size of one attention head of the language tower. Its rotary frequencies (half of this size)
+    are divided among time, height and width."""
     feed_forward: int = 512
     """Feed-forward size of the language tower."""
     vision_hidden: int = 128
@@ -48,15 +49,15 @@ class LoraConfig(Settings):
     rank: int = setting(16, least=0)
     """Rank of the adapters; 0 adds no adapters and trains the whole model."""
     alpha: int = 32
-    """Scale of the adapters: their output is multiplied by alpha / rank."""
+    """Numerator of the adapters' scale: their output is multiplied by alpha / rank."""
     dropout: float = setting(0.0, least=0, below=1)
     """Dropout probability of the adapters' inputs."""
     targets: str = (
         r"(model\.)*language_model\.layers\.\d+\."
         r"(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
     )
-    """Regular expression for the full names of the adapted modules: the attention and feed-forward
-    projections of the language tower."""
+    """Regular expression that matches the full names of the modules to adapt; by default the
+    attention and feed-forward projections of the language tower."""
 
 
 @dataclass
@@ -66,12 +67,12 @@ class ModelConfig(Settings):
     name: str = MISSING
     """Name of the model in reports."""
     model: str | None = None
-    """Folder of the base, or its name on the Hugging Face hub if it is in the local cache; null
-    builds `architecture`."""
+    """Folder of the base, or its name on the Hugging Face hub, from which it is downloaded unless
+    it is in the local cache. null builds a model from `architecture`."""
     revision: str | None = None
     """Branch, tag or commit of `model` on the hub."""
     trust_remote_code: bool = False
-    """Allow the model's own Python code to run."""
+    """Allow Python code from the model's repository to run."""
     architecture: ArchitectureConfig | None = None
     """Sizes of a model to build with random weights; null loads `model`."""
     quantization: str = setting("nf4", ("nf4", "none"))
@@ -80,18 +81,18 @@ class ModelConfig(Settings):
     image_size: int = setting(336, least=32)
     """Width and height (px) to which frames are resized before the model's image processor."""
     frames: int = setting(12, least=2)
-    """Evenly spaced frames per prefix."""
+    """Number of evenly spaced frames of a prefix that the model sees."""
     max_length: int = setting(3072, least=1)
-    """Maximum length of an input with its response (tokens); a longer one raises an error and is
-    never truncated."""
+    """Maximum length (tokens) of an input, including the response if it is trained on. A longer
+    input raises an error; inputs are never truncated."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         rank = self.lora.rank
         quantization = f"{group}quantization={self.quantization}"
         if (self.model is None) == (self.architecture is None):
             yield (
-                f"{group}model and {group}architecture: set exactly one, a model to load or the "
-                "sizes of a model to build"
+                f"{group}model and {group}architecture: set exactly one of them, a model to load "
+                "or the sizes of a model to build"
             )
         if self.quantization == "nf4" and rank == 0:
             yield (
@@ -109,41 +110,44 @@ class ModelConfig(Settings):
 @dataclass
 class StudentConfig(ModelConfig):
     max_new_tokens: int = setting(512, least=1)
-    """Maximum length of a response (tokens), including its thinking."""
+    """Maximum number of generated tokens, including those of thinking. Without thinking, answer
+    mode has a fixed limit of 16 tokens instead."""
     thinking: bool = False
-    """Let the model think before its response; its thinking is not scored."""
+    """Let the model think (`<think>` ... `</think>`) before its response. Only the text after the
+    thinking is scored."""
     temperature: float = setting(0.0, least=0)
     """Sampling temperature of responses; 0 decodes greedily."""
     top_p: float = setting(1.0, above=0, most=1)
-    """Sample from the most likely tokens whose probabilities sum to this share."""
+    """Sample from the smallest set of most likely tokens whose total probability reaches this."""
     top_k: int = setting(0, least=0)
     """Sample from this number of most likely tokens; 0 sets no limit."""
 
 
 @dataclass
 class LateConfig(Settings):
-    """Late interaction: one vector per token of a frame, and of a query's clip and question. The
-    score sums, over the query's vectors, the highest similarity to any vector of the frame. Train
-    with train.scale near 1."""
+    """Late interaction: a frame has one vector per token, and a query has one per token of its clip
+    and question. The score is the sum, over the query's vectors, of the highest similarity to any
+    vector of the frame. Train with train.scale near 1."""
 
     width: int = setting(128, least=1)
-    """Dimensions of a vector."""
+    """Number of dimensions of each token's vector."""
 
 
 @dataclass
 class RetrieverConfig(ModelConfig):
     encoder: str = setting("qwen3_vl", ENCODERS)
-    """Kind of model. qwen3_vl and vlm2vec embed a prefix and its question jointly; dual (CLIP,
+    """Kind of model. qwen3_vl and vlm2vec embed a prefix and its question as one input; dual (CLIP,
     SigLIP 2) and languagebind embed them separately and add the embeddings. Only qwen3_vl can be
-    trained; the others are measured as released."""
+    trained; the others are evaluated as released."""
     image_model: str | None = None
     """Model that embeds frames, for languagebind only; `model` embeds prefixes and questions."""
     image_revision: str | None = None
     """Branch, tag or commit of `image_model` on the hub."""
     widths: list[int] = field(default_factory=lambda: [4096, 2048, 1024, 512, 256, 128, 64])
-    """Matryoshka widths in descending order; unused with `late`, which has its own width."""
+    """Matryoshka widths in descending order; not used with late interaction (`late.width`)."""
     late: LateConfig | None = None
-    """null embeds each query and each frame as a single vector."""
+    """Settings of late interaction, with one vector per token; +exp=late_interaction sets them.
+    null embeds each query and each frame as a single vector."""
     query_instruction: str = "Retrieve images or text relevant to the user's query."
     """System prompt of a query."""
     frame_instruction: str = "Represent the user's input."
@@ -165,7 +169,7 @@ class RetrieverConfig(ModelConfig):
             or self.architecture is not None
         ):
             yield (
-                f"{encoder} is measured as released: set {group}quantization=none and "
+                f"{encoder} can only be evaluated as released: set {group}quantization=none and "
                 f"{group}lora.rank=0, and leave {group}late and {group}architecture null"
             )
         if (self.encoder == "languagebind") != (self.image_model is not None):

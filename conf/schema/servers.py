@@ -1,4 +1,4 @@
-"""Settings of the clients of OpenAI-compatible servers: teacher and measured model."""
+"""Settings of OpenAI-compatible servers, which serve the teacher or the model to measure."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from conf.schema.settings import Settings, is_url, setting
 
 @dataclass
 class ServersConfig(Settings):
-    """Settings that every group of servers has."""
+    """Settings that `server` and `teacher` share. All addresses serve the same model."""
 
     GROUP: ClassVar[str]
-    """Name of the group in messages of the client."""
+    """Key of this group of settings, which error messages name."""
 
     url: Any = None
     """Address of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1, or a list of
-    servers of the same model; null uses no server."""
+    addresses of servers of the same model; null uses no server."""
     model: str | None = None
     """Name of the model on the server."""
     concurrency: int = setting(128, least=1)
-    """Concurrent requests over all servers; 128 requests saturate one vLLM server."""
+    """Number of concurrent requests, over all servers; 128 requests saturate one vLLM server."""
     timeout: float = setting(120.0, least=1)
     """Timeout of a request (s)."""
     unreachable_timeout: float = setting(600.0, least=0)
-    """Time (s) without a response of any server after which the command gives up."""
+    """Time (s) after which the command gives up if no server has responded."""
 
     @property
     def urls(self) -> list[str]:
-        """Addresses of the servers; empty without a server."""
+        """Addresses of the servers; empty if no server is used."""
         if self.url is None:
             return []
         return list(self.url) if isinstance(self.url, list) else [self.url]
@@ -54,7 +54,7 @@ class ServerConfig(ServersConfig):
     model: str | None = None
     """Name of the model or of an adapter on the server; null uses student.model."""
     concurrency: int = setting(32, least=1)
-    """Concurrent requests over all servers; each contains the frames of an item."""
+    """Number of concurrent requests, over all servers; each contains the frames of one item."""
     timeout: float = setting(600.0, least=1)
     """Timeout of a request (s); a response with thinking takes minutes."""
 
@@ -66,29 +66,30 @@ class ServerConfig(ServersConfig):
 
 @dataclass
 class TeacherConfig(ServersConfig):
-    """A model on a server, or the built-in narrator without one."""
+    """The teacher: a model on servers or, without a server, the built-in narrator."""
 
     GROUP: ClassVar[str] = "teacher"
 
     name: str = MISSING
     """Name of the teacher, recorded with every rationale."""
     seed: int = setting(0, least=0)
-    """Seed of the built-in narrator's phrasing. It is not sent to a server, but with another seed
-    every rationale is requested again."""
+    """Seed of the built-in narrator's choice of phrases. It is not sent to a server, but changing
+    it requests every rationale again."""
     min_words: int = 80
     """Minimum length of a rationale (words)."""
     max_words: int = 250
     """Maximum length of a rationale (words)."""
     attempts: int = setting(4, least=1)
-    """Maximum number of responses requested for an item before it is set aside."""
+    """Maximum number of responses for an item. If the validator rejects all of them, the item is
+    set aside: it gets no rationale."""
     fallback: bool = False
-    """Let the built-in narrator narrate the items that are set aside; its rationales are marked."""
+    """Let the built-in narrator write the rationales of items that are set aside, and mark them."""
     samples: int = setting(3, least=1)
-    """Responses per request for an item whose previous response was rejected."""
+    """Number of responses per request for an item whose previous response was rejected."""
     temperature: float = setting(0.7, least=0)
     """Sampling temperature of the server's responses."""
     top_p: float = setting(0.8, above=0, most=1)
-    """Sample from the most likely tokens whose probabilities sum to this share."""
+    """Sample from the smallest set of most likely tokens whose total probability reaches this."""
     top_k: int = 20
     """Sample from this number of most likely tokens."""
     max_tokens: int = setting(640, least=1)
@@ -99,7 +100,7 @@ class TeacherConfig(ServersConfig):
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
         if (self.url is None) != (self.model is None):
-            yield f"{group}url and {group}model: set both (a server) or neither"
+            yield f"{group}url and {group}model: set both, to use a server, or neither"
         if not 0 < self.min_words <= self.max_words:
             yield (
                 f"{group}min_words={self.min_words} and {group}max_words={self.max_words}: "

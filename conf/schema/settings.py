@@ -1,4 +1,4 @@
-"""Base class of all groups of settings, with the checks that several groups share."""
+"""Base class of all groups of settings, and the checks that several groups share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BOUNDS = {
     "most": (operator.le, "at most {}"),
     "below": (operator.lt, "below {}"),
 }
-"""The comparison and the wording of each bound that `setting` takes."""
+"""For each bound that `setting` takes, its comparison and its wording in error messages."""
 
 
 def setting(default: Any, options: Sequence[str | None] = (), **bounds: float) -> Any:
@@ -25,7 +25,7 @@ def setting(default: Any, options: Sequence[str | None] = (), **bounds: float) -
     Args:
         default: The default value.
         options: The valid values; empty allows any value.
-        bounds: Bounds by their name in BOUNDS, such as `least=1`. null is always within them.
+        bounds: Bounds by their name in BOUNDS, such as `least=1`. null satisfies every bound.
     """
     return field(default=default, metadata={"options": options, "bounds": bounds})
 
@@ -34,7 +34,7 @@ class Settings:
     """Base of a group of settings: a dataclass whose fields are settings or nested groups."""
 
     def check(self, group: str = "") -> list[str]:
-        """Return one sentence per invalid setting of this group and of its nested groups.
+        """Return one message per problem in this group and in its nested groups.
 
         Args:
             group: Prefix of this group's keys as the user types them, such as ``"train."``.
@@ -52,7 +52,8 @@ class Settings:
         return [*problems, *self.find_problems(group)]
 
     def find_problems(self, group: str) -> Iterable[str]:
-        """One sentence per further problem, such as settings that exclude each other."""
+        """One message per further problem, such as settings that exclude each other. Subclasses
+        override this method."""
         return ()
 
 
@@ -77,14 +78,14 @@ def is_url(text: str) -> bool:
 
 
 def check_choices(name: str, chosen: Sequence[str] | None, options: Sequence[str]) -> list[str]:
-    """A list that is empty, repeats a value or has one that is not an option; null passes."""
+    """Check that a list is not empty, repeats no value and contains only options; None passes."""
     if chosen is None or (chosen and len(set(chosen)) == len(chosen) and set(chosen) <= {*options}):
         return []
     return [f"{name}={chosen}: give one or more of {', '.join(options)}, each once"]
 
 
 def check_run(run: str, folder: str) -> list[str]:
-    """A `run` that is neither the name of a run in `folder` nor a folder inside it."""
+    """Check that `run` is the name of a run in `folder`, or the path of a folder inside it."""
     if is_run_name(resolve_run_name(run, folder)):
         return []
     return [

@@ -1,7 +1,7 @@
-"""The columns of an exported benchmark, which `columns.yaml` lists, and the rows of its records.
+"""The columns of an exported benchmark (see `columns.yaml`), and the rows of its records.
 
-Columns have the names of the records' fields. With images, a row also has the frames that it refers
-to, as PNGs.
+Columns have the names of the records' fields. An export with images also contains, as PNGs, the
+frames of prefixes, candidates, targets and databases. Hard negatives have no images.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ COLUMNS = OmegaConf.to_container(
 )
 DESCRIPTIONS: dict[str, str] = COLUMNS.pop("descriptions")
 ENCODED_FRAMES = 1_000
-"""Encoded frames kept in memory, at up to 100 KB each."""
-Record = SelectionItem | RetrievalQuery | FrameRef
+"""Number of encoded frames that are kept in memory, at up to 100 KB each."""
+ExportedRecord = SelectionItem | RetrievalQuery | FrameRef
 
 
 def list_columns(images: bool) -> dict[str, dict[str, str]]:
-    """Return the type of each column in the notation of `columns.yaml`, by configuration."""
+    """Return the types of columns, as `columns.yaml` writes them, by configuration (table)."""
     return {
         name: {c: kind for c, kind in columns.items() if images or not kind.endswith("image")}
         for name, columns in COLUMNS.items()
@@ -39,7 +39,7 @@ def list_columns(images: bool) -> dict[str, dict[str, str]]:
 
 
 def dataset_features(images: bool) -> dict[str, Features]:
-    """Return the columns of each configuration, in order."""
+    """Return the `datasets.Features` of each configuration."""
     from datasets import Features, Image, List, Value
 
     frame = {"scene_id": Value("string"), "frame": Value("int64")}
@@ -58,7 +58,7 @@ def dataset_features(images: bool) -> dict[str, Features]:
 
 
 class RowBuilder:
-    """Turns a store's records into rows, with their frames if `images` is set."""
+    """Converts a store's records to rows, with images of their frames if `images` is set."""
 
     def __init__(self, store: Store, images: bool) -> None:
         self.images = images
@@ -68,12 +68,12 @@ class RowBuilder:
         self._encode = lru_cache(maxsize=ENCODED_FRAMES)(self._encode_png)
 
     def images_per_row(self, configuration: str) -> int:
-        """Return the largest number of images in a row of a configuration."""
+        """Return the maximum number of images in a row of a configuration."""
         counts = {"selection": self._prefix_frames + 4, "retrieval": self._prefix_frames + 1}
         return counts.get(configuration, 1) if self.images else 0
 
-    def row(self, record: Record, split: str) -> dict[str, Any]:
-        """Return a record's values by column; `split` names the database of a frame."""
+    def row(self, record: ExportedRecord, split: str) -> dict[str, Any]:
+        """Return a record's values by column. For a frame, `split` is the name of its database."""
         if isinstance(record, FrameRef):
             row = {**asdict(record), "database": split}
             return row | ({"image": self._encode(record)} if self.images else {})
@@ -88,7 +88,7 @@ class RowBuilder:
         return row | {"candidate_images": list(map(self._encode, references))}
 
     def _encode_png(self, frame: FrameRef) -> dict[str, Any]:
-        """A frame in the form that `datasets.Image` stores."""
+        """Encode a frame in the form that `datasets.Image` stores."""
         png = io.BytesIO()
         self._frames.image(frame.scene_id, frame.frame).save(png, "PNG", compress_level=1)
         return {"bytes": png.getvalue(), "path": f"{frame.scene_id}-{frame.frame:03d}.png"}

@@ -18,12 +18,12 @@ INK, GREEN = "#222222", "#1a7f37"
 CELL_WIDTH, CAPTION_HEIGHT, HEADING_HEIGHT = 2.3, 0.5, 0.6
 """Sizes in inches."""
 GAP = 0.12
-"""Width between the prefix and the candidates, as a share of a cell's."""
+"""Width of the gap between the prefix and the candidates, as a fraction of a cell's width."""
 DPI = 100
 PREFIX_FRAMES = 4
 """Number of frames that represent a prefix on a sheet."""
-AXES = ("framing", "gap", "horizon", "group", "window_family", "difficulty")
-"""Construction axes of selection items that a heading states."""
+HEADING_FIELDS = ("framing", "gap", "horizon", "group", "window_family", "difficulty")
+"""Fields of a selection item that its heading shows."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def draw_sheet(rows: Sequence[Row]) -> bytes:
             axes.set_xlabel("\n".join(cell.caption), loc="left", labelpad=6, fontsize=9)
             axes.xaxis.label.set_color(GREEN if cell.is_answer else INK)
     buffer = io.BytesIO()
-    # Without the version of matplotlib, equal sheets have equal bytes.
+    # PNGs of matplotlib contain its version by default; equal sheets should have equal bytes.
     figure.savefig(buffer, metadata={"Software": None})
     return buffer.getvalue()
 
@@ -96,9 +96,9 @@ class SheetRows:
 
     def _item(self, item: SelectionItem) -> Row:
         """The prefix and the candidates of an item, with the answer marked."""
-        values = {name.replace("_", " "): getattr(item, name) for name in AXES}
-        axes = [f"{name} {value}" for name, value in values.items() if value is not None]
-        details = [item.split, *axes, f"least displacement {item.min_displacement:.0f} px"]
+        values = {name.replace("_", " "): getattr(item, name) for name in HEADING_FIELDS}
+        fields = [f"{name} {value}" for name, value in values.items() if value is not None]
+        details = [item.split, *fields, f"minimum displacement {item.min_displacement:.0f} px"]
         cells = []
         for letter, candidate in zip(LETTERS, item.candidates, strict=True):
             distance, nearest = min(
@@ -115,18 +115,18 @@ class SheetRows:
     def _query(self, query: RetrievalQuery) -> Row:
         """The prefix, the target and the hard negatives of a query.
 
-        The first hard negative of a counterfactual query is the factual frame: the query's own
-        scene at the target's moment.
+        The first hard negative of a counterfactual query is the factual frame: the scene with the
+        object, at the target's moment.
         """
         caption = _describe_frame(query, query.target)
         cells = [self._cell(query.target, "target", caption, is_answer=True)]
         negatives = list(query.hard_negatives)
         if query.removed_object is not None:
             scene = self._store.scene(query.scene_id)
-            without = self._store.scene(query.target.scene_id)
+            counterfactual = self._store.scene(query.target.scene_id)
             removed = [o.noun_phrase for o in scene.objects].index(query.removed_object)
-            shift = removal_displacement(scene, without, removed)[query.target.frame]
-            caption = f"others differ by {shift:.0f} px"
+            shift = removal_displacement(scene, counterfactual, removed)[query.target.frame]
+            caption = f"other objects differ by {shift:.0f} px"
             cells.insert(0, self._cell(negatives.pop(0), "factual", caption))
         for frame in negatives:
             distance = f"{self._displacement(query.target, frame):.0f} px away"
@@ -142,15 +142,17 @@ class SheetRows:
     def _cell(self, frame: FrameRef, *caption: str, is_answer: bool = False) -> Cell:
         return Cell(self._frames.image(frame.scene_id, frame.frame), caption, is_answer)
 
-    def _displacement(self, one: FrameRef, two: FrameRef) -> float:
-        scenes = self._store.scene(one.scene_id), self._store.scene(two.scene_id)
-        return cross_scene_displacement(scenes[0], one.frame, scenes[1], two.frame)
+    def _displacement(self, first: FrameRef, second: FrameRef) -> float:
+        scenes = self._store.scene(first.scene_id), self._store.scene(second.scene_id)
+        return cross_scene_displacement(scenes[0], first.frame, scenes[1], second.frame)
 
 
 def _describe_frame(record: SelectionItem | RetrievalQuery, frame: FrameRef) -> str:
     """Describe when a frame occurs: its index and its offset in frames from the end of the prefix.
 
-    The offset is omitted unless the frame is of the record's scene or of its counterfactual scene.
+    The offset is omitted if the frame belongs to another scene; the scene's counterfactual counts
+    as the same scene.
     """
-    own = frame.scene_id.partition("-without-")[0] == record.scene_id
-    return f"frame {frame.frame}" + (f" ({frame.frame - record.prefix_stop:+d})" if own else "")
+    is_same_scene = frame.scene_id.partition("-without-")[0] == record.scene_id
+    offset = frame.frame - record.prefix_stop
+    return f"frame {frame.frame}" + (f" ({offset:+d})" if is_same_scene else "")

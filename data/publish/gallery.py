@@ -17,7 +17,7 @@ from data.tracks.quota import named_rng
 
 @dataclass(frozen=True)
 class Sheet:
-    """A picture of some items or queries, and its section and title on the page."""
+    """A contact sheet (PNG), its file name, and its section and title on the page."""
 
     section: str
     title: str
@@ -26,7 +26,8 @@ class Sheet:
 
 
 def draw_sheets(store: Store, examples: int, seed: int) -> Iterator[Sheet]:
-    """Draw a sheet for each subtype, builder and control, with `examples` sampled by `seed`."""
+    """Draw a sheet of up to `examples` random items, queries or pairs for each selection subtype,
+    retrieval builder and control."""
     rows = SheetRows(store)
     groups: dict[tuple[str, str, str], list[tuple]] = defaultdict(list)
     for item in store.selection():
@@ -37,10 +38,10 @@ def draw_sheets(store: Store, examples: int, seed: int) -> Iterator[Sheet]:
         group = "Retrieval: future", f"builder {number}", f"retrieval-builder-{number}"
         groups[group].append((query,))
     for query in store.retrieval(pool="counterfactual"):
-        group = "Retrieval: counterfactual", "with and without an object", "counterfactual"
+        group = "Retrieval: counterfactual", "scenes without one object", "counterfactual"
         groups[group].append((query,))
     for pair in pair_items(store.selection(suite=MATCHED_ANCHOR)):
-        group = "Controls", "differing only in the anchor", f"controls-{MATCHED_ANCHOR}"
+        group = "Controls", "pairs that differ only in the anchor", f"controls-{MATCHED_ANCHOR}"
         groups[group].append(pair)
     for (section, title, name), examples_of_group in groups.items():
         count = len(examples_of_group)
@@ -51,7 +52,7 @@ def draw_sheets(store: Store, examples: int, seed: int) -> Iterator[Sheet]:
 
 
 def render_page(store: Store, sheets: Sequence[Sheet]) -> str:
-    """Return the HTML page of sheets that are in its folder."""
+    """Return an HTML page that shows `sheets`, whose files must be in the folder of the page."""
     from jinja2 import Template
 
     sections = defaultdict(list)

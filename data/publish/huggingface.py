@@ -1,7 +1,7 @@
-"""Write a benchmark as a Hugging Face dataset, which loads without this code.
+"""Write a benchmark as a Hugging Face dataset, which can be loaded without this repository.
 
     <folder>/README.md      the dataset card, which names the files of each split
-             export.json    what was exported, with the SHA-256 of every file
+             export.json    the exported benchmark's identity, and the SHA-256 of every file
              selection/ retrieval/ database/    <split>-00000-of-00002.parquet
 
 The dataset is written to a hidden folder beside `<folder>`, one shard after another, and renamed
@@ -25,7 +25,13 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.runs import lock_folder
-from data.publish.columns import DESCRIPTIONS, Record, RowBuilder, dataset_features, list_columns
+from data.publish.columns import (
+    DESCRIPTIONS,
+    ExportedRecord,
+    RowBuilder,
+    dataset_features,
+    list_columns,
+)
 from data.records import POOLS, SPLITS, RetrievalQuery, SelectionItem
 from data.store import DATABASES, Store, component_versions, hash_file, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR
@@ -39,21 +45,22 @@ RECORD, CARD = "export.json", "README.md"
 EXPORT_VERSION = "2"
 """Changes whenever the same store would give another dataset."""
 GROUP_IMAGES = 512
-"""Images of a parquet row group, about 30 MB at 480 x 320 px; an export holds one in memory."""
+"""Images in a parquet row group (about 30 MB at 480 x 320 px), which an export keeps in memory."""
 GROUP_ROWS = 5_000
-"""Rows of a row group without images."""
+"""Number of rows in a row group without images."""
 SHARD_GROUPS = 10
-"""Row groups of a shard."""
+"""Number of row groups in a shard."""
 Shard = dict[str, Any]
-"""A written file, as export.json describes it: configuration, split, path relative to the export's
+"""Entry of a parquet file in export.json: configuration, split, path relative to the export's
 folder, rows, bytes and sha256."""
 
 
 def ensure_export(store: Store, folder: Path, images: bool) -> list[Shard]:
-    """Return the shards of the export of `store` at `folder`, which is written if missing.
+    """Export a store to `folder` unless that is already done, and return the shards.
 
     Raises:
-        UserError: `folder` holds something else, or that export is damaged.
+        UserError: `folder` contains something else or a damaged export, or another process is
+            writing to it.
     """
     plan = {
         "benchmark": store.name,
@@ -84,10 +91,10 @@ def ensure_export(store: Store, folder: Path, images: bool) -> list[Shard]:
     return shards
 
 
-def list_tables(store: Store) -> dict[tuple[str, str], list[Record]]:
+def list_tables(store: Store) -> dict[tuple[str, str], list[ExportedRecord]]:
     """Return the records of each table that is not empty, by configuration and split. The splits
     of the configuration `database` are the databases."""
-    tables: dict[tuple[str, str], list[Record]] = {}
+    tables: dict[tuple[str, str], list[ExportedRecord]] = {}
     for split in SPLITS:
         tables["selection", split] = store.selection(split) + store.selection(split, MATCHED_ANCHOR)
     for split in SPLITS:
@@ -100,11 +107,11 @@ def _write_table(
     folder: Path,
     configuration: str,
     split: str,
-    records: list[Record],
+    records: list[ExportedRecord],
     builder: RowBuilder,
     bar: tqdm,
 ) -> Iterator[Shard]:
-    """Write the missing shards of a table, and describe all of its shards."""
+    """Write the missing shards of a table, and yield each of its shards."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -138,7 +145,7 @@ def _write_table(
 
 
 def render_card(store: Store, shards: Sequence[Shard], images: bool) -> str:
-    """Return the README.md of an export that was written as `shards`."""
+    """Return the dataset card (README.md) of an export with these shards."""
     from jinja2 import Template
 
     settings = store.manifest["config"]
@@ -165,7 +172,7 @@ def render_card(store: Store, shards: Sequence[Shard], images: bool) -> str:
 
 
 def _count_rows(records: Iterable[SelectionItem | RetrievalQuery], *axes: str) -> list[tuple]:
-    """Count records by the values of some fields: a tuple (value, ..., train, test) for each."""
+    """Count records by the values of the fields `axes`, as tuples (value, ..., train, test)."""
     counts = Counter((*(getattr(r, axis) for axis in axes), r.split) for r in records)
     keys = dict.fromkeys(key[:-1] for key in counts)
     return [(*key, *(counts[*key, split] for split in SPLITS)) for key in keys]
@@ -176,7 +183,7 @@ def _write_record(folder: Path, record: dict[str, Any]) -> None:
 
 
 def _read_record(folder: Path) -> dict[str, Any]:
-    """The content of export.json, empty if it is missing or cannot be read."""
+    """Return the content of export.json; an empty dict if it is missing or cannot be read."""
     try:
         return dict(json.loads((folder / RECORD).read_text()))
     except (OSError, ValueError, TypeError):
@@ -187,15 +194,15 @@ def _verify(folder: Path, plan: dict[str, Any]) -> None:
     record = _read_record(folder)
     if "shards" not in record:
         raise UserError(
-            f"{folder} exists and holds no readable export: choose another folder with "
+            f"{folder} exists but contains no readable export: choose another folder with "
             "folder=FOLDER",
             code="folder-in-use",
         )
     for key, value in plan.items():
         if record.get(key) != value:
             raise UserError(
-                f"{folder} holds an export with {key}={record.get(key)}, not {key}={value}: choose "
-                f"another folder with folder=FOLDER, or delete {folder}",
+                f"{folder} contains an export with {key}={record.get(key)}, not {key}={value}: "
+                f"choose another folder with folder=FOLDER, or delete {folder}",
                 code="different-settings",
             )
     expected = {CARD: record["card"]} | {s["path"]: s["sha256"] for s in record["shards"]}

@@ -1,7 +1,7 @@
 """Statistics of a benchmark's scenes and selection items, and the accuracy of baselines.
 
-Baselines answer selection items from the oracle, without predicting the future. A high accuracy of
-a baseline shows that items can be answered by a shortcut.
+Baselines answer selection items from the oracle by simple rules, without simulating the scene. A
+high accuracy of a baseline shows that items can be answered by a shortcut.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ from data.world.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displaceme
 from data.world.standins import standin_view
 
 Cost = Callable[[SelectionItem, Candidate, Store], float]
+"""Cost of choosing a candidate of an item."""
 
 
 def displacement_from_prefix(item: SelectionItem, candidate: Candidate, store: Store) -> float:
-    """Displacement from the last frame of the prefix."""
+    """Displacement between the last frame of the prefix and the candidate."""
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
     return cross_scene_displacement(scene, item.prefix_stop, other, candidate.frame)
 
 
 def displacement_from_others(item: SelectionItem, candidate: Candidate, store: Store) -> float:
-    """Sum of the displacements from the other candidates; the prefix is ignored."""
+    """Sum of the displacements between the candidate and the other candidates."""
     scene = store.scene(candidate.scene_id)
     return sum(
         cross_scene_displacement(scene, candidate.frame, store.scene(c.scene_id), c.frame)
@@ -36,10 +37,11 @@ def displacement_from_others(item: SelectionItem, candidate: Candidate, store: S
 
 
 def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: Store) -> float:
-    """Mean distance of the objects from where their last observed velocities lead, px at 336 x 336.
+    """Mean distance of the objects from their positions at constant velocity, px at 336 x 336.
 
-    The extrapolation uses the target's moment, which questions of the event family do not state.
-    An object that the candidate's scene lacks counts as the image's diagonal.
+    Positions are extrapolated from the last frame of the prefix to the target's moment, which
+    questions of the event and window families do not state. An object that the candidate's scene
+    lacks has the image's diagonal as its distance, which is also the maximum.
     """
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
     seconds = (item.target_frame - item.prefix_stop) / scene.fps
@@ -62,12 +64,12 @@ BASELINES: dict[str, Cost] = {
     "typical": displacement_from_others,
     "velocity": constant_velocity_error,
 }
-"""The cost of each baseline, which answers with the candidate of the least cost."""
+"""Cost function of each baseline; a baseline chooses the candidate with the lowest cost."""
 
 
 def score_baselines(item: SelectionItem, store: Store) -> dict[str, float]:
-    """Return each baseline's score on an item: 1/m if the target is among m candidates of the least
-    cost, otherwise 0."""
+    """Return each baseline's score on an item: 1/m if the target is among the m candidates with the
+    lowest cost, otherwise 0."""
     scores = {}
     for name, cost in BASELINES.items():
         costs = np.array([cost(item, candidate, store) for candidate in item.candidates])
@@ -82,8 +84,9 @@ def compute_statistics(store: Store) -> dict[str, Any]:
     Returns:
         ``scenes``: distributions of objects, collisions and event frames. ``answers``: items by
         letter. ``cells``: items and quotas by family, window group and subtype. ``candidates``:
-        median displacements and positions in time by category. ``baselines``: accuracies by
-        category.
+        median displacements, and items by number of distractors earlier than the target, by
+        category. ``baselines``: accuracies by category. A category is a family, a kind of
+        distractors in the event family, or a difficulty in the window family.
     """
     items = store.selection()
     rows = pd.DataFrame([_describe_item(item, store) for item in items])
@@ -104,7 +107,7 @@ def compute_statistics(store: Store) -> dict[str, Any]:
 
 
 def describe_scenes(store: Store) -> dict[str, Any]:
-    """Return the scenes by number of objects and of collisions, and quantiles of event frames."""
+    """Count scenes by their numbers of objects and collisions; find quartiles of event frames."""
     scenes = [store.scene(name) for split in SPLITS for name in store.scene_ids(split)]
     counts = pd.DataFrame({s.scene_id: (len(s.objects), len(s.collisions)) for s in scenes}).T
     frames = [c.frame for scene in scenes for c in scene.collisions]
@@ -120,7 +123,7 @@ def describe_scenes(store: Store) -> dict[str, Any]:
 def count_cells(
     items: list[SelectionItem], quotas: dict[str, dict[str, dict[str, int]]]
 ) -> dict[str, dict[str, int]]:
-    """Return items and quotas by split, for each family, window group and subtype."""
+    """Return the items and the quotas of each split, for each family, window group and subtype."""
     counts = [(item.family, item.subtype, item.split, 1) for item in items]
     counts += [
         (family, subtype, f"{split} quota", quotas[family][subtype][split])
@@ -160,7 +163,7 @@ def _categories(item: SelectionItem) -> Iterator[str]:
 
 
 def format_statistics(statistics: dict[str, Any]) -> str:
-    """Return the statistics as tables of at most 100 columns."""
+    """Format the statistics as text tables whose lines have at most 100 characters."""
     scenes = statistics["scenes"]
     candidates = pd.DataFrame(statistics["candidates"]).T.round().astype(int)
     baselines = pd.DataFrame(statistics["baselines"]).T

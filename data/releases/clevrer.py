@@ -3,11 +3,11 @@
     <folder>/annotation_train/annotation_00000-01000/annotation_00000.json
              video_train/video_00000-01000/video_00000.mp4
 
-The path of a video is that of its annotation with `video` in place of `annotation`, so
-`annotations/train/...` beside `videos/train/...` is read too.
+The folder of a video is the folder of its annotation with `video` in place of `annotation`, so
+`annotations/train/...` beside `videos/train/...` can be read too.
 
-`orientation` is read as angles in radians about the fixed x, y and z axes, in this order: the
-convention of Bullet's getEulerFromQuaternion and of Blender's rotation mode XYZ.
+`orientation` is read as angles in radians of rotations about the fixed x, y and z axes, in this
+order, as in Bullet's getEulerFromQuaternion and Blender's rotation mode XYZ.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Annotation(Layout):
 
 
 def list_scenes(folder: Path) -> list[Path]:
-    """Return the annotations below a folder, in order of their number."""
+    """Return the paths of the annotations below a folder, in order of their numbers."""
     paths = sorted(folder.rglob("annotation_*.json"), key=lambda path: (path.stem, path))
     return check_unique_scenes(folder, paths, _scene_id, FOLDER_CONTENTS)
 
@@ -84,8 +84,8 @@ def _scene_id(path: Path) -> str:
 def read_scene(path: Path, folder: Path, split: str) -> Scene:
     """Return the scene of an annotation.
 
-    Visible fractions are computed from the poses. The annotation states whether an object is in
-    view.
+    Visible fractions are computed from the poses; whether an object is in view is read from the
+    annotation.
     """
     from scipy.spatial.transform import Rotation
 
@@ -113,6 +113,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     footage = Path(str(path.relative_to(folder)).replace("annotation", "video"))
     footage = footage.with_name(annotation.video_filename)
     with _open_video(folder / footage) as video:
+        # Counting packets is faster than decoding the frames.
         count = sum(packet.size > 0 for packet in video.demux(video=0))
     if count != FRAMES:
         raise RecordError(f"{folder / footage} has {count} frames, expected {FRAMES}")

@@ -1,4 +1,4 @@
-"""Readers of other simulators' releases, by simulator. Each module provides three functions:
+"""Readers of other simulators' releases: one module per simulator, with three functions each.
 
     list_scenes(folder) -> list[Path]           one path per scene, in a stable order
     read_scene(path, folder, split) -> Scene    the scene at one of these paths
@@ -7,9 +7,9 @@
 `folder` is the release's folder; `Scene.footage` is relative to it. `list_scenes` raises UserError
 for a folder without scenes, and for a scene that occurs twice. `read_scene` reads only the scene's
 own files and checks that its frames exist, so scenes can be read in any order and in separate
-processes. It and `load_images` raise `RecordError` for a record that is damaged or does not have
-the published layout. Physion's trials do not record their frame rate: `physion.read_scene` also
-takes `fps`.
+processes. `read_scene` and `load_images` raise `RecordError` for a record that is damaged or does
+not have the published layout. `physion.read_scene` also has the argument `fps`, because Physion's
+trials do not record their frame rate.
 """
 
 from __future__ import annotations

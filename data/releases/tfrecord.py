@@ -24,10 +24,10 @@ HEADER, FOOTER = 12, 4
 
 
 def record_ranges(path: Path) -> list[range]:
-    """Return the bytes that the data of each record occupies.
+    """Return the range of bytes in the file that contains the data of each record.
 
-    The list ends with the first record that reaches beyond the end of the file, because the records
-    after it cannot be located.
+    If a record reaches beyond the end of the file, its range is the last one: the records after it
+    cannot be located.
     """
     size, start, ranges = path.stat().st_size, 0, []
     with open(path, "rb") as file:

@@ -1,7 +1,7 @@
-"""Selection items of the transfer suites, which are built from scenes of MoVi-A and Physion.
+"""Selection items of the transfer suites, which test students on scenes of MoVi-A and Physion.
 
-Their questions are those of the dynapix suite. CLEVRER needs no suite here: its scenes have the
-items of the dynapix suite.
+A suite is a set of items that are built in the same way. The transfer suites have the questions of
+the suite `dynapix`. Items from CLEVRER's scenes belong to the suite `dynapix`.
 """
 
 from __future__ import annotations
@@ -17,37 +17,37 @@ from data.tracks.selection import event, time
 from data.tracks.selection.distractors import DistractorPicker, Family, Timing, scene_candidates
 from data.world.events import find_motion_onsets
 
-LEAST_PREFIX = 5
-"""Minimum number of frames in a prefix. A prefix is shorter than usual where it would begin before
-the scene."""
+MIN_PREFIX_FRAMES = 5
+"""Minimum number of frames in a prefix, for prefixes that are cut at the start of the scene."""
 CROSS_SCENES = 8
-"""Number of other scenes that are sampled for cross-scene distractors."""
+"""Number of other scenes to sample for cross-scene distractors."""
 
 
 @dataclass(frozen=True)
 class EventCell:
     """A cell whose target is the frame of an event.
 
-    The prefix ends `gap` frames before the event and starts `step` frames before its end.
+    `kind` is a key of `EVENTS`. The prefix ends `gap` frames before the event, and its first frame
+    is `span` frames before its last frame.
     """
 
     kind: str
-    step: int
+    span: int
     gap: int
     question = event.QUESTION
 
     def timings(self, scene: Scene) -> list[Timing]:
         stops = [frame - self.gap for frame in sorted(set(EVENTS[self.kind](scene)))]
         return [
-            Timing(max(stop - self.step, 0), stop, stop + self.gap, event=stop + self.gap)
+            Timing(max(stop - self.span, 0), stop, stop + self.gap, event=stop + self.gap)
             for stop in stops
-            if stop + 1 >= LEAST_PREFIX
+            if stop + 1 >= MIN_PREFIX_FRAMES
         ]
 
 
 @dataclass(frozen=True)
 class TimeCell:
-    """A cell whose prefix is the scene's first second. The target is `seconds` later."""
+    """A cell whose prefix is the scene's first second. The target is `seconds` after the prefix."""
 
     seconds: int
 
@@ -68,10 +68,11 @@ def transfer_family(
     same_scene: int,
     after_target: bool,
 ) -> Family:
-    """Return a family of a suite's items.
+    """Return one family of a transfer suite.
 
     Args:
-        same_scene: Number of distractors from the item's own scene, at frames after the prefix. The
+        cells: Cells of the family by subtype.
+        same_scene: Number of distractors from the item's own scene, all from after the prefix. The
             other distractors are targets from other scenes of the same scenario.
         after_target: Whether distractors from the item's own scene must also come after the target.
     """
@@ -109,11 +110,11 @@ def transfer_family(
 def cross_scene_candidates(
     cell: EventCell | TimeCell, scene: Scene, rng: np.random.Generator, picker: DistractorPicker
 ) -> Iterator[Candidate]:
-    """Yield the first target of each of several other scenes of the same scenario.
+    """Yield the first target of up to `CROSS_SCENES` other scenes of the same scenario.
 
-    The scenes that share the most objects with `scene` come first.
+    Scenes that share more objects with `scene` come first.
     """
-    # Scenes are loaded only until enough of them have the same scenario.
+    # The generators are lazy: no more scenes are loaded than needed.
     scenes = (picker.scene_of(str(name)) for name in rng.permutation(picker.scene_ids))
     similar = (s for s in scenes if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
     targets = ((s, timings[0].target) for s in similar if (timings := cell.timings(s)))
@@ -128,27 +129,27 @@ EVENTS: dict[str, Callable[[Scene], list[int]]] = {
     "motion": lambda scene: [frame for frame, _ in find_motion_onsets(scene)],
     "landing": lambda scene: [landing.frame for landing in scene.landings],
 }
-"""Frames of each kind of event in a scene."""
+"""Functions that return the frames of a scene's events, by kind of event."""
 
 
 CELLS = {
-    # At MoVi-A's 12 fps, these steps and gaps last nearly as long as those of the dynapix suite at
-    # 25 fps. A scene lasts two seconds, so there is no in_2s.
+    # At MoVi-A's 12 fps, these spans and gaps last nearly as long as those of the suite `dynapix`
+    # at 25 fps. A scene lasts two seconds, so there is no in_2s.
     "movi_a": {
-        "event": {"contact": EventCell("contact", step=10, gap=5)},
+        "event": {"contact": EventCell("contact", span=10, gap=5)},
         "time": {"in_1s": TimeCell(1)},
     },
-    # Physion's steps and gaps are numbers of frames, whatever the frame rate.
+    # Physion's spans and gaps are the same numbers of frames at every frame rate.
     "physion": {
         "event": {
-            "A1_contact": EventCell("contact", step=20, gap=10),
-            "A2_motion": EventCell("motion", step=20, gap=10),
-            "A3_landing": EventCell("landing", step=20, gap=10),
+            "A1_contact": EventCell("contact", span=20, gap=10),
+            "A2_motion": EventCell("motion", span=20, gap=10),
+            "A3_landing": EventCell("landing", span=20, gap=10),
         },
         "time": {"in_1s": TimeCell(1), "in_2s": TimeCell(2)},
     },
 }
-# The items of a stand-in are built as those of its suite, but name the stand-in as their suite.
+# Items of a stand-in are built like those of the suite that it imitates, under a name of their own.
 TRANSFER_SUITES = {
     f"{prefix}{suite}": {
         family: transfer_family(

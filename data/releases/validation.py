@@ -14,14 +14,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from conf.errors import UserError
 
-FLOOR_HEIGHT = 0.05
-"""Greatest height of a contact with the floor, simulator units."""
-UPRIGHT = 0.7
-"""Least vertical share of the normal of a contact with the floor."""
+FLOOR_TOLERANCE = 0.05
+"""Maximum distance from the floor's plane of a contact with the floor, simulator units."""
+MIN_VERTICAL = 0.7
+"""Minimum vertical component of the unit normal of a contact with the floor."""
 
 
 class RecordError(UserError):
-    """A record that does not have the published layout, or cannot be read.
+    """A scene's record in a release that does not have the published layout or cannot be read.
 
     The message states the file, what it contains and what was expected. A caller either skips and
     counts the record, or stops.
@@ -53,7 +53,7 @@ def read_json(path: Path, layout: type[AnyLayout]) -> AnyLayout:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         if first["type"] == "json_invalid":
-            raise RecordError(f"{path} is cut off: {first['msg']}", "damaged-file") from error
+            raise RecordError(f"{path} is not JSON: {first['msg']}", "damaged-file") from error
         where = ".".join(map(str, first["loc"])) or "the file"
         raise RecordError(
             f"{path} does not have the published layout: {where}: {first['msg']}"
@@ -68,10 +68,10 @@ def scene_id(suite: str, *parts: str) -> str:
 def check_unique_scenes(
     folder: Path, paths: list[Path], id_of: Callable[[Path], str], contents: str
 ) -> list[Path]:
-    """Return `paths`, one path per scene, after checking that there is one and no scene repeats.
+    """Check that a release has scenes and none of them twice, and return `paths`, one per scene.
 
     Args:
-        id_of: Returns the scene id of a path.
+        id_of: Function that returns the scene id of a path.
         contents: A description of the expected contents of the folder, for error messages.
 
     Raises:
@@ -79,7 +79,7 @@ def check_unique_scenes(
     """
     if not folder.is_dir():
         raise UserError(
-            f"folder {folder} does not exist: give the folder that contains {contents}",
+            f"folder {folder} does not exist: choose the folder that contains {contents}",
             code="missing-folder",
         )
     if not paths:
@@ -89,8 +89,8 @@ def check_unique_scenes(
         other = first.setdefault(id_of(path), path)
         if other is not path:
             raise UserError(
-                f"{folder} contains scene {id_of(path)} twice, as {other} and as {path}: give a "
-                "folder that contains each scene once",
+                f"{folder} contains scene {id_of(path)} twice, as {other} and as {path}: "
+                "choose a folder that contains each scene once",
                 code="duplicate-scene",
             )
     return paths
@@ -102,7 +102,7 @@ def finite_array(
     """Return numbers as an array of `shape`, in which -1 stands for any length.
 
     Raises:
-        RecordError: There are fewer or more values, or not all are finite numbers.
+        RecordError: The values do not fit the shape, or not all of them are finite numbers.
     """
     try:
         array = np.asarray(values, np.float64).reshape(shape)
@@ -114,7 +114,7 @@ def finite_array(
 
 
 def decode_image(image: bytes | Path, where: str) -> Image.Image:
-    """Decode an encoded image or a file to RGB. An alpha channel is discarded, not blended.
+    """Decode an image (encoded bytes or a file) to RGB. An alpha channel is ignored, not blended.
 
     Raises:
         RecordError: The image cannot be decoded.

@@ -1,8 +1,9 @@
-"""Renderers of scenes, with one interface.
+"""The two renderers of scenes, `bullet` and `blender`, which have the same interface.
 
 `bullet` runs on every machine, and `blender` renders images in the style of CLEVRER's videos. The
-renderer is a part of a benchmark, because the two give different pixels. Its `version` changes
-whenever the same oracle gives different pixels, and `render(scene, frame)` returns an RGB image.
+renderer is a setting of a benchmark, because the two give different pixels. A renderer's `version`
+changes whenever the same oracle gives different pixels. `render(scene, frame)` returns an RGB
+image.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ RENDERERS: dict[str, type[Renderer]] = {"bullet": BulletRenderer, "blender": Ble
 
 @cache
 def get_renderer(name: str, width: int, height: int, view: View = STANDARD_VIEW) -> Renderer:
-    """The renderer of this process for a frame size (px) and a view.
+    """Return this process's renderer for a frame size (px) and a view.
 
     Raises:
-        UserError: it cannot run on this machine.
+        UserError: the renderer cannot run on this machine.
     """
     return RENDERERS[name](width, height, view)

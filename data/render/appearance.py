@@ -21,17 +21,18 @@ RGB = {
 """CLEVRER's colours; green and brown are darker so that small objects differ more."""
 
 SEGMENTS = 48
+"""Number of segments around the z axis."""
 
 
 def mesh(shape: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3), normals (V, 3), texture coordinates (V, 2) and triangles (T, 3)."""
+    """Return vertices (V, 3), normals (V, 3), texture coordinates (V, 2) and triangles (T, 3)."""
     if shape == "cube":
         return _cube()
     if shape == "sphere":
         angle = np.linspace(0, np.pi, SEGMENTS // 2 + 1)
         normals = np.stack([np.sin(angle), np.cos(angle)], axis=1)
         return _revolve(RADIUS * normals, normals, angle / np.pi)
-    # The rim has two vertices, with the cap's normal and with the side's, for a hard edge.
+    # For a hard edge, a rim point occurs twice: with the normal of the cap and that of the side.
     points = RADIUS * np.array([[0, 1], [1, 1], [1, 1], [1, -1], [1, -1], [0, -1]], dtype=float)
     normals = np.array([[0, 1], [0, 1], [1, 0], [1, 0], [0, -1], [0, -1]], dtype=float)
     return _revolve(points, normals, np.array([0.05, 0.2, 0.25, 0.75, 0.8, 0.95]))
@@ -40,7 +41,7 @@ def mesh(shape: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 def _revolve(
     points: np.ndarray, normals: np.ndarray, down: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The surface of revolution of a profile of (radius, height) about the z axis."""
+    """Rotate a profile of (radius, height) points about the z axis; `down` is their texture v."""
     turns = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
 
     def spin(profile: np.ndarray) -> np.ndarray:
@@ -75,10 +76,10 @@ def _cube() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def texture(material: str) -> np.ndarray:
-    """(64, 64, 3) uint8 texture that multiplies an object's colour.
+    """Return a (64, 64, 3) uint8 texture that multiplies an object's colour.
 
-    For metal it imitates the reflection of a bright sky over a dark horizon; for rubber it is
-    uniform.
+    The texture of metal imitates the reflection of a bright sky over a dark horizon; that of rubber
+    is uniform.
     """
     if material == "rubber":
         return np.full((64, 64, 3), 215, dtype=np.uint8)

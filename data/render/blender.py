@@ -1,7 +1,7 @@
 """Renderer with Cycles, Blender's path tracer: reflections on metal and soft shadows.
 
-Blender runs in a separate process (`blender_worker.py`), which ends with this one. It uses a GPU
-where available; GPU pixels differ slightly from CPU pixels.
+Blender runs in a separate process (`blender_worker.py`), which exits when this process ends.
+Blender uses a GPU if there is one; GPU pixels differ slightly from CPU pixels.
 """
 
 from __future__ import annotations
@@ -35,25 +35,26 @@ WORKER = Path(__file__).with_name("blender_worker.py")
 class BlenderRenderer:
     """Renders frames of any scene at one size, in one Blender process.
 
-    It uses the view's camera. The lamps and the ground are those of `blender_worker.py`.
+    Only the camera of the view is used. `blender_worker.py` defines the lamps and the ground.
     """
 
     version = VERSION
 
     def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
-        """Start Blender. Raises UserError if its module is missing or of another release."""
+        """Start Blender. Raises UserError if the module `bpy` is missing or of another release."""
         try:
             installed = version("bpy")
         except PackageNotFoundError:
             installed = None
         if installed != BPY:
             raise UserError(
-                f"renderer=blender needs Blender's module bpy {BPY} (installed: {installed}): "
-                "install it with pip install -e '.[blender]', or use renderer=bullet",
+                f"benchmark.renderer=blender needs Blender's module bpy {BPY} (installed: "
+                f"{installed}): install it with pip install -e '.[blender]', or use "
+                "benchmark.renderer=bullet",
                 code="missing-package",
             )
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as the worker
-        # Without -P the worker would import the modules beside it.
+        # Without -P, imports in the worker would find the modules of this folder first.
         self._worker = subprocess.Popen(
             [sys.executable, "-P", str(WORKER)],
             stdin=subprocess.PIPE,
@@ -100,10 +101,10 @@ class BlenderRenderer:
         status = self._worker.wait()
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").split("\n")
-        last = ([f"status {status}", *filter(str.strip, lines)])[-1].strip()
+        last = [f"status {status}", *filter(str.strip, lines)][-1].strip()
         raise UserError(
-            f"renderer=blender: Blender ended while {activity} ({last}); run the command again, "
-            "with fewer workers if memory is short, or use renderer=bullet",
+            f"Blender ended while {activity} ({last}); run the command again, with fewer workers "
+            "if memory is short, or use benchmark.renderer=bullet",
             code="renderer-failed",
         )
 

@@ -3,7 +3,8 @@
 Blender has one global scene, prints to standard output and may crash, so it runs in a separate
 process. Each request is a line of JSON on standard input: first the settings (see `Studio`), then
 the objects of each frame (see `Studio.render`). Each response is a line on standard output with the
-path of a PNG, which the next request overwrites. The process exits when its input ends.
+path of a PNG, which the next request overwrites; the first response only shows that Blender has
+started. The process exits when its input ends.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ MATERIALS = {
 GROUND = (0.36, 0.355, 0.34)
 """The ground's colour, linear RGB."""
 BEVEL = 0.05
-"""Rounding of edges, as a share of half the height; sharp edges would not reflect light."""
+"""Radius of rounded edges as a fraction of half the height; sharp edges would not reflect light."""
 LAMPS = {
     "key": {"location": (3.5, -3.5, 5.5), "size": 2.0, "watts": 500},
     "fill": {"location": (3.0, 4.5, 3.5), "size": 3.0, "watts": 170},
@@ -35,7 +36,7 @@ AMBIENT = 0.1
 """Strength of ambient light, so that shadows and reflections are not black."""
 IMAGE = {"file_format": "PNG", "color_mode": "RGB", "compression": 0}
 SAMPLING = {
-    # Sampling of a pixel stops at this noise level, after at least this many samples.
+    # Sampling of a pixel stops at this noise level, but not before this number of samples.
     "adaptive_threshold": 0.05,
     "adaptive_min_samples": 8,
     "use_denoising": True,
@@ -60,7 +61,7 @@ def main() -> None:
 
 
 class Studio:
-    """A Blender scene with ground, lamps, a camera and one solid for each appearance."""
+    """A Blender scene with ground, lamps, a camera and one body for each appearance."""
 
     def __init__(self, settings: dict[str, Any], path: Path) -> None:
         """Set up the scene.
@@ -86,7 +87,8 @@ class Studio:
         """Render objects to the file.
 
         Args:
-            objects: shape, material, color (linear RGB), position and quaternion (x y z w) each.
+            objects: Dicts with shape, material, color (linear RGB), position and quaternion
+                (x y z w).
         """
         import bpy
 
@@ -119,7 +121,7 @@ class Studio:
         if shape != "sphere":
             bevel = solid.modifiers.new("edges", "BEVEL")
             bevel.width, bevel.segments = BEVEL * half, 3
-            # Keeps faces flat between rounded edges.
+            # Without it, smooth shading would make the flat faces look curved.
             solid.modifiers.new("shading", "WEIGHTED_NORMAL")
         return solid
 

@@ -1,9 +1,9 @@
 """Renderer with Bullet's software rasteriser.
 
-Bullet's TinyRenderer draws the objects as smooth meshes without OpenGL: metal with a texture like a
-reflection and a sharp highlight, rubber matt. It can neither clip a large floor nor soften a
-shadow, so this module draws the floor and soft shadows wherever no object is. Objects are rendered
-at twice the size and averaged, for anti-aliasing.
+Bullet's TinyRenderer draws the objects as smooth meshes without OpenGL. Metal has a texture that
+imitates a reflection, and a sharp highlight; rubber is matt. TinyRenderer can neither clip a large
+floor nor soften a shadow, so this module draws the floor and soft shadows wherever no object is.
+Objects are rendered at twice the size and averaged, for anti-aliasing.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ VERSION = "bullet-1"
 
 OVERSAMPLING = 2
 NEAR, FAR = 0.1, 50.0
+"""Distances of the clipping planes, simulator units."""
 
 
 class BulletRenderer:
@@ -49,10 +50,10 @@ class BulletRenderer:
         pixels, mask = self.capture()
         opaque = pixels.view(np.uint32)[..., 0] | np.uint32(0xFF000000)
         layers = np.where(mask >= 0, opaque, np.uint32(0))
-        # Pillow would premultiply the colours of an RGBA image.
+        # RGBX, because Pillow would premultiply the colours of an RGBA image by alpha.
         fine = Image.frombuffer("RGBX", mask.shape[::-1], layers, "raw", "RGBX", 0, 1)
         *colors, cover = fine.reduce(OVERSAMPLING).split()
-        shade = self._floor.shade(scene.positions[frame], self._shadows[frame])
+        shade = self._floor.shade(scene.positions[frame], self._shadow_boxes[frame])
         bands = []
         uncovered = 1 - np.asarray(cover, np.float32) / 255
         for color, tint in zip(colors, self._scene_view.floor, strict=True):
@@ -73,7 +74,7 @@ class BulletRenderer:
             scene.quaternions[frame].tolist(),
             strict=True,
         ):
-            # The reflection on a sphere does not move as it rolls.
+            # A rolling sphere is not turned, because its texture is a reflection of the sky.
             turn = [0, 0, 0, 1] if scene_object.shape == "sphere" else turn
             self._bullet.resetBasePositionAndOrientation(handle, place, turn)
         return list(self._handles)
@@ -112,7 +113,7 @@ class BulletRenderer:
         for handle in self._handles:
             self._bullet.removeBody(handle)
         self._handles = [self._add(scene_object) for scene_object in scene.objects]
-        self._shadows = self._floor.shadows(scene.positions)
+        self._shadow_boxes = self._floor.shadow_boxes(scene.positions)
         self._scene_id = scene.scene_id
 
     def _add(self, scene_object: SceneObject) -> int:
@@ -135,7 +136,7 @@ class BulletRenderer:
 
 
 def _projection(camera: Camera) -> list[float]:
-    """OpenGL's projection matrix for square pixels, in column-major order."""
+    """Return OpenGL's projection matrix for square pixels, in column-major order."""
     x, y = 2 * camera.focal / camera.width, 2 * camera.focal / camera.height
     depth, shift = -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR)
     return [x, 0, 0, 0, 0, y, 0, 0, 0, 0, depth, -1, 0, 0, shift, 0]

@@ -1,4 +1,4 @@
-"""Brightness of each pixel of the floor: the light of one lamp, and the objects' soft shadows."""
+"""Brightness of the floor: light that decreases with distance, and the objects' soft shadows."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from data.world.camera import Camera
 from data.world.shapes import RADIUS
 
 SHADOW_DEPTH = 0.55
-"""Share of the light that a shadow removes at its centre."""
+"""Fraction of the light that a shadow removes at its centre."""
 
 _SPREAD = 2 * (0.85 * RADIUS) ** 2
 """Twice the variance of a shadow's Gaussian profile, squared simulator units."""
 _REACH = 1.0
-"""Half the side of the square in which a shadow is computed, simulator units. Farther than 0.984
-from its centre a shadow is below float32 precision: SHADOW_DEPTH * exp(-d^2 / _SPREAD) < 2^-25."""
+"""Half the side of the square in which a shadow is computed, simulator units. At distances d above
+0.984 a shadow is below float32 precision: SHADOW_DEPTH * exp(-d^2 / _SPREAD) < 2^-25."""
 
 
 class Floor:
-    """The floor in the image of one camera, under a lamp at `light`."""
+    """The floor as one camera sees it; `light` is the direction towards the light."""
 
     def __init__(self, camera: Camera, light: tuple[float, float, float]) -> None:
         self._camera, self._light = camera, light
@@ -28,15 +28,16 @@ class Floor:
         points = np.asarray(camera.eye)[:2] + reach[..., None] * rays[..., :2]
         distance = np.linalg.norm(points - np.array([0.3, 0.0]), axis=-1)
         self._lit = (1.12 / (1 + (distance / 7.5) ** 2)).astype(np.float32)
+        # x is equal along an image row, because the camera looks along the x-z plane.
         self._y = points[..., 1].astype(np.float32).astype(float)
         self._x = points[:, :1, 0].astype(np.float32).astype(float)
 
     def shade(self, positions: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-        """Compute the brightness of the floor: the light of the lamp less the objects' shadows.
+        """Compute the brightness of the floor with the objects' shadows.
 
         Args:
             positions: (N, 3) positions of the objects.
-            boxes: (N, 4) bounding boxes of their shadows, from `shadows`.
+            boxes: (N, 4) bounding boxes of their shadows, from `shadow_boxes`.
 
         Returns:
             (H, W) float32 factors for the colour of the floor.
@@ -51,7 +52,7 @@ class Floor:
                 shade[box] *= 1 - SHADOW_DEPTH * np.exp(-squares / _SPREAD)
         return shade
 
-    def shadows(self, positions: np.ndarray) -> np.ndarray:
+    def shadow_boxes(self, positions: np.ndarray) -> np.ndarray:
         """Compute the bounding boxes of the shadows in the image.
 
         Args:

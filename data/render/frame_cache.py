@@ -1,8 +1,8 @@
-"""Pixels of frames, from the store's cache or rendered on demand, with the same result.
+"""Pixels of frames, which are read from the store's cache or, with the same result, rendered.
 
-The cached frames of a scene are one archive. It holds the first frame, and the difference of each
-other frame from it (modulo 256), compressed with LZ4. Because most of an image does not change,
-this is smaller than PNGs, and more than ten times as fast to read.
+The cached frames of a scene are one archive. It contains the first frame, and the differences of
+the other frames from the first (modulo 256), compressed with LZ4. Because most of an image does not
+change, an archive is smaller than PNGs, and more than ten times as fast to read.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from data.world.standins import standin_view
 log = logging.getLogger(__name__)
 
 CACHE_BYTES = 2 << 30
-"""Largest total size of decoded frames that a `FrameReader` keeps."""
+"""Maximum total size of the decoded frames that a `FrameReader` keeps in memory."""
 _CODEC = "lz4"
 
 
@@ -55,8 +55,8 @@ def load_frames(path: Path, wanted: Iterable[int] | None = None) -> dict[int, np
         wanted: Frame indices; all frames of the archive by default.
 
     Returns:
-        The wanted frames that the archive has; none if it is missing or, with a warning, if it is
-        damaged.
+        The wanted frames that the archive contains; none if it is missing or damaged. A damaged
+        archive is logged.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -117,22 +117,22 @@ class FrameReader:
     """Reads the pixels of a store's frames and keeps the most recently used ones in memory."""
 
     def __init__(self, store: Store, size: int | None = None) -> None:
-        """With `size`, frames are resized to size x size px, as model inputs."""
+        """If `size` is given, frames are resized to size x size px, as inputs of a model."""
         self._store = store
         self._size = size
         self._decoded: OrderedDict[tuple[str, int], np.ndarray] = OrderedDict()
         self._bytes = 0
 
     def array(self, scene_id: str, frame: int) -> np.ndarray:
-        """(height, width, 3) uint8."""
+        """Return a frame as a (height, width, 3) uint8 array."""
         return self.stack(scene_id, [frame])[0]
 
     def stack(self, scene_id: str, frames: list[int]) -> np.ndarray:
-        """(T, height, width, 3) uint8."""
+        """Return frames of a scene as a (T, height, width, 3) uint8 array."""
         missing = [f for f in dict.fromkeys(frames) if (scene_id, f) not in self._decoded]
         if missing:
             for frame, pixels in zip(missing, self._load(scene_id, missing), strict=True):
-                # A copy, because a view would keep the whole stack in memory.
+                # A copy, because a view would keep all frames of the stack in memory.
                 self._decoded[scene_id, frame] = pixels.copy()
                 self._bytes += pixels.nbytes
         stack = np.stack([self._decoded[scene_id, frame] for frame in frames])
@@ -157,12 +157,12 @@ class FrameReader:
 
 
 def resize_frames(pixels: np.ndarray, size: int) -> np.ndarray:
-    """Resize (T, height, width, 3) uint8 to (T, size, size, 3), as model inputs."""
+    """Resize (T, height, width, 3) uint8 frames to (T, size, size, 3), as inputs of a model."""
     import torch
     from torchvision.transforms.v2 import InterpolationMode
     from torchvision.transforms.v2.functional import resize
 
-    # Pillow agrees to two levels of 255, and is five times slower.
+    # Pillow's result differs by at most 2 (of 255), and takes five times as long.
     channels_first = torch.from_numpy(pixels).permute(0, 3, 1, 2)
     resized = resize(channels_first, [size, size], InterpolationMode.BICUBIC, antialias=True)
     return resized.permute(0, 2, 3, 1).contiguous().numpy()

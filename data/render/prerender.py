@@ -19,15 +19,16 @@ from data.tracks.controls import MATCHED_ANCHOR
 log = logging.getLogger(__name__)
 
 RECORD = "frames.json"
-"""File with the options and results of the last prerendering."""
+"""File with the options and results of the last prerendering, which is not repeated."""
 
 
 def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: Workers) -> None:
-    """Render the missing frames of a store; other frames are rendered on demand.
+    """Render a store's missing frames to its cache.
 
     Args:
         which: `all`, `none`, or `named` for those that items, queries and databases refer to.
-        limit_gb: Maximum size of all frames on the disk. Scenes that exceed it are not rendered.
+        limit_gb: Maximum total size of these frames on disk. Rendering stops when the next scene
+            would exceed it; the remaining frames are rendered on demand.
     """
     options = {"frames": which, "bound_gb": limit_gb, "renderer": store.manifest["renderer"]}
     path = store.folder / FRAMES_FOLDER / RECORD
@@ -53,7 +54,7 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
 
 
 def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:
-    """Frames to render by scene, scenes of the test split first."""
+    """Return the frames to render by scene, with the scenes of the test split first."""
     if which == "none":
         return {}
     frames: dict[str, set[int]] = defaultdict(set)
@@ -78,7 +79,7 @@ def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:
 
 
 def _render_scene(folder: Path, config: Mapping[str, Any], scene_id: str, frames: list[int]) -> int:
-    """Render the frames that an archive lacks, and return its size in bytes."""
+    """Add missing frames to a scene's archive, and return the size of the archive in bytes."""
     path = frames_path(folder, scene_id)
     pixels = load_frames(path)
     if missing := [f for f in frames if f not in pixels]:

@@ -1,8 +1,9 @@
 """Makes all items and queries of a benchmark from the oracle alone.
 
-Each selection cell and each retrieval builder is a separate job with its own random generator. A
-job writes its result to a part file whose name is a hash of all its inputs. A killed build resumes
-with the parts that exist, and a build with changed quotas repeats only the jobs that changed.
+A cell is a subtype of a family of selection items; a builder is a function that makes one kind of
+retrieval queries. Each is a separate job with its own random generator. A job writes its result to
+a file whose name is a hash of the job's inputs. A killed build resumes with the files that exist,
+and a build with changed quotas repeats only the jobs whose quotas changed.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ from data.world.physics import GENERATOR_VERSION
 DYNAPIX_FAMILIES = {"event": event.FAMILY, "time": time.FAMILY, "window": window.FAMILY}
 COUNTERFACTUAL = "counterfactual"
 CACHED_SCENES = 20_000
-"""Scenes that a worker keeps in memory, at about 50 KB each."""
+"""Number of scenes that a worker keeps in memory, at about 50 KB each."""
 QUERY_RESERVE = 1.3
-"""Factor of the quotas of queries, because a query whose target has a twin is dropped later."""
+"""Factor on the quotas of queries: those with near-duplicate targets are dropped later."""
 
 ScenesOfSplit = dict[str, list[str]]
 
@@ -44,8 +45,8 @@ def make_items_and_queries(
     """Make the items and queries of the scenes below `folder`, in the order of the config.
 
     Returns:
-        Items; queries, more than the quotas by `QUERY_RESERVE`; and how many of each were dropped
-        because too few candidates differ enough.
+        The items; the queries, up to `QUERY_RESERVE` times their quotas; and the numbers of items
+        and queries that were dropped because too few other frames differ enough from their targets.
     """
     quotas = cell_quotas(cfg)
     for name in filter(_is_query_cell, quotas):
@@ -77,24 +78,24 @@ def make_items_and_queries(
 
 
 def item_families(cfg: BenchmarkConfig) -> Mapping[str, Family]:
-    """The families of a benchmark's suite."""
+    """Return the families of a benchmark's suite by name."""
     return TRANSFER_SUITES.get(suite_name(cfg), DYNAPIX_FAMILIES)
 
 
 def suite_name(cfg: BenchmarkConfig) -> str:
-    """The suite of the benchmark's items."""
+    """Return the name of the set of items: `dynapix`, a transfer suite or a stand-in."""
     if cfg.standin is not None:
         return f"standin_{cfg.standin}"
     return cfg.simulator if cfg.simulator in TRANSFER_SUITES else "dynapix"
 
 
 def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:
-    """The selection track's quotas by family and subtype."""
+    """Return the quotas of selection items by family and subtype."""
     return {family: getattr(cfg.selection, family) for family in FAMILIES}
 
 
 def cell_quotas(cfg: BenchmarkConfig) -> dict[str, Quota]:
-    """Quotas of all cells and builders, by name."""
+    """Return the quotas of all cells and builders by name."""
     return {
         **{
             f"{family}/{subtype}": quota
@@ -108,7 +109,7 @@ def cell_quotas(cfg: BenchmarkConfig) -> dict[str, Quota]:
 
 
 def builder_name(builder: int | None) -> str:
-    """The name of a retrieval builder among the cells."""
+    """Return the name of a builder in `cell_quotas`; None is the counterfactual builder."""
     return COUNTERFACTUAL if builder is None else f"builder {builder}"
 
 

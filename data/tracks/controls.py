@@ -1,8 +1,8 @@
-"""Controls: matched-anchor pairs, candidate-only items and shuffled prefixes.
+"""Controls of the selection track: matched-anchor pairs, no prefix, and shuffled prefixes.
 
-The two items of a matched-anchor pair share prefix, target, horizon and candidates. One question
-names the event at the target, the other the time until then. The other two controls change the
-prefix of an existing item: they remove it or shuffle its frames.
+The two items of a matched-anchor pair share prefix, target, horizon and candidates. The question of
+one item names the event at the target, and that of the other the time from prefix to target. The
+other two controls remove the prefix of an existing item, or shuffle the frames of its prefix.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from data.tracks.selection.distractors import Family, Timing
 from data.world.events import collision_frames, collisions_in
 
 MATCHED_ANCHOR = "matched_anchor"
-"""The suite of the pairs' items."""
+"""Name of the suite of the matched-anchor items."""
 EVENT_QUESTION = (
     "Watch the 1-second observation video. Which image best shows what the scene will look like "
     "at the moment of the next collision?"
@@ -29,7 +29,7 @@ SECONDS = (1, 2)
 
 
 def timings(subtype: str, scene: Scene) -> list[Timing]:
-    """The timings whose target is the next collision, whole seconds after a 1-second prefix."""
+    """Return timings with a 1-second prefix and the next collision as target, `SECONDS` later."""
     return [
         Timing(stop - SELECTION_SECOND + 1, stop, target, event=target)
         for target in collision_frames(scene)
@@ -41,9 +41,10 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 
 
 def fill_pairs(cell: CellInputs) -> tuple[list[SelectionItem], int]:
-    """Make pairs up to the quota. The two items of a pair follow each other."""
+    """Make matched-anchor pairs up to the quota: a list with the items of each pair in sequence,
+    and the number of targets that `fill_quota` dropped."""
     items, dropped = fill_quota(MATCHED_ANCHOR, Family({}, timings, time.make_item), cell)
-    return [each for item in items for each in _pair(item)], dropped
+    return [paired for item in items for paired in _pair(item)], dropped
 
 
 def _pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:
@@ -60,7 +61,7 @@ def _pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:
 
 
 def pair_items(items: Sequence[SelectionItem]) -> list[tuple[SelectionItem, SelectionItem]]:
-    """The matched-anchor pairs among items, in their order, as (event item, time item)."""
+    """Return the matched-anchor pairs among `items` as (event item, time item), in order."""
     by_time = {_pair_key(item): item for item in items if item.family == "time"}
     return [(item, by_time[_pair_key(item)]) for item in items if item.family == "event"]
 
@@ -73,8 +74,8 @@ def prefix_under_control(item: SelectionItem, count: int, control: str | None) -
     """Sample `count` frames of an item's prefix, in the order in which a model receives them.
 
     Args:
-        control: `candidate_only` for no frames, `shuffled_prefix` for an order other than in time,
-            None for the order in time.
+        control: `candidate_only` for no frames, `shuffled_prefix` for a random order that differs
+            from the order in time, None for the order in time.
     """
     if control == "candidate_only":
         return []

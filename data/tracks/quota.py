@@ -1,4 +1,4 @@
-"""Seeded sampling of scenes until each cell of a benchmark has the items of its quota."""
+"""Makes the items of each cell from scenes in a seeded order, until its quota is reached."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ Element = TypeVar("Element")
 
 @dataclass(frozen=True)
 class CellInputs:
-    """What the items or queries of one cell are made from.
+    """The inputs for making the items or queries of one cell.
 
     Attributes:
         scene_ids: Scene ids by split.
-        scene_of: Loads a scene by its id.
+        scene_of: Function that loads a scene by its id.
         min_displacement: Minimum displacement between two candidates, px at 336 x 336.
         hard_negatives: Number of hard negatives of a query.
     """
@@ -43,8 +43,8 @@ def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[Sel
     The timings of a scene are tried in a random order.
 
     Returns:
-        Items of each split up to its quota, and the number of targets that were dropped because
-        no three distinguishable distractors exist.
+        The items of each split up to its quota, and the number of timings that were dropped because
+        fewer than three distractors differ enough.
     """
     items, dropped = [], 0
     for split in SPLITS:
@@ -60,8 +60,8 @@ def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[Sel
             order = rng.permutation(len(timings))
             attempts = (family.make_item(subtype, scene, timings[k], rng, picker) for k in order)
             made += islice(filter(None, attempts), 1)
-        # Each letter is the answer equally often, starting at a random letter: otherwise the first
-        # letters would be the answer more often in small cells.
+        # Each letter is the answer equally often. Where the number of items is not divisible by 4,
+        # a random first letter decides which letters are the answer once more.
         positions = rng.permutation((np.arange(len(made)) + rng.integers(4)) % 4)
         for item, position in zip(made, positions.tolist(), strict=True):
             target, *distractors = item.candidates
@@ -73,14 +73,14 @@ def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[Sel
 
 
 def named_rng(seed: int, *names: str) -> np.random.Generator:
-    """A random generator for a seed and a name. Each cell has its own, so that the quota of one
-    does not affect the others."""
+    """Return a random generator for a seed and names. Each cell has a generator of its own, so that
+    the quota of a cell does not affect other cells."""
     digest = hashlib.sha256("/".join(names).encode()).digest()
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "big")])
 
 
 def round_robin(queues: Iterable[Iterable[Element]]) -> Iterator[Element]:
-    """The next element of each queue in turn, read lazily, until all queues are exhausted."""
+    """Yield the next element of each queue in turn, until all are exhausted. Queues are lazy."""
     waiting = [iter(queue) for queue in queues]
     while waiting:
         for queue in list(waiting):
@@ -91,8 +91,8 @@ def round_robin(queues: Iterable[Iterable[Element]]) -> Iterator[Element]:
 
 
 def interleave(elements: Iterable[Element], key: Callable[[Element], Hashable]) -> list[Element]:
-    """Sort elements by their position among those of the same key: the first one of every key,
-    then the second ones, and so on."""
+    """Order elements so that the first element of every key comes first, then the second element of
+    every key, and so on."""
     turns: dict[Hashable, Iterator[int]] = defaultdict(count)
     # `sorted` calls its key once for each element, in order.
     return sorted(elements, key=lambda element: next(turns[key(element)]))

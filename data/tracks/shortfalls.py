@@ -1,4 +1,4 @@
-"""Counts of a benchmark's records, and the cells that fall short of their quotas."""
+"""Counts of a benchmark's records, and the cells with fewer records than their quotas."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def count_records(
     """Count a benchmark's records.
 
     Returns:
-        Counts of scenes, items by family, queries by builder and frames by database; and the cells,
-        builders and databases with fewer records than their quotas, as "n of quota".
+        Counts of scenes, items by family, queries by builder and frames by database; and a text
+        "n of quota" for each cell, builder and database with fewer records than its quota.
     """
     counts = Counter({f"scenes/{split}": len(names) for split, names in scene_ids.items()})
     cells: Counter[str] = Counter()
@@ -53,7 +53,7 @@ def count_records(
 
 
 def summarize_store(store: Store) -> str:
-    """A table of a store's counts and shortfalls."""
+    """Format a store's counts and shortfalls as a table."""
     lines = [f"{store.folder} ({len(store.manifest['files'])} files, {store.identity})"]
     lines += [f"  {name:<36}{n:>8,}" for name, n in store.manifest["counts"].items()]
     lines += [f"  short: {cell} has {n}" for cell, n in store.manifest["shortfalls"].items()]

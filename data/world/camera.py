@@ -43,7 +43,7 @@ class Camera:
         return centre + self.focal * local[..., :2] / clamped[..., None], depth
 
     def rays(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """(P, 3) world directions through the centres of P pixels, not normalised."""
+        """Return world directions (..., 3), not normalised, through the centres of pixels."""
         x = (columns + 0.5 - self.width / 2) / self.focal
         y = (rows + 0.5 - self.height / 2) / self.focal
         return np.stack([x, y, np.ones_like(x)], axis=-1) @ self.axes
@@ -54,11 +54,11 @@ class View:
     """The camera, floor colour and light of scenes."""
 
     camera: Camera = Camera()
-    """`eye` must lie in the x-z plane: the floor is shaded by image rows."""
+    """`eye` must lie in the x-z plane, as `data.render.floor` assumes."""
     floor: tuple[float, float, float] = (158.0, 156.0, 152.0)
     """RGB colour of the floor at brightness 1, 0 to 255."""
     light: tuple[float, float, float] = (3.0, 3.0, 6.0)
-    """Direction towards the light. Blender's scenes have lamps of their own."""
+    """Direction towards the light; the Blender renderer has lamps of its own."""
 
 
 STANDARD_VIEW = View()

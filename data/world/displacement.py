@@ -1,4 +1,4 @@
-"""Image-plane displacement between frames, computed from the oracle alone."""
+"""Displacement of objects in the image between frames, computed from the oracle alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DIAGONAL = MODEL_SIZE * 2**0.5
 
 
 def on_screen_positions(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """(F, N, 2) positions in px at 336 x 336, and (F, N) whether the centre is on screen."""
+    """Return positions (F, N, 2), px at 336 x 336, and whether centres are on screen (F, N)."""
     positions = scene.image_positions * (MODEL_SIZE / np.array(scene.image_size))
     inside = (positions >= 0).all(-1) & (positions <= MODEL_SIZE).all(-1)
     return positions, scene.in_view & inside
@@ -22,10 +22,10 @@ def on_screen_positions(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=64)
 def frame_displacements(scene: Scene, about: tuple[int, ...] | None = None) -> np.ndarray:
-    """(F, F) largest image displacement of an object between two frames, px at 336 x 336.
+    """Return the largest displacement of an object between any two frames, (F, F) px at 336 x 336.
 
-    An object counts where its centre is on screen in at least one of the two frames, so that the
-    visible edge of an object outside does not distinguish frames. The image's diagonal is the
+    Only objects whose centre is on screen in at least one of the two frames count, because the
+    visible edge of an object does not suffice to distinguish frames. The image's diagonal is the
     maximum.
 
     Args:
@@ -40,13 +40,13 @@ def frame_displacements(scene: Scene, about: tuple[int, ...] | None = None) -> n
 
 
 def cross_scene_displacement(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:
-    """Displacement between frames of two scenes, px at 336 x 336.
+    """Return the largest displacement of an object between frames of two scenes, px at 336 x 336.
 
-    As `frame_displacements`, with objects matched by appearance. An object that is on screen in one
-    scene and absent from the other counts as the image's diagonal.
+    As in `frame_displacements`, but with objects matched by appearance. An object that is on screen
+    in one scene and does not exist in the other counts as displaced by the image's diagonal.
     """
-    pair = ((scene, frame), (other, other_frame))
-    first, second = (_positions_by_appearance(*ends) for ends in pair)
+    first = _positions_by_appearance(scene, frame)
+    second = _positions_by_appearance(other, other_frame)
     absent = (np.full(2, np.inf), False)
     displacement = 0.0
     for key in first.keys() | second.keys():
@@ -61,7 +61,7 @@ def cross_scene_displacement(scene: Scene, frame: int, other: Scene, other_frame
 def _positions_by_appearance(
     scene: Scene, frame: int
 ) -> dict[tuple[SceneObject, int], tuple[np.ndarray, bool]]:
-    """Position and visibility of each object, by its appearance and its index among equals."""
+    """Map appearances, numbered where objects look alike, to positions and whether on screen."""
     positions, on_screen = on_screen_positions(scene)
     return {
         (each, scene.objects[:k].count(each)): (positions[frame, k], bool(on_screen[frame, k]))
@@ -72,10 +72,10 @@ def _positions_by_appearance(
 def object_match_scores(
     scene: Scene, target: int, about: tuple[int, ...] | None = None
 ) -> np.ndarray:
-    """(F,) object-match score of each frame with `target`; 0 for the target itself.
+    """Return the object-match score of each frame with frame `target`, (F,); lower is more similar.
 
-    The score is the mean image-plane displacement over objects, as a share of the image's diagonal.
-    An object that is in view in only one of the two frames counts as 1, in neither as 0.
+    The score is the mean displacement of objects in the image, as a fraction of the image's
+    diagonal. An object that is in view in only one of the frames counts as 1; in neither, as 0.
 
     Args:
         about: Indices of the objects that count; all by default.

@@ -13,33 +13,33 @@ OCCLUDED = 0.5
 ONSET = 0.01
 """Distance from its initial position at which an object counts as moving, simulator units."""
 ONSET_FRAMES = 3
-"""Number of consecutive frames at that distance that make an onset."""
+"""Number of consecutive frames beyond `ONSET` that make the first of them a motion onset."""
 REST_FRAMES = 10
-"""Number of initial frames in which the object must stay within half of that distance."""
+"""Number of initial frames in which the object must stay within half of `ONSET`."""
 
 
 def collision_frames(scene: Scene) -> list[int]:
-    """The frames of the scene's collisions, each once, in order."""
+    """Return the frames of the scene's collisions in order, without repetitions."""
     return list(dict.fromkeys(c.frame for c in scene.collisions))
 
 
 def collisions_in(scene: Scene, first: int, last: int) -> list[Collision]:
-    """Collisions at frames first to last, inclusive."""
+    """Return the collisions at frames `first` to `last`, inclusive."""
     return [c for c in scene.collisions if first <= c.frame <= last]
 
 
 def _changes_in(states: np.ndarray, first: int, last: int) -> int:
-    """Number of changes of the objects' boolean states (F, N) at frames first to last."""
+    """Count the changes of the objects' boolean states (F, N) at frames `first` to `last`."""
     window = states[max(first - 1, 0) : last + 1]
     return int((window[1:] != window[:-1]).sum())
 
 
 def window_group(scene: Scene, start: int, stop: int, horizon: int) -> str:
-    """The group of a window item: the first of these whose condition holds.
+    """Return the group of a window item: the first in this list whose condition holds.
 
-    G4: two or more collisions or view changes in the future window. G2: one collision in it. G3: a
-    view change in the prefix or the future window, or an occlusion change in the prefix. G1: none.
-    A view change is an object that enters or leaves the view.
+    G4: two or more collisions or view changes after the prefix, up to the target. G2: one collision
+    there. G3: a view change there or in the prefix, or an occlusion change in the prefix. G1: none
+    of these. A view change is an object that enters or leaves the view.
     """
     ahead, prefix = (stop + 1, stop + horizon), (start + 1, stop)
     collisions, changes = len(collisions_in(scene, *ahead)), _changes_in(scene.in_view, *ahead)
@@ -54,21 +54,21 @@ def window_group(scene: Scene, start: int, stop: int, horizon: int) -> str:
 
 
 def first_contacts(touching: Iterable[tuple[int, tuple[int, int]]]) -> tuple[Collision, ...]:
-    """The first contact of each pair, in order of frame.
+    """Return the first contact of each pair, in order of frame.
 
     Args:
         touching: (frame, objects) of every contact, in any order.
     """
     first: dict[tuple[int, int], int] = {}
-    for frame, (one, two) in touching:
-        pair = (min(one, two), max(one, two))
+    for frame, (a, b) in touching:
+        pair = (min(a, b), max(a, b))
         first[pair] = min(frame, first.get(pair, frame))
     contacts = (Collision(frame, pair) for pair, frame in first.items())
     return tuple(sorted(contacts, key=lambda c: (c.frame, c.objects)))
 
 
 def find_motion_onsets(scene: Scene) -> list[tuple[int, int]]:
-    """(frame, object) of every object that starts to move after an initial rest, in order."""
+    """Return (frame, object) for every object that starts to move after initial rest, in order."""
     distance = np.linalg.norm(scene.positions - scene.positions[0], axis=-1)
     is_away = distance > ONSET
     stays_away = np.logical_and.reduce(

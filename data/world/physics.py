@@ -30,7 +30,7 @@ GENERATOR_VERSION = "2"
 
 SOLVER_ITERATIONS = 20
 CONTACT_FREE_FRAMES = 5
-"""A pair's contact is a new event only after more contact-free frames than this."""
+"""A pair collides again only if more frames than this without contact precede."""
 
 
 @dataclass(frozen=True)
@@ -39,18 +39,18 @@ class Physics:
 
     fps: int = FPS
     substeps: int = 7
-    """Steps per frame: 175 Hz, as in CLEVRER's raw records."""
+    """Simulation steps per frame; 7 x 25 fps = 175 Hz, as in CLEVRER's raw records."""
     gravity: float = 9.81
     ground_friction: float = 0.1
     object_friction: float = 0.3
     ground_restitution: float = 0.0
-    """Bullet multiplies it by the object's restitution: with 0 nothing bounces on the ground."""
+    """Bullet multiplies it by the object's restitution, so with 0 nothing bounces on the ground."""
     rubber_restitution: float = 0.5
     metal_restitution: float = 0.7
 
     @property
     def friction_deceleration(self) -> float:
-        """Deceleration of a sliding object; Bullet multiplies the two coefficients."""
+        """Deceleration of a sliding object; Bullet multiplies the two friction coefficients."""
         return self.ground_friction * self.object_friction * self.gravity
 
 
@@ -75,7 +75,7 @@ class Motion:
 
     Attributes:
         states: (F, N, 13) positions, quaternions, linear and angular velocities as in `Scene`.
-        collisions: First contacts.
+        collisions: First contacts of pairs.
         repeated_pair: Whether any pair collides more than once.
         touching_at_start: Whether any two bodies touch at the first frame.
         landings: Landings of bodies that start in the air.
@@ -97,7 +97,7 @@ class Motion:
 
 
 def connect() -> BulletClient:
-    """Connect a Bullet client without a window and without its console output."""
+    """Start a Bullet client without a window, and suppress what it prints."""
     with silence(1), silence(2):
         import pybullet
         from pybullet_utils.bullet_client import BulletClient
@@ -116,7 +116,7 @@ def silence(descriptor: int) -> Iterator[None]:
     try:
         yield
     finally:
-        # Otherwise C's buffered output would appear later, in the middle of a progress bar.
+        # Otherwise the buffered output of C would appear later, in the middle of a progress bar.
         ctypes.CDLL(None).fflush(None)
         os.dup2(kept, descriptor)
         os.close(kept)
@@ -131,7 +131,7 @@ class Simulator:
     def simulate(
         self, bodies: list[Body], frames: int = FRAMES, physics: Physics = STANDARD_PHYSICS
     ) -> Motion:
-        """Simulate bodies for `frames` frames; the result is bit-identical every time."""
+        """Simulate bodies for `frames` frames. Equal arguments give bit-identical results."""
         ground, handles = self._place(bodies, physics)
         recorded = np.zeros((frames, len(bodies), 13))
         recorded[0] = self._state(handles)
@@ -142,7 +142,7 @@ class Simulator:
         in_air = {k for k, body in enumerate(bodies) if body.height is not None}
         landings = []
         for frame in range(1, frames):
-            # Bullet keeps the points of pairs that have separated, so only a force counts.
+            # Bullet also lists points of pairs that have separated; contacts have a normal force.
             for _ in range(physics.substeps):
                 self._bullet.stepSimulation()
                 for point in self._bullet.getContactPoints():
@@ -168,8 +168,8 @@ class Simulator:
         bullet = self._bullet
         bullet.resetSimulation()
         bullet.setGravity(0, 0, -physics.gravity)
-        # With a residual threshold above 0 the number of iterations depends on all objects, so
-        # that removing one would change the motion of objects that it never touches.
+        # With a residual threshold above 0, the number of iterations depends on all objects, so
+        # that removing an object would change the motion of objects that it never touches.
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=1 / (physics.fps * physics.substeps),
             numSolverIterations=SOLVER_ITERATIONS,
@@ -218,15 +218,15 @@ class Simulator:
 
 @cache
 def shared_simulator() -> Simulator:
-    """The simulator of this process."""
+    """Return the simulator of this process."""
     return Simulator()
 
 
 def _has_repeated(contacts: Mapping[tuple[int, int], Sequence[int]]) -> bool:
-    """Whether any pair has a second, separate contact.
+    """Return whether any pair has a second, separate contact.
 
     Args:
-        contacts: The frames in which a pair is in contact, in order.
+        contacts: The frames in which each pair is in contact, in order.
     """
     return any(
         after - before > CONTACT_FREE_FRAMES + 1

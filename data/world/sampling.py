@@ -1,7 +1,7 @@
-"""Samples collision scenes as CLEVRER does, and records their oracle.
+"""Samples collision scenes in the manner of CLEVRER, and records their oracle.
 
-A scene is a pure function of (seed, index, GENERATOR_VERSION) and the benchmark's object and
-collision limits.
+A scene depends only on the seed, its index, GENERATOR_VERSION, and the benchmark's limits on the
+numbers of objects and collisions.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from data.world.shapes import BOUNDING_RADIUS, RADIUS
 from data.world.visibility import compute_visibility
 
 AT_REST = 0.35
-"""Share of the colliding objects that start at rest."""
+"""Probability that an object added for a collision starts at rest."""
 SPEED = (1.0, 3.0)
 """Range of initial speeds, simulator units per second."""
 COLLISIONS = {2: 0.63, 3: 0.33, 4: 0.04}
-"""Probability of each target number of collisions, from a sample of CLEVRER's release."""
+"""Probabilities of the intended number of collisions, from a sample of CLEVRER's release."""
 CLEAR = 2 * max(BOUNDING_RADIUS.values()) + 0.2
-"""Objects that keep this distance at every frame never touch: between two frames their distance
-falls by less than 0.1."""
+"""Objects that have this distance at every frame never touch, because between two frames their
+distance falls by less than 0.1."""
 PLACEMENTS = 40
-"""Attempts to place one object before the scene is sampled again."""
+"""Number of attempts to place an object before the scene is sampled again."""
 
 
 def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[Body], Motion]:
     """Sample the bodies of scene `index` and simulate their motion.
 
-    The first body moves. Each further one is placed so that it collides with an earlier one, until
-    the scene has its target number of collisions; the remaining bodies rest and touch no other.
-    Scenes in which a pair touches at the start or collides twice are rejected and sampled again.
+    The first body moves. Each further body is placed so that it collides with an earlier body,
+    until the scene has its intended number of collisions; the others rest and touch no other body.
+    A placement by which a pair touches at the start or collides twice is rejected.
     """
     rng = np.random.default_rng([seed, index])
     while True:
@@ -65,7 +65,7 @@ def sample_objects(rng: np.random.Generator, limits: BenchmarkConfig) -> list[Sc
 
 
 def _entering(added: SceneObject, rng: np.random.Generator) -> Body:
-    """Sample a body that enters from outside the view, towards its middle."""
+    """Sample a body that moves from far away towards the middle of the view."""
     bearing = rng.uniform(0, 2 * np.pi)
     start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * unit_vector(bearing)
     goal = np.array([-0.7, 0.0]) + rng.uniform(-1, 1, 2)
@@ -80,35 +80,35 @@ def _try_body(
     added: SceneObject,
     rng: np.random.Generator,
     goal: int,
-    most: int,
+    max_collisions: int,
 ) -> tuple[list[Body], Motion] | None:
-    """Add a body that collides with another, or with none once the motion has `goal` collisions.
+    """Add a body that collides with another body or, once there are `goal` collisions, with none.
 
     Returns:
-        All bodies and their motion, or None where the sampled body does not fit.
+        All bodies and their motion, or None if the sampled body does not fit.
     """
-    is_colliding = len(motion.collisions) < min(goal, most)
+    is_colliding = len(motion.collisions) < min(goal, max_collisions)
     body = (_colliding if is_colliding else _resting)(added, motion, rng)
     if body is None:
         return None
     extended = [*bodies, body]
-    # A colliding body seldom stays clear of the others, so they are simulated together.
+    # A body at rest usually stays clear of the others, and then need not be simulated with them.
     combined = None if is_colliding else _combine(motion, body)
     result = combined or shared_simulator().simulate(extended)
     fits = (
         not result.touching_at_start
         and not result.repeated_pair
-        and len(result.collisions) <= most
+        and len(result.collisions) <= max_collisions
         and any(len(bodies) in c.objects for c in result.collisions) == is_colliding
     )
     return (extended, result) if fits else None
 
 
 def _combine(motion: Motion, body: Body) -> Motion | None:
-    """Add the motion of a body that stays clear of all others; None where it may touch one.
+    """Add the motion of a body that touches no other body; return None if it may touch one.
 
-    Bullet solves separate groups of bodies separately, so the result is bit-identical to a joint
-    simulation.
+    Bullet solves groups of bodies that do not touch separately, so the result is bit-identical to a
+    simulation of all bodies.
     """
     alone = shared_simulator().simulate([body]).states
     distance = np.linalg.norm(motion.positions - alone[..., :3], axis=-1)
@@ -118,8 +118,8 @@ def _combine(motion: Motion, body: Body) -> Motion | None:
 
 
 def _colliding(added: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
-    """Sample a body that should collide with another one in view: at rest in its path, or aimed at
-    its future position."""
+    """Sample a body that should collide with another body on screen: at rest in its path, or moving
+    towards its future position. Returns None if the sample is unsuitable."""
     other = int(rng.integers(motion.positions.shape[1]))
     frame = int(rng.integers(15, 111))
     place = motion.positions[frame, other, :2] + rng.normal(0, 0.1, 2)
@@ -140,7 +140,7 @@ def _colliding(added: SceneObject, motion: Motion, rng: np.random.Generator) -> 
 
 
 def _resting(added: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
-    """Sample a body at rest on screen, clear of all paths."""
+    """Sample a body at rest on screen; return None if it is off screen or near another's path."""
     place = np.array([rng.uniform(-3.5, 1.2), rng.uniform(-2.2, 2.2)])
     is_clear = np.linalg.norm(motion.positions[..., :2] - place, axis=-1).min() > 0.7
     if not (is_clear and is_on_screen(place)):
@@ -151,7 +151,7 @@ def _resting(added: SceneObject, motion: Motion, rng: np.random.Generator) -> Bo
 def is_on_screen(
     place: np.ndarray, height: float = RADIUS, camera: Camera = STANDARD_VIEW.camera
 ) -> bool:
-    """Whether a point above a ground position is on screen, with a margin of 20 px."""
+    """Return whether a point above a ground position is on screen, with a margin of 20 px."""
     pixel, depth = camera.project(np.array([*place, height]))
     margin = 20
     return bool(
@@ -172,7 +172,7 @@ def format_scene_id(seed: int, index: int) -> str:
 def simulate_without(name: str, split: str, bodies: list[Body], removed: int) -> Scene:
     """Simulate a scene again without object `removed`.
 
-    Objects that it never affects, directly or through others, move bit-identically.
+    Objects that the removed object never affects, directly or through others, move bit-identically.
     """
     rest = bodies[:removed] + bodies[removed + 1 :]
     return record_scene(name, split, rest, shared_simulator().simulate(rest))
@@ -187,7 +187,7 @@ def record_scene(
     camera: Camera = STANDARD_VIEW.camera,
     scenario: str = "",
 ) -> Scene:
-    """Record a motion as a scene, with projection and visibility by a camera."""
+    """Return the scene of a motion, with image positions and visibility for a camera."""
     objects = tuple(body.object for body in bodies)
     states = np.split(motion.states, [3, 7, 10], axis=-1)
     positions, quaternions, velocities, angular_velocities = states

@@ -1,4 +1,4 @@
-"""Simulates the scenes of a benchmark, or reads them from a release, and splits them."""
+"""Simulates the scenes of a benchmark or reads them from a release, in two splits."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from data.world.standins import simulate_standin
 log = logging.getLogger(__name__)
 
 SPLIT_BLOCK = 5
-"""Consecutive scenes that are split together."""
+"""Number of consecutive scenes in a block; each block is divided between the splits."""
 LOGGED_PROBLEMS = 5
-"""Invalid records of a release that are logged one by one; the others are counted."""
+"""Maximum number of invalid records that are logged one by one; the others are counted."""
 
 Element = TypeVar("Element")
 
@@ -38,18 +38,18 @@ def make_scenes(
     """Write every missing scene below `folder`.
 
     Returns:
-        Scene ids by split, in a stable order, and counts of records that were left out.
+        Scene ids by split, in a stable order, and the number of invalid records.
 
     Raises:
-        UserError: a split would be empty, the release is missing, or `strict` is set and one of
-            its records is invalid.
+        UserError: a split would be empty, the release is missing, or `strict` is set and a record
+            is invalid.
     """
     if cfg.simulator != "bullet":
         return read_release(cfg, folder, workers, strict)
     prefix = f"standin_{cfg.standin}-" if cfg.standin else ""
     names = [prefix + format_scene_id(cfg.seed, index) for index in range(cfg.scenes)]
     scene_ids = split_scenes(cfg, names)
-    split_of = {name: split for split, some in scene_ids.items() for name in some}
+    split_of = {name: split for split, ids in scene_ids.items() for name in ids}
     paths = {name: scene_path(folder, name) for name in names}
     jobs = {
         paths[name]: partial(_simulate_one, cfg, index, split_of[name], paths[name])
@@ -62,8 +62,8 @@ def make_scenes(
 def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, list[Element]]:
     """Assign a random share of every `SPLIT_BLOCK` scenes to the test split; the order is kept.
 
-    A scene's split depends only on the seed and its index, so that the training scenes of a larger
-    benchmark are never test scenes of a smaller one with the same scenes.
+    A scene's split depends only on its index, the seed and the test share, so that a scene has the
+    same split in a smaller and in a larger benchmark.
 
     Raises:
         UserError: a split would be empty.
@@ -79,14 +79,14 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
         if not splits[split]:
             raise UserError(
                 f"benchmark.test_share={cfg.test_share} of {len(scenes)} scenes leaves no {split} "
-                f"scenes: use more scenes (benchmark.scenes is {cfg.scenes})",
+                f"scene: change it, or use more scenes (benchmark.scenes={cfg.scenes})",
                 code="empty-split",
             )
     return splits
 
 
 def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> None:
-    """Simulate a scene and, if the benchmark has counterfactuals, the scene without one object."""
+    """Simulate a scene and, for counterfactual queries, the scene without one of its objects."""
     if cfg.standin is not None:
         save_scene(simulate_standin(path.stem, index, split, cfg), path)
         return
@@ -95,10 +95,10 @@ def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> N
     if getattr(cfg.retrieval.counterfactual, split):
         removed = counterfactual.removed_object(scene, cfg.seed)
         if removed is not None:
-            name = counterfactual.absent_id(scene.scene_id, removed)
-            absent = simulate_without(name, split, bodies, removed)
-            save_scene(absent, path.with_name(f"{name}.npz"))
-    # Last, because this file marks the job as done.
+            name = counterfactual.counterfactual_id(scene.scene_id, removed)
+            counterfactual_scene = simulate_without(name, split, bodies, removed)
+            save_scene(counterfactual_scene, path.with_name(f"{name}.npz"))
+    # This file is saved last, because it marks the job as done.
     save_scene(scene, path)
 
 
@@ -118,10 +118,10 @@ def read_release(
     source = Path(cfg.folder)
     paths = READERS[cfg.simulator].list_scenes(source)[: cfg.scenes]
     jobs, split_of = {}, {}
-    for split, some in split_scenes(cfg, paths).items():
-        for path in some:
+    for split, split_paths in split_scenes(cfg, paths).items():
+        for path in split_paths:
             file = path if path.exists() else path.parent
-            # A record that changes is read again.
+            # Size and time of the file, so that a record that has changed is read again.
             inputs = [str(path), split, file.stat().st_size, file.stat().st_mtime_ns]
             part = part_path(folder, inputs)
             jobs[part] = partial(_read_one, cfg, path, split, folder, part)

@@ -1,8 +1,8 @@
 """Stand-ins: Bullet scenes that imitate the motions of MoVi-A and Physion.
 
-They replace a transfer suite whose release is not available. Items are built from them by the
-suite's recipe, and they measure how a student transfers to unseen motions, light and cameras.
-Results on them are not results on the paper's suites, so they have their own names,
+They replace a transfer suite whose release is not available. Their items are built in the same way
+as those of the suite. They measure how a student transfers to unseen motions, light and cameras.
+Results on them are not results on the paper's suites, so they have names of their own,
 `standin_movi_a` and `standin_physion`.
 
 In the stand-in of MoVi-A, objects fall and bounce for two seconds. In that of Physion, objects rest
@@ -27,7 +27,7 @@ STANDINS_VERSION = "2"
 """Increment it whenever the scenes or the appearance of a stand-in change."""
 
 ROW_STEP = (0.75, 1.1)
-"""Range of distances between neighbours in a row, simulator units."""
+"""Range of distances between neighbours in a row of objects, simulator units."""
 
 Start = tuple[str, list[Body]]
 """The name of a scenario, and the initial bodies."""
@@ -61,12 +61,12 @@ def thrown(objects: list[SceneObject], view: View, rng: np.random.Generator) -> 
 
 
 def struck(objects: list[SceneObject], view: View, rng: np.random.Generator) -> Start | None:
-    """Sample a row of resting objects, and one more that strikes the first of them.
+    """Sample a row of objects at rest, and an object that strikes the first object of the row.
 
     The striking object slides along the row (scenario Collide) or falls (scenario Drop).
     """
     last, *row = objects
-    # The row runs across the view: in a row away from the camera, objects would hide each other.
+    # The row is roughly perpendicular to the view: otherwise objects would hide each other.
     bearing = rng.choice([-1, 1]) * np.pi / 2 + rng.uniform(-0.7, 0.7)
     place = rng.uniform([-0.8, -1.0], [1.0, 1.0])
     first, bodies = place, []
@@ -107,8 +107,8 @@ STANDINS = {
         start=struck,
     ),
 }  # fmt: skip
-"""Stand-ins by suite. The frame rate is the suite's. Gravity is weaker than on Earth, so that some
-objects are still in the air when a prefix ends."""
+"""Stand-ins by the suite that they imitate, whose frame rate they have. Gravity is weaker than on
+Earth, so that some objects are still in the air when a prefix ends."""
 
 
 def generator_version(standin: str | None) -> str:

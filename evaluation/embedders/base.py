@@ -1,4 +1,4 @@
-"""Embed the queries, items, frames and texts of a benchmark, with a cache on disk.
+"""Embed the queries, selection items, frames and texts of a benchmark, with a cache on disk.
 
 Modules that load a model are imported only when an embedding is missing, because importing them
 takes longer than ranking.
@@ -31,41 +31,42 @@ from models.resolved import check_base
 from models.trained_runs import product_folder, resolve_model, run_title
 
 EMBEDDINGS = "embeddings"
-"""Their folder in a store."""
-INPUTS = 2
-"""Version of the inputs' layout; raise it when the layout changes, so that earlier embeddings are
-not reused."""
+"""Folder of the embeddings in a store."""
+INPUT_VERSION = 2
+"""Version of the layout of the models' inputs. Increment it when the layout changes, so that
+earlier embeddings are not reused."""
 PACKAGES = ("sentence-transformers", "transformers")
-"""Packages that turn a prompt and pixels into a model's input."""
+"""Packages that turn a prompt and pixels into a model's input, which depends on their versions."""
 
 Query = RetrievalQuery | SelectionItem
 Input = TypeVar("Input")
 
 
 class Encoder(Protocol):
-    """A loaded model that returns fp32 embeddings (inputs, entries)."""
+    """A loaded model. Its methods return fp32 embeddings (inputs, entries)."""
 
-    def queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
+    def embed_queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
         """Embed prefixes with their questions."""
 
-    def frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray: ...
+    def embed_frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray: ...
 
-    def texts(self, texts: list[str]) -> np.ndarray:
+    def embed_texts(self, texts: list[str]) -> np.ndarray:
         """Embed texts as queries without a prefix."""
 
 
 @dataclass(frozen=True)
 class Embedder:
-    """A retriever that is evaluated. Its encoder is loaded when the first embedding is missing.
+    """A retriever that is evaluated. Its encoder is loaded when an embedding is missing.
 
-    Its methods embed the inputs that the store's cache lacks, `batch` at a time. They raise
-    UserError if memory runs out, or if an embedding is non-finite or narrower than the widths.
+    The `embed_` methods embed the inputs that the store's cache lacks, `batch` at a time, and
+    return the cache. They raise UserError if memory runs out, or if an embedding is non-finite or
+    has fewer entries than the widest width.
 
     Attributes:
         saved: Folder of the trained retriever; None for the preset's model as it was released.
-        weights: Digest of the base's weights and the adapters'.
-        processor: Digest of the files that define its input.
-        frames: Reads the pixels of the store's frames at the preset's size.
+        weights: Digest of the weights, including adapters.
+        processor: Digest of the files of the tokenizer and the processor.
+        frames: Reads the frames of the store, resized to the preset's `image_size`.
     """
 
     name: str
@@ -85,25 +86,29 @@ class Embedder:
         return load_encoder(self.preset, self.precision, self.saved)
 
     def embed_queries(self, queries: Sequence[Query]) -> EmbeddingCache:
-        """Embed prefixes with their questions, by name; pixels are read one batch at a time."""
+        """Embed prefixes with their questions. The cache stores them by `Query.name`."""
         # By scene, so that each scene's frames are decoded once.
         inputs = {q.name: q for q in sorted(queries, key=lambda q: (q.scene_id, q.name))}
         preset = self.preset
         settings = {"instruction": preset.query_instruction, "frames": preset.frames}
-        return self._embed("query", settings, inputs, lambda e, some: e.queries(some, self.frames))
+        return self._embed(
+            "query", settings, inputs, lambda model, batch: model.embed_queries(batch, self.frames)
+        )
 
     def embed_frames(self, database: Iterable[FrameRef]) -> EmbeddingCache:
-        """Embed frames, by name."""
+        """Embed frames. The cache stores them by `FrameRef.name`."""
         inputs = {f.name: f for f in sorted(database, key=lambda f: (f.scene_id, f.frame))}
         settings = {"instruction": self.preset.frame_instruction}
-        return self._embed("frame", settings, inputs, lambda e, some: e.frames(some, self.frames))
+        return self._embed(
+            "frame", settings, inputs, lambda model, batch: model.embed_frames(batch, self.frames)
+        )
 
     def embed_texts(self, texts: Iterable[str]) -> EmbeddingCache:
-        """Embed texts as queries without a prefix, by the text."""
-        # Longest first: little padding in a batch, and a lack of memory shows at once.
+        """Embed texts as queries without a prefix. The cache stores them by the text itself."""
+        # Longest first: a batch has little padding, and a lack of memory shows in the first batch.
         inputs = {text: text for text in sorted(set(texts), key=lambda text: (-len(text), text))}
         settings = {"instruction": self.preset.query_instruction}
-        return self._embed("text", settings, inputs, lambda e, some: e.texts(some))
+        return self._embed("text", settings, inputs, lambda model, batch: model.embed_texts(batch))
 
     def _embed(
         self,
@@ -112,15 +117,15 @@ class Embedder:
         inputs: Mapping[str, Input],
         encode: Callable[[Encoder, list[Input]], np.ndarray],
     ) -> EmbeddingCache:
-        def embed(some: list[Input]) -> np.ndarray:
+        def embed(batch: list[Input]) -> np.ndarray:
             encoder = self.encoder
 
             from models.memory import explain_out_of_memory
 
             with explain_out_of_memory(
-                f"with {len(some)} inputs in a batch", "lower batch, in a separate run (run=NAME)"
+                f"with {len(batch)} inputs in a batch", "lower batch, in a separate run (run=NAME)"
             ):
-                rows = encode(encoder, some)
+                rows = encode(encoder, batch)
             self._check_widths(rows.shape[1])
             return rows
 
@@ -135,11 +140,12 @@ class Embedder:
             check_widths(self.preset, entries)
 
     def settings(self) -> dict[str, Any]:
-        """Return everything that an embedding depends on, except its input and instruction."""
+        """Return everything that an embedding depends on, except its input and the settings of that
+        kind of input, such as the instruction."""
         preset = self.preset
         return {
             "encoder": preset.encoder,
-            "inputs": INPUTS,
+            "inputs": INPUT_VERSION,
             "weights": self.weights,
             "processor": self.processor,
             "revision": preset.revision,
@@ -175,16 +181,16 @@ def open_embedders(
     run: Path,
     batch: int,
 ) -> Iterator[Embedder]:
-    """Yield the retriever of a run's `folder`, if there is one, and then its untrained base: one at
-    a time, so that memory holds only one.
+    """Yield the retriever of the run in `folder`, if there is one, and then its untrained base, one
+    at a time, so that memory holds only one of them.
 
     Args:
-        trained: The settings of that run, or those of the command.
-        run: Folder of the evaluation, for a base that is built from a seed.
+        trained: The settings of that run; without a folder, those of the command.
+        run: Folder of the evaluation. A base that is built from a seed is saved there.
 
     Raises:
-        UserError: The trained retriever's base is not the one that its preset names, or its pooling
-            differs.
+        UserError: The weights of a trained retriever's local base have changed since the training,
+            or its modules are damaged or not supported.
     """
     preset, precision = trained.retriever, resolve_precision(trained.train.precision)
     inputs = store, FrameReader(store, preset.image_size), batch
@@ -199,7 +205,7 @@ def open_embedders(
         )
         yield Embedder(run_title(folder), preset, precision, saved, *digests, *inputs)
     if preset.architecture is not None:
-        # The base is built from a seed; a training run contains it.
+        # The base is built from a seed. A training run contains it.
         base = (folder or run) / "untrained"
         if folder is None or not base.is_dir():
             from models.retriever.embedder import load_retriever, tokenizer_texts

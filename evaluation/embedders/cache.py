@@ -2,9 +2,9 @@
 
     store/<name>/embeddings/<kind>-<key>.sqlite
 
-A file holds the embeddings of one kind of input under the same settings, which it records and whose
-hash is its key. Each batch is committed, so that a killed evaluation resumes after the last one.
-All files can be deleted at any time.
+A file holds the embeddings of one kind of input (frame, query or text) that were made with the same
+settings. It records these settings, and the key in its name is their hash. Each batch is committed,
+so that a killed evaluation resumes after the last batch. All files can be deleted at any time.
 """
 
 from __future__ import annotations
@@ -25,30 +25,31 @@ from models.fingerprints import settings_key
 
 SCHEMA = """
 PRAGMA page_size = 65536; -- an embedding of 4,096 entries fits in a page
-PRAGMA synchronous = OFF; -- a kill loses nothing, and a power failure at most this cache
-CREATE TABLE IF NOT EXISTS about (settings TEXT PRIMARY KEY);
-CREATE TABLE IF NOT EXISTS embedding (name TEXT UNIQUE, entries BLOB);
+PRAGMA synchronous = OFF; -- a killed process damages nothing, a power failure only this cache
+CREATE TABLE IF NOT EXISTS about (settings TEXT PRIMARY KEY); -- JSON
+CREATE TABLE IF NOT EXISTS embedding (name TEXT UNIQUE, entries BLOB); -- fp32
 """
 PART_ROWS = 512
-"""Embeddings that are read at a time."""
+"""Maximum number of rows of a part that `EmbeddingCache.parts` yields."""
 
 Input = TypeVar("Input")
 
 
 class EmbeddingCache:
-    """One model's embeddings of one kind of input, by name."""
+    """One model's embeddings of one kind of input, by the name of the input.
 
-    def __init__(self, root: Path, kind: str, about: Mapping[str, Any]) -> None:
-        """
-        Args:
-            kind: frame, query or text.
-            about: All settings that the embeddings depend on, as JSON.
+    Args:
+        root: Folder of the files.
+        kind: frame, query or text.
+        settings: Everything that the embeddings depend on besides the inputs; values of JSON.
 
-        Raises:
-            UserError: The file is damaged.
-        """
-        self.kind, self._about = kind, json.dumps(about)
-        self.path = root / f"{kind}-{settings_key(about)}.sqlite"
+    Raises:
+        UserError: The file is damaged.
+    """
+
+    def __init__(self, root: Path, kind: str, settings: Mapping[str, Any]) -> None:
+        self.kind, self._settings = kind, json.dumps(settings)
+        self.path = root / f"{kind}-{settings_key(settings)}.sqlite"
         root.mkdir(parents=True, exist_ok=True)
         with self._explain_damage():
             self._db = sqlite3.connect(self.path, timeout=60)
@@ -60,8 +61,8 @@ class EmbeddingCache:
         """Embed the `inputs` that the cache lacks, `batch` at a time.
 
         Args:
-            inputs: By name, in the order in which they are embedded.
-            embed: Returns (inputs, entries) fp32.
+            inputs: The inputs by name, in the order in which they are embedded.
+            embed: Returns the fp32 embeddings (inputs, entries) of some inputs.
 
         Raises:
             UserError: An embedding is non-finite, or the file is damaged.
@@ -71,7 +72,7 @@ class EmbeddingCache:
         if not missing:
             return
         with self._explain_damage(), self._db:
-            self._db.execute("INSERT OR IGNORE INTO about VALUES (?)", [self._about])
+            self._db.execute("INSERT OR IGNORE INTO about VALUES (?)", [self._settings])
         done = len(inputs) - len(missing)
         with tqdm(total=len(inputs), initial=done, desc="embedding", unit=self.kind) as bar:
             for names in batched(missing, batch):
@@ -83,28 +84,29 @@ class EmbeddingCache:
                 bar.update(len(names))
 
     def parts(self, names: Sequence[str]) -> Iterator[np.ndarray]:
-        """Yield the embeddings of `names`, some at a time and in any order."""
+        """Yield the embeddings of `names` in parts (rows, entries). The order of the rows is not
+        that of `names`, and a repeated name has one row."""
         wanted, width = set(names), self.width
         bar = tqdm(total=len(wanted), desc="ranking", unit=self.kind, leave=False)
         with self._explain_damage(), bar:
             cursor = self._db.execute("SELECT name, entries FROM embedding")
             while rows := cursor.fetchmany(PART_ROWS):
                 if entries := [row for name, row in rows if name in wanted]:
-                    yield pad_rows([_array(e) for e in entries], width)
+                    yield pad_rows([np.frombuffer(e, np.float32) for e in entries], width)
                     bar.update(len(entries))
 
     def rows(self, names: Sequence[str]) -> np.ndarray:
-        """Return (names, entries) in the order of `names`, which may repeat."""
+        """Return the embeddings (names, entries) in the order of `names`, which may repeat."""
         unique = list(dict.fromkeys(names))
         query = "SELECT entries FROM embedding WHERE name = ?"
         entries = [entries for name in unique for (entries,) in self._query(query, name)]
-        rows = pad_rows([_array(e) for e in entries], self.width)
+        rows = pad_rows([np.frombuffer(e, np.float32) for e in entries], self.width)
         row_of = {name: k for k, name in enumerate(unique)}
         return rows[[row_of[name] for name in names]]
 
     @property
     def width(self) -> int:
-        """Entries of the longest embedding."""
+        """Number of entries of the longest embedding."""
         [(size,)] = self._query("SELECT max(length(entries)) FROM embedding")
         return size // np.dtype(np.float32).itemsize
 
@@ -118,8 +120,7 @@ class EmbeddingCache:
             yield
         except sqlite3.DatabaseError as error:
             raise UserError(
-                f"{self.path} cannot be used ({error}): delete it, and its inputs are embedded "
-                "again",
+                f"{self.path} cannot be read or written ({error}): delete it, and run this again",
                 code="damaged-file",
             ) from error
 
@@ -130,19 +131,15 @@ class EmbeddingCache:
             more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
             raise UserError(
                 f"non-finite embedding (NaN or Inf) for {self.kind} {bad[0]}{more}: the weights "
-                "are broken or overflow; measure in train.precision=fp32, or train again with a "
-                "lower train.lr",
+                "are not finite, or the model overflows; set train.precision=fp32, or train again "
+                "with a lower train.lr",
                 code="non-finite-embedding",
             )
 
 
 def pad_rows(rows: Sequence[np.ndarray], width: int | None = None) -> np.ndarray:
-    """Stack rows (entries,) of several lengths, padded with zeros to `width` or the longest."""
+    """Stack rows (entries,) of different lengths, padded with zeros to `width` or the longest."""
     padded = np.zeros((len(rows), width or max(map(len, rows))), np.float32)
     for target, row in zip(padded, rows, strict=True):
         target[: len(row)] = row
     return padded
-
-
-def _array(entries: bytes) -> np.ndarray:
-    return np.frombuffer(entries, np.float32)

@@ -1,4 +1,4 @@
-"""Encoders that read a prefix and its question as one input, and the loading of any encoder."""
+"""Encoders that embed a prefix and its question as one input, and the loading of all encoders."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ if TYPE_CHECKING:
     from models.retriever.embedder import Retriever
 
 MAX_TOKEN_PAIRS = 64 * 512**2
-"""Maximum entries of a text batch's attention mask: 64 texts of 512 tokens, the default length of a
-response. A tokenizer splits unknown text into many more tokens, and then 64 texts need many GB."""
+"""Maximum entries of the attention mask of a batch of texts: 64 texts of 512 tokens, the default
+length of a response. A tokenizer may split a text into many more tokens; 64 such texts would need
+many GB."""
 
 
 class JointEncoder:
-    """An encoder of sentence-transformers with separate instructions for queries and frames."""
+    """An `Encoder` that is a model of sentence-transformers."""
 
     def __init__(self, model: Retriever, preset: RetrieverConfig) -> None:
         self._model, self._preset = model, preset
 
-    def queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
+    def embed_queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
         inputs = [query_input(query, frames, self._preset) for query in queries]
         return self._encode(inputs, self._preset.query_instruction, "query")
 
-    def frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray:
+    def embed_frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray:
         inputs = [frame_input(ref, frames) for ref in refs]
         return self._encode(inputs, self._preset.frame_instruction, "document")
 
-    def texts(self, texts: list[str]) -> np.ndarray:
+    def embed_texts(self, texts: list[str]) -> np.ndarray:
         longest = max(map(len, self._model.tokenizer(texts)["input_ids"]))
         size = max(1, MAX_TOKEN_PAIRS // max(1, longest) ** 2)
         instruction = self._preset.query_instruction
@@ -46,7 +47,8 @@ class JointEncoder:
         return np.concatenate(batches)
 
     def _encode(self, inputs: list[Any], prompt: str, kind: str) -> np.ndarray:
-        """A row holds one vector, or an input's vectors one after the other."""
+        """Embed inputs of one kind, query or document. A row holds the vector of an input, or all
+        of its vectors one after the other."""
         task = {} if self._preset.late is None else {"task": kind}
         embeddings = self._model.encode(
             inputs, prompt=prompt, batch_size=len(inputs), convert_to_numpy=True,
@@ -56,11 +58,11 @@ class JointEncoder:
 
 
 def load_encoder(preset: RetrieverConfig, precision: str, saved: Path | None) -> Encoder:
-    """Load the retriever in `saved`, or without a folder a preset's model as it was released.
+    """Load the trained retriever in `saved`, or if it is None the preset's model as released.
 
     Raises:
-        UserError: The model cannot be loaded, is incomplete, is not of the preset's encoder, has
-            another model's processor, or needs another number or size of frames.
+        UserError: The model cannot be loaded, is incomplete, is of another kind than `encoder`, has
+            the processor of another model, or needs another number or size of frames.
     """
     keep_freed_memory()
     if saved is not None:
@@ -77,5 +79,5 @@ def load_encoder(preset: RetrieverConfig, precision: str, saved: Path | None) ->
         from evaluation.embedders.languagebind import load_languagebind
 
         return load_languagebind(preset, precision)
-    # A base that is built from a seed was built before, and is loaded from its folder.
+    # The texts and the folder are for building a base. `open_embedders` has already built it.
     return JointEncoder(load_retriever(preset, precision, [], Path()), preset)

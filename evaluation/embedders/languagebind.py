@@ -1,8 +1,8 @@
-"""LanguageBind: a video tower and an image tower, bound to one text tower.
+"""LanguageBind: a video tower and an image tower that embed into the space of one text tower.
 
 transformers has no class for it, and its authors' code needs an older transformers. Its image and
-text towers are CLIP's. Its video tower is CLIP's with an attention over time before each layer,
-implemented here under the names of the released weights.
+text towers are those of CLIP. Its video tower is CLIP's image tower with attention over time before
+each layer. It is implemented here with the names of the released weights.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from evaluation.embedders.dual_encoder import (
     check_tokenizer,
     image_features,
     load_complete,
-    reading_model,
     unit_rows,
 )
+from models.loading import explain_unloadable
 
 
 class TemporalLayer(CLIPEncoderLayer):
-    """A CLIP layer that first attends over the clip's frames, at each position of the image."""
+    """A CLIP layer after attention over time: each image position attends over a clip's frames."""
 
     def __init__(self, config: Any) -> None:
         super().__init__(config)
@@ -38,7 +38,7 @@ class TemporalLayer(CLIPEncoderLayer):
         self.temporal_attn = CLIPAttention(config)
 
     def forward(self, hidden_states: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
-        """`hidden_states` is (clips x frames, positions, width), clip by clip."""
+        """`hidden_states` is (clips x frames, positions, width), with a clip's frames in a row."""
         frames, positions = self.temporal_embedding.shape[1], hidden_states.shape[1]
         over_time = hidden_states.unflatten(0, (-1, frames)).transpose(1, 2).flatten(0, 1)
         over_time = over_time + self.temporal_embedding
@@ -51,8 +51,8 @@ class TemporalLayer(CLIPEncoderLayer):
 class LanguageBindVideo(CLIPModel):
     """CLIP with attention over time.
 
-    `get_image_features` takes the frames of whole clips and returns features per frame; a clip's
-    embedding is their mean.
+    `get_image_features` takes the frames of complete clips and returns the features of each frame.
+    The embedding of a clip is the mean of its frames' features.
     """
 
     def __init__(self, config: CLIPConfig) -> None:
@@ -68,33 +68,34 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
     """Load the video and text towers of `model`, and the image tower of `image_model`."""
     video = load_tower(LanguageBindVideo, preset, precision, "model", preset.revision)
     image = load_tower(CLIPModel, preset, precision, "image_model", preset.image_revision)
-    with reading_model(preset.model):
+    with explain_unloadable("retriever", preset.model):
         tokenizer = CLIPTokenizer.from_pretrained(preset.model, revision=preset.revision)
     check_tokenizer(preset, video.config, tokenizer)
-    times = preset.frames
+    frame_count = preset.frames
     size = {"height": preset.image_size, "width": preset.image_size}
-    # The released models lack a processor file; their authors' transform is CLIP's.
+    # The released models have no processor file. Their authors preprocess images as CLIP does.
     processor = CLIPImageProcessor(crop_size=size, size={"shortest_edge": preset.image_size})
 
     def embed_clips(clips: list[np.ndarray]) -> np.ndarray:
-        pixels = np.concatenate([clip[spread(len(clip), times)] for clip in clips])
-        features = image_features(video, processor, pixels, group=times)
-        return unit_rows(features.reshape(len(clips), times, -1).mean(axis=1))
+        pixels = np.concatenate([clip[spread(len(clip), frame_count)] for clip in clips])
+        features = image_features(video, processor, pixels, group=frame_count)
+        return unit_rows(features.reshape(len(clips), frame_count, -1).mean(axis=1))
 
     return DualEncoder(preset, image, video, tokenizer, processor, embed_clips)
 
 
 def spread(frames: int, wanted: int) -> list[int]:
-    """Return `wanted` evenly spread frame indices, with repeats if there are fewer frames."""
+    """Return `wanted` evenly spread frame indices, repeating some if there are fewer frames."""
     return [int(k) for k in np.linspace(0, frames - 1, wanted).round()]
 
 
 def load_tower(
     kind: type[CLIPModel], preset: RetrieverConfig, precision: str, key: str, revision: str | None
 ) -> CLIPModel:
-    """Load the model that the setting `key` names, and check that its frames fit the preset."""
+    """Load the model that the setting `key` names; raise UserError if it is incomplete, not of this
+    kind, or needs another number or size of frames than the preset's."""
     source = getattr(preset, key)
-    with reading_model(source, key):
+    with explain_unloadable("retriever", source, key):
         # CLIPConfig.from_pretrained would warn that the file has another model type.
         config = CLIPConfig.from_dict(CLIPConfig.get_config_dict(source, revision=revision)[0])
         is_video = getattr(config.vision_config, "add_time_attn", False)
@@ -109,10 +110,10 @@ def load_tower(
                 f"LanguageBind, such as LanguageBind/LanguageBind_{example}",
                 code="wrong-model-type",
             )
-        if is_video and (times := config.vision_config.num_frames) != preset.frames:
+        if is_video and (needed := config.vision_config.num_frames) != preset.frames:
             raise UserError(
-                f"retriever.frames={preset.frames}, but {source} needs clips of {times} frames: "
-                f"set retriever.frames={times}",
+                f"retriever.frames={preset.frames}, but {source} needs clips of {needed} frames: "
+                f"set retriever.frames={needed}",
                 code="wrong-frame-count",
             )
         check_size(preset, config)

@@ -10,9 +10,8 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
-from evaluation.embedders.dual_encoder import reading_model
 from models.checks import check_processor
-from models.loading import DTYPES, pin_sizes
+from models.loading import DTYPES, explain_unloadable, pin_sizes
 from models.retriever.embedder import PROCESSING
 
 TEMPLATE = (
@@ -26,14 +25,14 @@ TEMPLATE = (
     "{%- endfor -%}"
     "{{ parts.media + parts.texts | join(' ') }}"
 )
-"""Format of VLM2Vec's training: the placeholder token of the image or video, the instruction and
-the text, without roles or start and end tokens."""
+"""Chat template in the format that VLM2Vec was trained with: the placeholder token of the image or
+video, the instruction and the text, without roles and without start and end tokens."""
 
 
 def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer:
-    """Load VLM2Vec, whose embedding is the L2-normalised last hidden state of the last token."""
+    """Load VLM2Vec. Its embedding is the last hidden state of the last token, L2-normalised."""
     origin = {"revision": preset.revision, "trust_remote_code": preset.trust_remote_code}
-    with reading_model(preset.model):
+    with explain_unloadable("retriever", preset.model):
         backbone = Transformer(
             preset.model,
             model_kwargs={"dtype": DTYPES[precision], "use_safetensors": True, **origin},
@@ -59,11 +58,11 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
 
 
 def use_text_positions(module: Any, args: tuple[dict[str, Any]]) -> None:
-    """Give the tokens of images and videos sequential positions, as those of text; a forward
-    pre-hook.
+    """Forward pre-hook that gives the tokens of images and videos sequential positions, like the
+    tokens of text.
 
-    VLM2Vec was trained without vision start tokens, so its images and videos had no spatial
-    positions. Newer versions of transformers would assign spatial positions.
+    VLM2Vec was trained without vision start tokens, and therefore without spatial positions. Newer
+    versions of transformers assign spatial positions even without these tokens.
     """
     (features,) = args
     if "mm_token_type_ids" in features:

@@ -21,25 +21,25 @@ not reused."""
 
 
 class Generator(Protocol):
-    """A model that responds to selection items, queries or frames.
+    """A model that responds to prompts about selection items, queries or frames.
 
     Attributes:
         name: Name of the model in tables.
-        revision: Values that identify the weights. Stored responses are reused only if the revision
-            is equal.
+        identity: Values that identify the weights and the processor. A stored response is reused
+            only for a model with an equal identity.
     """
 
     name: str
-    revision: dict[str, Any]
+    identity: dict[str, Any]
 
     def respond(
         self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
     ) -> None:
-        """Respond to the prompt `sample_of(subject)` of each item, query or frame, and pass
-        finished responses to `save`.
+        """Generate a response to the prompt `sample_of(subject)` of each subject, and pass finished
+        responses to `save`.
 
         Raises:
-            UserError: Memory runs out, no server responds, or a subject gets no response.
+            UserError: Memory runs out, a prompt is too long, or the servers do not respond to it.
         """
 
 
@@ -55,8 +55,9 @@ def open_generator(
         trained: The settings of the student's run; for a base, `cfg`.
 
     Raises:
-        UserError: The base is not the one that the student was trained on, no server responds, or
-            the servers do not serve `server.model`, or serve different models under this name.
+        UserError: The weights of the student's local base have changed since the training; no
+            server responds; `server.model` is missing, unknown to the servers or an adapter without
+            its run; or the servers serve different models under this name.
     """
     if cfg.server.url is not None:
         from evaluation.generators.openai_server import ServedModel
@@ -68,22 +69,22 @@ def open_generator(
 
 
 def item_instruction(mode: str, regime: str) -> str:
-    """Return the instruction that ends a prompt in `mode`. `regime` is the training regime, which
-    determines the requested sections of a rationale."""
+    """Return the instruction that ends a prompt in `mode`. The training regime determines which
+    sections of a rationale the instruction requests."""
     return record_instruction() if mode in RECORD_MODES else instruction(mode, regime)
 
 
 def item_sample(
     regime: str,
     frames: FrameReader,
-    cfg: StudentConfig,
+    student: StudentConfig,
     control: str | None,
     mode: str,
     item: SelectionItem,
 ) -> Sample:
     """Return the prompt for `item` in `mode`, with the instruction of the training regime."""
     text = item_instruction(mode, regime)
-    return selection_sample(item, mode, regime, frames, cfg.frames, control=control, text=text)
+    return selection_sample(item, mode, regime, frames, student.frames, control=control, text=text)
 
 
 def response_settings(
@@ -91,12 +92,12 @@ def response_settings(
     regime: str,
     student: StudentConfig,
     seed: int,
-    revision: dict[str, Any],
+    model: dict[str, Any],
     benchmark: str,
     control: str | None,
 ) -> dict[str, Any]:
-    """Return all settings that determine a response in `mode`, apart from the item, query or frame
-    itself."""
+    """Return all settings that determine a response in `mode`, apart from the subject itself.
+    `model` and `benchmark` are the identities of the generator and of the store."""
     sampling: dict[str, Any] = {
         "max_new_tokens": response_token_limit(mode, student.max_new_tokens, student.thinking),
         "thinking": student.thinking,
@@ -105,7 +106,7 @@ def response_settings(
     if student.temperature:
         sampling |= {"top_p": student.top_p, "top_k": student.top_k, "seed": seed}
     return {
-        "model": revision,
+        "model": model,
         "benchmark": benchmark,
         "control": control,
         "prompt": item_instruction(mode, regime),

@@ -1,4 +1,4 @@
-"""A model that is loaded on this machine and responds in batches."""
+"""A generator whose model is loaded in this process."""
 
 from __future__ import annotations
 
@@ -33,10 +33,9 @@ from models.trained_runs import product_folder, run_title
 
 
 class LocalModel:
-    """A generator: the student of a run or an export in `folder`, or the base without a folder.
+    """A generator: the student of the run or export in `folder`, or a base if `folder` is None.
 
-    The model is loaded at the first response, so that a run whose responses are all in its log
-    needs no memory for it.
+    The model is loaded for the first response. A run whose log is complete does not load it.
     """
 
     def __init__(
@@ -55,7 +54,7 @@ class LocalModel:
         self._batch, self._seed = cfg.batch, cfg.seed
         self.name = run_title(folder) if folder else f"{student.name} base"
         base = model_id(student.model, student.revision)
-        self.revision: dict[str, Any] = {
+        self.identity: dict[str, Any] = {
             "weights": weights_digest(base, self._weights),
             "processor": processor_digest(self._weights or base),
             "revision": student.revision,
@@ -63,11 +62,11 @@ class LocalModel:
             "precision": precision,
         }
         if student.architecture is not None and folder is None:
-            self.revision["architecture"] = asdict(student.architecture)
+            self.identity["architecture"] = asdict(student.architecture)
 
     @cached_property
     def loaded(self) -> tuple[nn.Module, ProcessorMixin]:
-        """The model and its processor."""
+        """The model and its processor, which the first access loads."""
         keep_freed_memory()
         if self._weights is not None:
             return loading.load_trained(self._student, self._precision, self._weights)
@@ -77,43 +76,44 @@ class LocalModel:
     def respond(
         self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
     ) -> None:
-        """Respond to a batch of subjects at a time.
+        """Generate the responses in batches.
 
-        In constrained mode the tokens are restricted to those of a valid record.
+        In constrained mode, a grammar restricts the tokens to those of a valid record.
         """
-        (model, processor), cfg = self.loaded, self._student
-        collator = Collator(processor, cfg.max_length, cfg.thinking)
-        limit = response_token_limit(mode, cfg.max_new_tokens, cfg.thinking)
+        (model, processor), student = self.loaded, self._student
+        collator = Collator(processor, student.max_length, student.thinking)
+        limit = response_token_limit(mode, student.max_new_tokens, student.thinking)
         grammar = compile_record_grammar(model, processor) if mode == "constrained" else None
-        for group in batched(subjects, self._batch):
-            steps = sampling_processors(cfg, [response_seed(self._seed, s, mode) for s in group])
+        for batch in batched(subjects, self._batch):
+            seeds = [response_seed(self._seed, subject, mode) for subject in batch]
+            steps = sampling_processors(student, seeds)
             if grammar is not None:
                 # The grammar comes first, so that tokens are sampled from those that it allows.
                 steps.insert(0, LogitsProcessor(grammar))
-            inputs = collator([sample_of(subject) for subject in group])
+            inputs = collator([sample_of(subject) for subject in batch])
             with explain_out_of_memory(
-                f"with {len(group)} items in a batch", "lower batch, in a separate run (run=NAME)"
+                f"with {len(batch)} prompts in a batch", "lower batch, in a separate run (run=NAME)"
             ):
                 texts = generate(model, processor, inputs, limit, self._precision, steps)
             if grammar is not None:
-                # A response that is a record from its first token on holds no thought.
+                # `generate` adds the tag of the prompt, but the grammar has allowed no thought.
                 texts = [replace(t, text=t.text.removeprefix(THOUGHT_TAG)) for t in texts]
-            save(list(zip(group, texts, strict=True)))
+            save(list(zip(batch, texts, strict=True)))
 
 
 def compile_record_grammar(model: nn.Module, processor: ProcessorMixin) -> xgrammar.CompiledGrammar:
-    """Compile the record's JSON schema over a model's tokens.
+    """Compile the record's JSON schema to a grammar over a model's tokens.
 
-    Each batch needs its own `LogitsProcessor`, which keeps the state of its responses.
+    Each batch needs its own `LogitsProcessor`, which holds the state of its responses.
     """
     tokenizer = processor.tokenizer
     tokens = xgrammar.TokenizerInfo.from_huggingface(
         tokenizer,
         vocab_size=model.config.get_text_config().vocab_size,
-        # Both end a response, so the grammar must not allow them inside a string.
+        # Both tokens end a response, so the grammar must not allow them inside a string.
         stop_token_ids=[tokenizer.eos_token_id, tokenizer.pad_token_id],
     )
-    # Free whitespace would let a model write spaces until the token limit.
+    # With arbitrary white space, a model could write spaces until the token limit.
     return xgrammar.GrammarCompiler(tokens).compile_json_schema(
         json.dumps(schema()), any_whitespace=False
     )

@@ -1,4 +1,4 @@
-"""A model on OpenAI-compatible servers, prompted with frames over HTTP."""
+"""A generator whose model runs on OpenAI-compatible servers, which receive the frames over HTTP."""
 
 from __future__ import annotations
 
@@ -36,19 +36,20 @@ from teacher.servers.server import (
 log = logging.getLogger(__name__)
 
 CANARY_SIZE = 64
-"""Edge in px of the blank frames of a canary request."""
+"""Width and height (px) of the blank frames of a canary: a request that any working server answers,
+sent after a failure to find out whether the server or the failed request is at fault."""
 
 
 class ServedModel:
-    """A generator on servers: the student of a run or an export in `folder`, or a base."""
+    """A generator on servers: the student of a run or export in `folder`, or a base without one."""
 
     def __init__(
         self, cfg: SelectCommand | TwoStageCommand, folder: Path | None, student: StudentConfig
     ) -> None:
         if folder is not None and cfg.server.model is None:
             raise UserError(
-                f"model={folder} is measured at server.url: set server.model=NAME to the server's "
-                "name of that student, so that the responses are not those of its base",
+                f"model={folder} is to be measured at server.url: set server.model=NAME, the name "
+                "under which the server serves this student; by default its base would respond",
                 code="missing-server-model",
             )
         self._student, self._seed = student, cfg.seed
@@ -58,28 +59,27 @@ class ServedModel:
         if folder is None and origin["parent"]:
             raise UserError(
                 f"server.model={self._server.model} is an adapter over {origin['parent']}: set "
-                "model=RUN, the run that trained it, so that it gets the prompt that it was "
-                "trained on",
+                "model=RUN, the run that trained it, so that its prompts are those of the training",
                 code="adapter-without-run",
             )
         if origin["parent"] and student.quantization == "nf4":
             log.warning(
-                "%s serves the adapters of %s over an unquantised base, but they were trained over "
-                "NF4: its responses differ from those of the student and of its merged export "
-                "(python -m train.export)",
-                self._server.model,
+                "the adapters of %s were trained over a base in NF4: if the server has loaded the "
+                "base unquantised, as python -m teacher.serve does, the responses differ from "
+                "those of the student and of its merged export (python -m train.export)",
                 folder,
             )
         weights = product_folder(folder, "student") if folder else None
         source = origin["parent"] or origin["root"]
         if source is None or not Path(source).is_dir():
             log.info(
-                "the server identifies %s only by name (%s): when that name gets other weights, "
-                "set student.revision=COMMIT, or the earlier responses are reused",
+                "the weights that the server calls %s are not in a folder of this machine, and "
+                "cannot be compared: when the server gets other weights under this name, %s, or "
+                "the responses of the earlier weights are reused",
                 self._server.model,
-                source,
+                "serve them under another name" if folder else "set student.revision=COMMIT",
             )
-        self.revision: dict[str, Any] = {
+        self.identity: dict[str, Any] = {
             "served": self._server.model,
             **origin,
             "revision": student.revision,
@@ -90,38 +90,38 @@ class ServedModel:
     def respond(
         self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
     ) -> None:
-        """Respond to `server.concurrency` subjects at a time."""
+        """Generate the responses with `server.concurrency` requests at a time."""
         asyncio.run(self._respond(mode, sample_of, subjects, save))
 
     async def _respond(
         self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
     ) -> None:
-        cfg, server = self._student, self._server
+        student, server = self._student, self._server
         loop = asyncio.get_running_loop()
-        # A response that is a record from its first token on holds no thought.
-        starts_in_thought = cfg.thinking and mode != "constrained"
+        # The JSON schema allows no thought before the record.
+        starts_in_thought = student.thinking and mode != "constrained"
         # The frame cache is not thread-safe, so one thread prepares all samples.
         with ThreadPoolExecutor(1) as preparer:
 
             def prepare(subject: Subject) -> tuple[Messages, RequestFields]:
                 sample = sample_of(subject)
-                return build_messages(sample), request_fields(cfg, mode, sample.clip)
+                return build_messages(sample), request_fields(student, mode, sample.clip)
 
             first = await loop.run_in_executor(preparer, sample_of, subjects[0])
             canary = build_messages(blank_sample(first))
-            async with ServerPool(server, request_fields(cfg, mode, first.clip), canary) as pool:
+            shared_fields = request_fields(student, mode, first.clip)
+            async with ServerPool(server, shared_fields, canary) as pool:
 
                 async def respond(subject: Subject) -> None:
                     messages, fields = await loop.run_in_executor(preparer, prepare, subject)
-                    if cfg.temperature:
+                    if student.temperature:
                         fields["seed"] = response_seed(self._seed, subject, mode)
                     try:
                         [response] = await pool.complete(messages, **fields)
                     except NoResponseError as error:
                         raise UserError(
-                            f"{server.model} has no response to {subject.name} ({error}): correct "
-                            "that and run the same command again; it resumes after the responses "
-                            "in its log",
+                            f"{server.model} gave no response to {subject.name} ({error}): correct "
+                            "the cause and run the same command again, which resumes",
                             code="no-response",
                         ) from error
                     save([(subject, restore_thought(response, starts_in_thought))])
@@ -130,9 +130,9 @@ class ServedModel:
 
 
 def build_messages(sample: Sample) -> Messages:
-    """Return a sample as messages of the API, with its frames as embedded PNGs.
+    """Return a sample as the messages of a chat request, with its frames as PNGs in base64.
 
-    A clip becomes vLLM's sequence of images; its timestamps go into the request.
+    A clip becomes a video in vLLM's format, whose times `request_fields` contains.
     """
     images = iter(sample.images)
     parts: list[dict[str, Any]] = []
@@ -156,23 +156,24 @@ def _encode_png(pixels: np.ndarray) -> str:
 
 
 def blank_sample(sample: Sample) -> Sample:
-    """Return a sample of the same form with blank frames."""
+    """Return a sample with the same text and number of frames, but with small blank frames."""
     blank = np.zeros((CANARY_SIZE, CANARY_SIZE, 3), np.uint8)
     clip = sample.clip and replace(sample.clip, pixels=np.stack([blank] * len(sample.clip.indices)))
     return replace(sample, clip=clip, images=[blank] * len(sample.images))
 
 
-def request_fields(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestFields:
+def request_fields(student: StudentConfig, mode: str, clip: Clip | None) -> RequestFields:
     """Return the fields of a request besides its messages: sampling, schema and preprocessing.
 
-    Frames are neither sampled again nor resized, as with a local model.
+    The server keeps all frames of a clip, and resizes a frame only to the nearest size on the grid
+    of the vision tower, as a local model does (see `models.loading.pin_sizes`).
     """
-    # With these bounds a frame is neither enlarged nor shrunk, as with a local model.
-    most = 2 * cfg.image_size**2
-    images = {"size": {"shortest_edge": 1, "longest_edge": most}}
-    videos = {"size": {"shortest_edge": 1, "longest_edge": most * cfg.frames}}
+    # Both edges are numbers of pixels.
+    max_pixels = 2 * student.image_size**2
+    images = {"size": {"shortest_edge": 1, "longest_edge": max_pixels}}
+    videos = {"size": {"shortest_edge": 1, "longest_edge": max_pixels * student.frames}}
     extra: dict[str, Any] = {
-        "chat_template_kwargs": {"enable_thinking": cfg.thinking},
+        "chat_template_kwargs": {"enable_thinking": student.thinking},
         "mm_processor_kwargs": {
             "images_kwargs": images,
             "videos_kwargs": {**videos, "do_sample_frames": False},
@@ -180,13 +181,13 @@ def request_fields(cfg: StudentConfig, mode: str, clip: Clip | None) -> RequestF
     }
     if clip:
         extra["media_io_kwargs"] = {"video": {"num_frames": -1, **clip.metadata}}
-    if cfg.temperature:
-        # Without top_k a server uses that of the model's generation_config.json.
-        extra["top_k"] = cfg.top_k or -1
+    if student.temperature:
+        # -1 sets no limit. Without this field, the model's generation_config.json sets the limit.
+        extra["top_k"] = student.top_k or -1
     request = {
-        "temperature": cfg.temperature,
-        "top_p": cfg.top_p,
-        "max_tokens": response_token_limit(mode, cfg.max_new_tokens, cfg.thinking),
+        "temperature": student.temperature,
+        "top_p": student.top_p,
+        "max_tokens": response_token_limit(mode, student.max_new_tokens, student.thinking),
         "extra_body": extra,
     }
     if mode == "constrained":
@@ -199,8 +200,8 @@ def restore_thought(response: Response, starts_in_thought: bool) -> GeneratedTex
     """Return a response's text with its thought inside `<think>` tags.
 
     Args:
-        starts_in_thought: Whether the prompt ends with `<think>`, so that the response lacks this
-            tag, which a server's reasoning parser removes as well.
+        starts_in_thought: Whether the prompt ends with `<think>`. The response then lacks this tag.
+            A response that a server's reasoning parser has split lacks it as well.
     """
     text = response.text
     if response.reasoning:
@@ -211,11 +212,15 @@ def restore_thought(response: Response, starts_in_thought: bool) -> GeneratedTex
 
 
 def served_origin(server: ServerConfig) -> dict[str, str | None]:
-    """Ask the servers for the `root` path of `server.model` and of the `parent` that it adapts.
+    """Ask the servers where the weights of `server.model` come from, by vLLM's /v1/models.
+
+    Returns:
+        `root`: the folder or hub name of the model or adapter. `parent`: the root of the base of an
+        adapter. A value that the servers do not report is None.
 
     Raises:
-        UserError: No server responds, one lacks the model or rejects the key, or two serve
-            different models by this name.
+        UserError: No server responds, one lacks the model or rejects the API key, or two serve
+            different models under this name.
     """
     problems, origins = [], {}
     for url in server.urls:
@@ -246,7 +251,7 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
     first, origin = next(iter(origins.items()))
     if others := [url for url, other in origins.items() if other != origin]:
         raise UserError(
-            f"server.url: {first} and {others[0]} serve different models by the name "
+            f"server.url: {first} and {others[0]} serve different models under the name "
             f"{server.model}: list servers of one model",
             code="different-models",
         )

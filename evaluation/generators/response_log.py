@@ -1,4 +1,4 @@
-"""Collect a model's responses in an append-only file, from which a killed evaluation resumes."""
+"""Collect a model's responses in an append-only file, so that a killed evaluation can resume."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from models.student.generation import GeneratedText
 from models.student.prompts import Sample
 
 Subject = SelectionItem | RetrievalQuery | FrameRef
-"""The item, query or frame that a response is about."""
+"""The item, query or frame that a prompt is about."""
 SampleOf = Callable[[Subject], Sample]
 """Returns the prompt for a subject."""
 SaveResponses = Callable[[list[tuple[Subject, GeneratedText]]], None]
-"""Saves finished responses: those of a batch, or a single one of a server."""
+"""Saves finished responses: all responses of a local batch, or one response of a server."""
 Respond = Callable[[list[Subject], SaveResponses], None]
-"""Generates and saves the responses to subjects."""
+"""Generates the responses to subjects and saves them."""
 
 RECORD_MODES = ("record", "constrained")
-"""Modes that request the structured record."""
+"""Modes in which the prompt requests the structured record of `response_schema`."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class Answer(ModelResponse):
 
 
 def score_response(subject: Subject, mode: str, generated: GeneratedText) -> ModelResponse:
-    """Return a response. If the subject is an item, parse the letter and compare it with the
-    correct one."""
+    """Return the response to a subject. If the subject is a selection item, the letter is parsed
+    and compared with the correct one."""
     text, cut = generated.text, generated.cut
     if not isinstance(subject, SelectionItem):
         return ModelResponse(subject.name, mode, text, cut)
@@ -84,14 +84,14 @@ def score_response(subject: Subject, mode: str, generated: GeneratedText) -> Mod
 
 
 class ResponseLog:
-    """A JSON Lines file of responses. Each response has the hash of its mode's settings, its key.
+    """A JSON Lines file of responses.
 
-    One line per mode records the settings and their key. Responses with other keys stay in the file
-    and are not used. The text of a response is parsed and scored again when it is read.
+    A response is stored with a key: the hash of its mode and of the settings that it depends on. A
+    line with the field `asked` records these settings for each key. Responses with other keys stay
+    in the file and are not used. Texts are parsed and scored again when they are read.
 
     Args:
-        settings: For each mode, all that its responses depend on except the subject; see
-            `evaluation.generators.base.response_settings`.
+        settings: By mode, what `evaluation.generators.base.response_settings` returns.
         subjects: Subjects whose responses are read.
     """
 
@@ -114,8 +114,7 @@ class ResponseLog:
         self._write([*([""] if is_incomplete else []), *map(json.dumps, headers)])
 
     def add_from(self, others: Iterable[Path]) -> int:
-        """Copy missing responses from other logs if their keys match. Return how many were
-        copied."""
+        """Copy the responses with matching keys that are only in other logs; return their count."""
         before = len(self.responses)
         for path in others:
             found = self._score(read_json_lines(path))
@@ -123,8 +122,8 @@ class ResponseLog:
         return len(self.responses) - before
 
     def _score(self, rows: Iterable[dict[str, Any]]) -> dict[tuple[str, str], ModelResponse]:
-        """Return the scored responses to this log's subjects with this log's keys, by (subject,
-        mode). Damaged rows are skipped."""
+        """Score the rows that hold responses to this log's subjects with this log's keys. Return
+        them by (name of the subject, mode). Damaged rows are skipped."""
         responses = {}
         for row in rows:
             try:
@@ -141,7 +140,7 @@ class ResponseLog:
         self.responses |= {(r.item_id, r.mode): r for r in responses}
 
     def _write(self, lines: list[str]) -> None:
-        """Append lines durably: they survive a crash of the machine."""
+        """Append lines and flush them to the disk, so that they survive a crash of the machine."""
         with open(self._path, "a", encoding="utf-8") as file:
             file.writelines(f"{line}\n" for line in lines)
             file.flush()
@@ -152,7 +151,7 @@ def collect_responses(
     subjects: Sequence[Subject], mode: str, respond: Respond, log: ResponseLog, unit: str = "item"
 ) -> list[ModelResponse]:
     """Generate the responses that are missing from the log, and return the response to each
-    subject. `unit` is the unit of the progress bar."""
+    subject. `unit` is what the progress bar counts."""
     missing = [s for s in subjects if (s.name, mode) not in log.responses]
     done = len(subjects) - len(missing)
     with tqdm(total=len(subjects), initial=done, desc=mode, unit=unit) as bar:
@@ -167,6 +166,6 @@ def collect_responses(
 
 
 def response_seed(seed: int, subject: Subject, mode: str) -> int:
-    """Return the 32-bit sampling seed of a response, independent of the batch that it is in."""
+    """Return the 32-bit sampling seed of a response. It does not depend on the batch."""
     digest = hashlib.sha256(f"{seed} {mode} {subject.name}".encode()).digest()
     return int.from_bytes(digest[:4], "big")

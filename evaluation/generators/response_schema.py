@@ -1,6 +1,6 @@
-"""The structured record of a response: its prompt, its JSON schema, and how it is read.
+"""The structured record of a response: its instruction, its JSON schema and its parser.
 
-Only the forced choice is scored. The other fields reveal refusals, hedges and ties.
+Only the forced choice is scored. The confidence is compared with the accuracy.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from data.records import LETTERS
 from models.student.answer_parser import parse_choice
 
 AMBIGUITY = ("none", "some", "high")
-"""How hard the candidates are to distinguish."""
-SHORT, LONG = 200, 400
-"""Maximum characters of a candidate's rationale and of the justification: a record fits in the 512
-new tokens of a response."""
+"""Values of `ambiguity`: how hard the candidates are to distinguish."""
+MAX_RATIONALE, MAX_JUSTIFICATION = 200, 400
+"""Maximum characters of a candidate's rationale and of the justification. A record of this length
+fits in 512 tokens, the default of `student.max_new_tokens`."""
 FIELDS = {
     "forced_choice": "the letter of the one candidate that you choose, however unsure you are",
     "confidence": "how sure you are that it is right, a number from 0 to 1",
@@ -29,7 +29,7 @@ FIELDS = {
     "rationales": "an object that gives each of the letters one short sentence for or against it",
     "justification": "one or two sentences on why you choose as you do",
 }
-"""Fields and their instructions, in the order of the record."""
+"""The fields of a record, in order, with the meaning that the instruction gives them."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Record:
 
 
 def instruction() -> str:
-    """Return the instruction of the record modes."""
+    """Return the instruction that requests a record."""
     fields = "\n".join(f'"{name}": {meaning}' for name, meaning in FIELDS.items())
     return (
         f"Reply with one JSON object and nothing else. It has these keys, in this order:\n{fields}"
@@ -57,17 +57,17 @@ def instruction() -> str:
 
 
 def schema(bound: bool = True) -> dict[str, Any]:
-    """Return the record's JSON schema; `bound` limits the length of its texts."""
+    """Return the record's JSON schema. If `bound` is true, it limits the length of the texts."""
     letter = {"enum": list(LETTERS)}
-    share = {"type": "number", "minimum": 0, "maximum": 1}
+    probability = {"type": "number", "minimum": 0, "maximum": 1}
     properties = {
         "forced_choice": letter,
-        "confidence": share,
-        "distribution": _object(dict.fromkeys(LETTERS, share)),
+        "confidence": probability,
+        "distribution": _object(dict.fromkeys(LETTERS, probability)),
         "second_choice": letter,
         "ambiguity": {"enum": list(AMBIGUITY)},
-        "rationales": _object(dict.fromkeys(LETTERS, _text(bound and SHORT))),
-        "justification": _text(bound and LONG),
+        "rationales": _object(dict.fromkeys(LETTERS, _text(bound and MAX_RATIONALE))),
+        "justification": _text(bound and MAX_JUSTIFICATION),
     }
     return _object(properties)
 
@@ -81,15 +81,15 @@ def _object(properties: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _text(most: int) -> dict[str, Any]:
-    return {"type": "string", "maxLength": most} if most else {"type": "string"}
+def _text(max_length: int) -> dict[str, Any]:
+    return {"type": "string", "maxLength": max_length} if max_length else {"type": "string"}
 
 
 def read_record(raw: str) -> Record | None:
-    """Return the record in a response, or None unless it is valid.
+    """Return the record in a response, or None if the response has no valid record.
 
-    It must be the only record with a choice, be JSON that the schema accepts, and name one letter.
-    Text around it is ignored.
+    A valid record is JSON that the schema accepts, with texts of any length. It must be the only
+    record with a choice in the response. The text around it is ignored.
     """
     answer = parse_choice(raw)
     if answer.record is None or answer.letter is None:
@@ -102,11 +102,11 @@ def read_record(raw: str) -> Record | None:
 
 
 def _refuse_constant(word: str) -> float:
-    """Python reads NaN and Infinity, which are not JSON."""
+    """Refuse NaN and Infinity, which Python's parser accepts although they are not JSON."""
     raise ValueError(f"{word} is not JSON")
 
 
 @cache
 def _validator() -> Draft202012Validator:
-    # The prompt names no length limit, so a response may exceed it.
+    # The instruction names no length limits, so a valid record may exceed them.
     return Draft202012Validator(schema(bound=False))

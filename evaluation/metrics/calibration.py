@@ -1,4 +1,4 @@
-"""Calibration of reported confidences, and preference for a letter."""
+"""Calibration of the confidences that models report, and their preference for letters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from data.records import LETTERS
 
 BINS = 10
-"""Confidence bins of equal width."""
+"""Number of confidence bins, which have equal width."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class Calibration:
     Attributes:
         confidence: Mean confidence.
         accuracy: Share of correct answers.
-        ece: Expected calibration error, the mean difference between confidence and accuracy in each
-            bin, weighted by its answers.
-        brier: Brier score, the mean squared difference over the answers.
+        ece: Expected calibration error: the absolute difference between mean confidence and
+            accuracy in a bin, averaged over the bins with their numbers of answers as weights.
+        brier: Brier score: the mean squared difference between confidence and correctness.
     """
 
     confidence: float
@@ -35,7 +35,8 @@ class Calibration:
 def measure_calibration(
     confidence: Sequence[float], correct: Sequence[float]
 ) -> Calibration | None:
-    """Compare confidences from 0 to 1 with correctness from 0 to 1; None without answers."""
+    """Compare the confidence in each answer, from 0 to 1, with its correctness: 1 for a correct
+    answer, 0 for a wrong one. Return None if there are no answers."""
     confidence, correct = np.asarray(confidence, float), np.asarray(correct, float)
     if not len(confidence):
         return None
@@ -50,7 +51,8 @@ def measure_calibration(
 
 @dataclass(frozen=True)
 class PositionBias:
-    """How often each letter was chosen, was correct, and was chosen where it was correct."""
+    """Numbers of items by letter: items for which a model chose the letter (`chosen`), items whose
+    correct letter it is (`right`), and items for which both are true (`hits`)."""
 
     chosen: dict[str, int]
     right: dict[str, int]
@@ -58,7 +60,7 @@ class PositionBias:
 
 
 def measure_position_bias(chosen: Sequence[str | None], right: Sequence[str]) -> PositionBias:
-    """Compare a model's letters, None for items without one, with the correct letters."""
+    """Compare the letters that a model chose, or None, with the correct letters (`right`)."""
     hits = [c for c, r in zip(chosen, right, strict=True) if c == r]
     counts = ({x: list(letters).count(x) for x in LETTERS} for letters in (chosen, right, hits))
     return PositionBias(*counts)

@@ -1,4 +1,4 @@
-"""95% intervals of shares, means and medians."""
+"""95% confidence intervals of means and medians."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Interval:
-    """A measure of `n` items, such as an accuracy, with its 95% interval."""
+    """A statistic of `n` items, such as their accuracy, with its 95% confidence interval."""
 
     value: float
     low: float
@@ -28,10 +28,11 @@ def mean_with_wilson(values: np.ndarray) -> Interval:
 
 
 class SceneBootstrap:
-    """95% percentile intervals of means and medians, by resampling whole scenes.
+    """95% percentile bootstrap intervals, in which scenes are resampled with all of their items.
 
-    Items of one scene share its video, so resampling items would make the intervals too narrow. The
-    resamples are stored as counts per item and serve many measures of the same items.
+    The items of a scene share its video, so resampling single items would give intervals that are
+    too narrow. The resamples are drawn once and reused for every statistic of the items. Each is
+    stored as the number of times that it contains each item.
     """
 
     def __init__(self, scenes: Sequence[str], seed: int, resamples: int = 2000) -> None:
@@ -44,22 +45,22 @@ class SceneBootstrap:
         self._counts = scene_counts.astype(np.int32)[:, codes]
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """Return the interval (2,), low and high, of the mean of values (items,)."""
+        """Return the interval of the mean of `values` (items,), as an array [low, high]."""
         return _percentiles(self._counts @ values / self._counts.sum(1))
 
     def median(self, values: np.ndarray) -> np.ndarray:
-        """Return the interval (2,) of the median of values (items,)."""
+        """Return the interval [low, high] of the median of `values` (items,)."""
         order = np.argsort(values, kind="stable")
         cumulative = np.cumsum(self._counts[:, order], axis=1, dtype=np.int32)
         total = cumulative[:, -1:]
         # The median of an even number of items is the mean of the middle two.
-        middle = [(cumulative > place).argmax(1) for place in ((total - 1) // 2, total // 2)]
+        middle = [(cumulative > index).argmax(1) for index in ((total - 1) // 2, total // 2)]
         return _percentiles(np.asarray(values, float)[order][middle].mean(0))
 
     def macro(self, values: np.ndarray, groups: Sequence[str]) -> np.ndarray:
-        """Return the interval (2,) of the mean of the groups' means of values (items,).
+        """Return the interval [low, high] of the unweighted mean of the groups' means of `values`.
 
-        A resample without items of a group averages the other groups.
+        If a resample has no item of a group, its mean is over the other groups.
         """
         _, codes = np.unique(np.asarray(groups), return_inverse=True)
         member = np.eye(codes.max() + 1)[codes]
@@ -71,14 +72,13 @@ class SceneBootstrap:
 def macro_by_scene(
     values: Sequence[float], groups: Sequence[str], scenes: Sequence[str], seed: int
 ) -> Interval:
-    """Return the plain mean of the groups' means, with its interval from `SceneBootstrap`.
-
-    Credits by family give a macro accuracy, differences of credits the difference of two macro
-    accuracies, and a single group its mean.
+    """Return the unweighted mean of the groups' means, with its interval from `SceneBootstrap`.
 
     Args:
-        values: One number per item.
-        groups, scenes: One name per item.
+        values: A number for each item. Credits (see `accuracy_by_group`) give a macro accuracy;
+            differences of credits give the difference between two macro accuracies.
+        groups: The name of each item's group, such as its family.
+        scenes: The name of each item's scene.
     """
     values, groups = np.asarray(values, float), np.asarray(groups)
     low, high = SceneBootstrap(scenes, seed).macro(values, groups)

@@ -1,8 +1,8 @@
-"""Recall, reciprocal rank and median rank of each query's target, with ties counted fairly.
+"""Recall, reciprocal rank and rank of each query's target.
 
-Every measure follows from two counts per query: the frames that score above the target, and the
-other frames that score exactly as it does. A tie counts as its mean over all orders of the tied
-frames, so that a constant scorer has chance accuracy.
+Every measure follows from two counts per query: the number of frames that score above the target,
+and the number of other frames with exactly the target's score. If frames tie with the target, a
+measure is its mean over all orders of these frames, so that constant scores give chance accuracy.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ import numpy as np
 from scipy.special import digamma
 
 
-def target_scores(scores: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return each query's score of its target as fp32 (queries,).
+def target_scores(scores: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the score of each query's target as fp32 (queries,).
 
     Args:
         scores: (queries, frames).
-        targets: (queries,) columns.
+        columns: (queries,) the column of each query's target.
     """
-    return np.asarray(scores, np.float32)[np.arange(len(targets)), targets]
+    return np.asarray(scores, np.float32)[np.arange(len(columns)), columns]
 
 
 def count_above_and_equal(scores: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count the columns that score above, and exactly as, each query's target.
+    """Count, for each query, the frames that score above its target and those with an equal score.
 
-    Counts of blocks of columns add up to those of the whole matrix. Over all columns, the second
-    count includes the target itself. NaN is neither above nor equal.
+    The counts of several blocks of columns can be added. The target's own column counts as equal.
+    NaN is neither above nor equal.
 
     Args:
-        scores: (queries, frames), a block of any width.
-        targets: (queries,) scores from `target_scores`. They must come from the same product as
-            `scores`: a score that is computed separately can differ in its last bit, and then
-            ties with nothing or loses to itself.
+        scores: (queries, frames), all columns of the score matrix or a block of them.
+        targets: (queries,) the score of each query's target, as `target_scores` returns it. It must
+            come from the same matrix product as `scores`: a score that is computed separately can
+            differ in its last bit, and then the target would not be equal to itself.
 
     Returns:
-        Two integer arrays (queries,).
+        Two integer arrays (queries,): above and equal.
     """
     scores = np.asarray(scores, np.float32)
     targets = np.asarray(targets, np.float32)[:, None]
@@ -44,10 +44,11 @@ def count_above_and_equal(scores: np.ndarray, targets: np.ndarray) -> tuple[np.n
 
 
 def expected_hits(greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, k: int) -> np.ndarray:
-    """Return each query's probability (queries,) to rank among the first `k` under random ties.
+    """Return the probability (queries,) that a query's target ranks among the first `k` frames if
+    ties are broken at random.
 
-    With k = 1 this is the credit of a similarity scorer on a selection item: 1/m if the target is
-    one of m maxima.
+    With k = 1 this is the credit of a retriever on a selection item: 1/m if the target is one of m
+    candidates with the highest score. The other arguments are those of `query_metrics`.
     """
     hits = np.clip((k - np.asarray(greater)) / (np.asarray(tied) + 1), 0, 1)
     return np.where(valid, hits, 0.0)
@@ -56,21 +57,23 @@ def expected_hits(greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, k: i
 def query_metrics(
     greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
 ) -> dict[str, np.ndarray]:
-    """Return each query's measures (queries,) by name.
+    """Return the measures of each query by name.
 
     Args:
-        greater, tied: (queries,) counts of frames above the target and of others tied with it.
-        valid: (queries,) False for a miss: a query without a response or with a NaN target score.
-            It has no hit, a reciprocal rank of 0 and the last rank, `frames`.
-        frames: Size of the database.
+        greater, tied: (queries,) numbers of frames that score above the target, and of other frames
+            with the target's score.
+        valid: (queries,) False for a query without a response or with a NaN target score. Such a
+            query has recall 0, reciprocal rank 0 and the last rank, `frames`.
+        frames: Number of frames in the database.
         ks: Cut-offs of the recalls.
 
     Returns:
-        `recall@k` for each k, `mrr`, `median_rank` (1 is best; ties count half) and `tie_rate`,
-        whether the target ties with another frame.
+        Arrays (queries,): `recall@k` for each k; the reciprocal rank `mrr`; the target's rank
+        `median_rank` (reports give its median), to which each tied frame adds one half; and
+        `tie_rate`, 1 if another frame ties with the target.
     """
     greater, tied, valid = np.asarray(greater), np.asarray(tied), np.asarray(valid, bool)
-    # The mean of 1/rank over the tied ranks is a difference of harmonic numbers.
+    # The sum of 1/rank over the tied ranks is a difference of harmonic numbers.
     harmonic = digamma(greater + tied + 2) - digamma(greater + 1)
     return {
         **{f"recall@{k}": expected_hits(greater, tied, valid, k) for k in ks},

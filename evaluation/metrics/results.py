@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 RECALLS = (1, 10, 50)
 """Cut-offs of the reported recalls."""
 COMPARED = (*(f"recall@{k}" for k in RECALLS), "mrr")
-"""Measures of the differences between retrievers."""
+"""Measures by which retrievers are compared."""
 MEASURES = (*COMPARED, "median_rank", "tie_rate")
 UNTRAINED = "untrained"
-"""Prefix of the names of Qwen3-VL retrievers that this project has not trained."""
+"""First word of the names of Qwen3-VL retrievers that this project has not trained."""
 SIMILARITY = "similarity"
 """Mode of the results of `evaluation.similarity`: a retriever chooses the nearest candidate."""
 
@@ -32,8 +32,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy of each family that has items, the mean over these families (`macro`) and the
-    accuracy over all items (`micro`)."""
+    """Accuracy of each family that has items; `macro`, the unweighted mean of these accuracies; and
+    `micro`, the accuracy over all items."""
 
     families: dict[str, Interval]
     macro: float
@@ -41,12 +41,12 @@ class Accuracy:
 
 
 def accuracy_by_group(groups: Sequence[str], credits: Sequence[float]) -> dict[str, Interval]:
-    """Return the accuracy of each group of items, in order of name, with Wilson intervals.
+    """Return the accuracy of each group of items with its Wilson interval, sorted by group.
 
     Args:
-        groups: One name per item, such as its family, subtype or horizon.
-        credits: One credit per item, 0 to 1: 1 if correct, 1/m if the target and m - 1 other
-            candidates have the highest score.
+        groups: The name of each item's group, such as its family, subtype or horizon.
+        credits: The credit for each item: 1 for a correct choice, 0 for a wrong choice, and 1/m if
+            a retriever gives the highest score to the target and to m - 1 other candidates.
     """
     groups, credits = np.asarray(groups, str), np.asarray(credits, float)
     return {str(g): mean_with_wilson(credits[groups == g]) for g in np.unique(groups)}
@@ -64,17 +64,18 @@ def accuracy_by_family(families: Sequence[str], credits: Sequence[float]) -> Acc
 class SelectionResult:
     """Accuracy of one model on the selection items of one benchmark, as fractions from 0 to 1.
 
-    Answers that cannot be parsed count as wrong.
+    Responses that cannot be parsed count as wrong.
 
     Attributes:
         mode: Response mode, such as "reasoning"; `SIMILARITY` for a retriever.
+        families, macro, micro: As in `Accuracy`.
         parse_rate: Fraction of the responses in which a letter was found; None for a retriever.
         n: Number of items.
-        macro_interval: 95% interval of `macro`, bootstrapped over scenes.
-        horizons: Accuracy by horizon (time from the prefix to the target), shortest first. Keys
-            are such as "8 frames" (window family) and "1 s" (time family).
-        suite: The suite of the items; None for the standard items.
-        control: The control; None for unchanged items.
+        macro_interval: `macro` with its 95% interval, bootstrapped over scenes.
+        horizons: Accuracy by horizon (time from the prefix to the target), shortest first. Examples
+            of keys are "8 frames" (window family) and "1 s" (time family).
+        suite: The set of items, such as "matched_anchor"; None for the standard items.
+        control: The change of each prefix, such as "shuffled_prefix"; None for unchanged items.
     """
 
     benchmark: str
@@ -96,13 +97,13 @@ class SelectionResult:
 
     @property
     def key(self) -> str:
-        """Key of this result's details in the report: `name` for a retriever, else `variant`."""
+        """Key of the details in `SelectionReport`: `name` for a retriever, otherwise `variant`."""
         return self.name if self.mode == SIMILARITY else self.variant
 
     @property
     def metrics(self) -> dict[str, float]:
         """The accuracies by family, macro and micro."""
-        families = {family: share.value for family, share in self.families.items()}
+        families = {family: interval.value for family, interval in self.families.items()}
         return {**families, "macro": self.macro, "micro": self.micro.value}
 
 
@@ -117,12 +118,13 @@ class SelectionReport:
 
     Attributes:
         build: Hash that identifies the benchmark's build.
-        controls: Comparisons of the unchanged items with each control, and of the event question
-            with the time question of matched-anchor pairs.
+        controls: Comparisons of the unchanged items with each control. For matched-anchor items,
+            also comparisons of the event question with the time question of each pair.
         subtypes, readings, positions, calibration: Details by `SelectionResult.key`. `readings`
-            counts parsed answers, valid records, and the reasons why responses could not be parsed.
-        asked: The mode, the control, and the `key` of the lines in answers.jsonl, for each variant;
-            empty for retrievers.
+            has the numbers of parsed responses, of valid records, and of responses that could not
+            be parsed for each reason.
+        asked: The mode and the control of each variant, and the `key` of its lines in
+            answers.jsonl; empty for retrievers.
     """
 
     build: str
@@ -138,13 +140,14 @@ class SelectionReport:
 @dataclass(frozen=True)
 class RetrievalResult:
     """Measures of one retriever, or of a two-stage pipeline, at one width, with intervals
-    bootstrapped over scenes. Comparisons of results ignore `seconds`.
+    bootstrapped over scenes. Results that differ only in `seconds` are equal.
 
     Attributes:
         width: Embedding width.
-        builder: Number of the queries' builder; None for the queries of all builders.
+        builder: Number of the builder (the procedure that made the queries); None for the queries
+            of all builders.
         bytes: Size of the searched vectors at this width.
-        seconds: Total time to rank the database for all queries at all widths.
+        seconds: Time to rank the database for all queries, at all widths together.
     """
 
     benchmark: str
@@ -205,15 +208,15 @@ def from_json(kind: type[T], value: Any) -> T:
 def retrieval_results(
     benchmark: str, name: str, ranks: Ranks, queries: Sequence[RetrievalQuery], seed: int
 ) -> list[RetrievalResult]:
-    """Return one result per width, widest first, over all queries; then one per width for each
-    builder. `seed` is the seed of the bootstrap over scenes."""
+    """Return a result for each width, widest first: over all queries, then for each builder. `seed`
+    is the seed of the bootstrap over scenes."""
     results = []
     for builder in (None, *sorted({q.builder for q in queries if q.builder})):
-        indices = [k for k, q in enumerate(queries) if builder in (None, q.builder)]
-        scenes = SceneBootstrap([queries[k].scene_id for k in indices], seed)
+        indices = [i for i, q in enumerate(queries) if builder in (None, q.builder)]
+        scenes = SceneBootstrap([queries[i].scene_id for i in indices], seed)
         for k, width in enumerate(ranks.widths):
             per_query = _query_metrics(ranks, k, indices)
-            measures = [_measure(measure, per_query[measure], scenes) for measure in MEASURES]
+            measures = [_summarize(name, per_query[name], scenes) for name in MEASURES]
             sizes = (len(indices), ranks.frames)
             cost = (ranks.vectors * width * np.dtype(np.float32).itemsize, ranks.seconds)
             results.append(
@@ -225,26 +228,26 @@ def retrieval_results(
 def compare_retrievers(
     ranked: Mapping[str, Ranks], queries: Sequence[RetrievalQuery], seed: int
 ) -> list[RetrieverDifference]:
-    """Compare the first retriever with each of the others, at every width. `seed` is the seed of
-    the bootstrap over scenes."""
+    """Compare the first retriever with each of the others, at every width. `ranked` has the ranks
+    by retriever. `seed` is the seed of the bootstrap over scenes."""
     (left, first), *others = ranked.items()
     scenes = SceneBootstrap([q.scene_id for q in queries], seed)
     compared = []
     for right, other in others:
         for k, width in enumerate(first.widths):
             one, two = (_query_metrics(r, k, slice(None)) for r in (first, other))
-            measures = {name: _measure(name, one[name] - two[name], scenes) for name in COMPARED}
+            measures = {name: _summarize(name, one[name] - two[name], scenes) for name in COMPARED}
             compared.append(RetrieverDifference(left, right, width, measures))
     return compared
 
 
 def _query_metrics(ranks: Ranks, k: int, indices: list[int] | slice) -> dict[str, np.ndarray]:
-    """Return the measures of some queries at the k-th width."""
+    """Return the measures of the queries at `indices`, at the k-th width."""
     counts = (ranks.greater[k, indices], ranks.tied[k, indices], ranks.found[indices])
     return query_metrics(*counts, ranks.frames, RECALLS)
 
 
-def _measure(name: str, values: np.ndarray, scenes: SceneBootstrap) -> Interval:
+def _summarize(name: str, values: np.ndarray, scenes: SceneBootstrap) -> Interval:
     median = name == "median_rank"
     low, high = scenes.median(values) if median else scenes.mean(values)
     value = np.median(values) if median else np.mean(values)

@@ -1,4 +1,4 @@
-"""Paired comparison of two runs over the same items."""
+"""Paired comparison of the accuracies of two runs on the same items."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from data.records import FAMILIES, SelectionItem
 from data.tracks.controls import pair_items
 from evaluation.metrics.intervals import macro_by_scene
 
-NAMED = 3
-"""Number of items that the error about different items names."""
+MAX_NAMED_ITEMS = 3
+"""Most items of each run that the error about different items names."""
 
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """Two runs over the same `n` items, called `left` and `right`; all numbers are shares.
+    """The accuracies of two runs, named `left` and `right`, on the same `n` items, as fractions.
 
     Attributes:
-        of: The items: a family's, "macro" for the plain mean of the families, or "all".
-        mode: Mode of both runs, if only one is compared.
-        difference: Left accuracy less right accuracy, with its 95% interval from `low` to `high`
-            by resampling scenes.
-        only_left, only_right: Items that are right on one side only (of ties, those with more
-            credit on that side). None for "macro".
-        p: McNemar's exact test of these two counts. None for "macro".
+        of: What the accuracies are of: a family, "all" items, or "macro", the unweighted mean of
+            the families' accuracies.
+        difference: Left accuracy minus right accuracy.
+        low, high: 95% interval of the difference, bootstrapped over scenes.
+        only_left, only_right: Numbers of items for which only this run is correct. An item with
+            tied candidates counts for the run with more credit. None for "macro".
+        p: p-value of McNemar's exact test of these two numbers. None for "macro".
+        mode: Mode of both runs; empty if their names contain it.
     """
 
     left: str
@@ -53,57 +54,57 @@ def compare_runs(
     names: tuple[str, str],
     seed: int,
 ) -> list[PairedComparison]:
-    """Compare two runs by family and macro, if there are several families, and over all items.
+    """Compare two runs over all items, and by family and macro if there are several families.
 
     Args:
-        left, right: The credit of each item by its id, such as whether it was answered right.
-        names: What the runs are called.
-        seed: Seed of the scene resampling for the intervals.
+        left, right: The credit for each item (1 for a correct choice) by item id.
+        names: The names of the left and of the right run.
+        seed: Seed of the bootstrap over scenes.
 
     Raises:
         UserError: The runs answered different items.
-        KeyError: Neither answered one of `items`.
+        KeyError: Both runs lack one of `items`.
     """
     check_same_items(left, right, names)
     credits = np.array([(left[i.item_id], right[i.item_id]) for i in items], float)
     families = np.array([i.family for i in items])
     scenes = np.array([i.scene_id for i in items])
-    groups = {f: families == f for f in FAMILIES if f in families}
-    groups = {**groups, "macro": slice(None)} if len(groups) > 1 else {}
+    masks = {f: families == f for f in FAMILIES if f in families}
+    masks = {**masks, "macro": slice(None)} if len(masks) > 1 else {}
     compared = [
-        _compare(names, of, credits[kept], families[kept], scenes[kept], seed)
-        for of, kept in groups.items()
+        _compare(names, of, credits[mask], families[mask], scenes[mask], seed)
+        for of, mask in masks.items()
     ]
-    together = np.full(len(items), "all")
-    return [*compared, _compare(names, "all", credits, together, scenes, seed)]
+    one_group = np.full(len(items), "all")
+    return [*compared, _compare(names, "all", credits, one_group, scenes, seed)]
 
 
 def compare_anchors(
     items: Sequence[SelectionItem], credits: Mapping[str, float], seed: int
 ) -> list[PairedComparison]:
-    """Compare the questions of matched-anchor pairs: event (left) with time (right).
+    """Compare the event question (left) with the time question (right) of matched-anchor pairs.
 
-    `credits` has each item's credit by its id.
+    `credits` has the credit for each item by its id.
     """
-    matched = pair_items(items)
-    left = {by_event.item_id: credits[by_event.item_id] for by_event, _ in matched}
-    right = {by_event.item_id: credits[by_time.item_id] for by_event, by_time in matched}
-    return compare_runs([by_event for by_event, _ in matched], left, right, ("event", "time"), seed)
+    pairs = pair_items(items)
+    left = {by_event.item_id: credits[by_event.item_id] for by_event, _ in pairs}
+    right = {by_event.item_id: credits[by_time.item_id] for by_event, by_time in pairs}
+    return compare_runs([by_event for by_event, _ in pairs], left, right, ("event", "time"), seed)
 
 
 def check_same_items(
     left: Mapping[str, Any], right: Mapping[str, Any], names: tuple[str, str]
 ) -> None:
-    """Raise a UserError if two runs, each with its results by item id, answered different items."""
-    extra = (left.keys() - right.keys(), right.keys() - left.keys())
+    """Raise a UserError if two runs, whose results are given by item id, answered other items."""
+    unshared = (left.keys() - right.keys(), right.keys() - left.keys())
     differences = [
-        f"{len(ids)} only in {name} (such as {', '.join(sorted(ids)[:NAMED])})"
-        for name, ids in zip(names, extra, strict=True)
+        f"{len(ids)} only in {name} (such as {', '.join(sorted(ids)[:MAX_NAMED_ITEMS])})"
+        for name, ids in zip(names, unshared, strict=True)
         if ids
     ]
     if differences:
         raise UserError(
-            f"{names[0]} and {names[1]} answered different items, {' and '.join(differences)}: "
+            f"{names[0]} and {names[1]} answered different items ({' and '.join(differences)}): "
             "compare runs of the same benchmark, suite, limit and seed",
             code="different-items",
         )
@@ -127,9 +128,9 @@ def _compare(
 
 
 def _mcnemar(differences: np.ndarray) -> tuple[int, int, float]:
-    """Return the numbers of positive and negative differences, and the test of these counts."""
+    """Return the numbers of positive and of negative differences, and the p-value of their test."""
     # statsmodels takes longer to import than everything else that --help needs.
     from statsmodels.stats.contingency_tables import mcnemar
 
-    above, below = int((differences > 0).sum()), int((differences < 0).sum())
-    return above, below, float(mcnemar([[0, above], [below, 0]], exact=True).pvalue)
+    positive, negative = int((differences > 0).sum()), int((differences < 0).sum())
+    return positive, negative, float(mcnemar([[0, positive], [negative, 0]], exact=True).pvalue)

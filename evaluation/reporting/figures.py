@@ -1,4 +1,4 @@
-"""The figures of evaluations and of the report, written in the format of the file's suffix.
+"""The figures of evaluations and of the report. A file's suffix determines its format.
 
 Figures are built without pyplot, so that they leave no global state and need no display.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
@@ -26,30 +26,30 @@ GRAY = "#999999"
 
 
 def accuracy_figure(
-    shares: Mapping[str, Mapping[str, Interval]], path: Path | str, with_paper: bool = True
+    accuracy: Mapping[str, Mapping[str, Interval]], file: Path | IO[bytes], with_paper: bool = True
 ) -> None:
-    """Plot bars of accuracy (%) with 95% intervals by family or horizon, a color for each model.
+    """Plot accuracies (%) with 95% intervals: groups of bars, in which each model has a color.
 
     Args:
-        shares: Accuracy by label of the model and by family or horizon.
-        with_paper: Whether the paper's CoT student is plotted as diamonds.
+        accuracy: The accuracy of each model, by the model's label and by family or horizon.
+        with_paper: Whether the accuracy of the paper's CoT student are plotted as diamonds.
     """
-    groups = list(dict.fromkeys(group for of_model in shares.values() for group in of_model))
+    groups = list(dict.fromkeys(group for by_group in accuracy.values() for group in by_group))
     figure = empty_figure(8, 4.4)
     axes = figure.add_subplot()
-    width = 0.84 / (len(shares) + 1)
-    for i, (label, of_model) in enumerate(shares.items()):
-        found = [of_model[group] for group in groups if group in of_model]
-        xs = [k + (i - len(shares) / 2) * width for k, g in enumerate(groups) if g in of_model]
-        heights, low, high = 100 * np.array([(s.value, s.low, s.high) for s in found]).T
+    width = 0.84 / (len(accuracy) + 1)
+    for i, (label, by_group) in enumerate(accuracy.items()):
+        bars = [(k, by_group[group]) for k, group in enumerate(groups) if group in by_group]
+        xs = [k + (i - len(accuracy) / 2) * width for k, _ in bars]
+        heights, low, high = 100 * np.array([(a.value, a.low, a.high) for _, a in bars]).T
         color = GRAY if label.startswith(UNTRAINED) else COLORS[i % len(COLORS)]
         axes.bar(xs, heights, width * 0.9, color=color, label=label)
-        middle, reach = (high + low) / 2, (high - low) / 2
-        axes.errorbar(xs, middle, reach, fmt="none", ecolor=INK, capsize=3, elinewidth=1.2)
-    printed = cot_student() if with_paper else {}
-    if places := [k for k, group in enumerate(groups) if group in printed]:
-        xs = [k + len(shares) / 2 * width for k in places]
-        values = [printed[groups[k]] for k in places]
+        middle, half_length = (high + low) / 2, (high - low) / 2
+        axes.errorbar(xs, middle, half_length, fmt="none", ecolor=INK, capsize=3, elinewidth=1.2)
+    paper = cot_student() if with_paper else {}
+    if in_paper := [k for k, group in enumerate(groups) if group in paper]:
+        xs = [k + len(accuracy) / 2 * width for k in in_paper]
+        values = [paper[groups[k]] for k in in_paper]
         axes.scatter(
             xs, values, 60, marker="D", color="#ffffff", edgecolors=INK, linewidths=1.5,
             label=f"paper: {COT_STUDENT}, 8B",
@@ -60,18 +60,18 @@ def accuracy_figure(
     axes.set_yticks(range(0, 101, 25))
     axes.spines[["top", "right"]].set_visible(False)
     _legend_above(figure, axes)
-    figure.savefig(path)
+    figure.savefig(file)
 
 
-def retrieval_figure(results: Iterable[tuple[str, RetrievalResult]], path: Path | str) -> None:
-    """Plot Recall@1, @10 and @50 (%) over the embedding width, with 95% bands.
+def retrieval_figure(rows: Iterable[tuple[str, RetrievalResult]], file: Path | IO[bytes]) -> None:
+    """Plot Recall@1, @10 and @50 (%) over the embedding width, with 95% intervals as bands.
 
     Args:
-        results: Results by name. Only those over all queries at a width are plotted; untrained
-            retrievers are dashed.
+        rows: Names of retrievers, and results. Results for a single builder, and those without a
+            width, are not plotted. The lines of untrained retrievers are dashed.
     """
     lines: dict[str, list[RetrievalResult]] = {}
-    for name, result in results:
+    for name, result in rows:
         if result.width and result.builder is None:
             lines.setdefault(name, []).append(result)
     names = sorted(lines, key=lambda name: (name.startswith(UNTRAINED), name))
@@ -79,10 +79,10 @@ def retrieval_figure(results: Iterable[tuple[str, RetrievalResult]], path: Path 
     panels = figure.subplots(1, len(RECALLS), sharey=True)
     for axes, k in zip(panels, RECALLS, strict=True):
         for i, name in enumerate(names):
-            of_name = sorted(lines[name], key=lambda r: r.width)
-            found = [r.measures[f"recall@{k}"] for r in of_name]
-            value, low, high = 100 * np.array([(f.value, f.low, f.high) for f in found]).T
-            widths, untrained = [r.width for r in of_name], name.startswith(UNTRAINED)
+            by_width = sorted(lines[name], key=lambda r: r.width)
+            recalls = [r.measures[f"recall@{k}"] for r in by_width]
+            value, low, high = 100 * np.array([(r.value, r.low, r.high) for r in recalls]).T
+            widths, untrained = [r.width for r in by_width], name.startswith(UNTRAINED)
             color = GRAY if untrained else COLORS[i % len(COLORS)]
             axes.fill_between(widths, low, high, color=color, alpha=0.14, linewidth=0)
             style = "--o" if untrained else "-o"
@@ -95,12 +95,12 @@ def retrieval_figure(results: Iterable[tuple[str, RetrievalResult]], path: Path 
         axes.grid(axis="y", color=GRID)
     panels[0].set_ylabel("Queries (%)")
     _legend_above(figure, panels[0])
-    figure.savefig(path)
+    figure.savefig(file)
 
 
 def _legend_above(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    # A dollar sign would begin a formula.
+    # Matplotlib would read the text between two dollar signs as a formula.
     labels = [label.replace("$", r"\$") for label in labels]
     figure.legend(
         handles, labels, loc="outside upper left", ncols=2, fontsize=9, frameon=False

@@ -1,4 +1,4 @@
-"""The items that the page shows: their choice, their frames, and the models' responses."""
+"""The items that the page shows, with their frames and the responses of the models."""
 
 from __future__ import annotations
 
@@ -23,20 +23,21 @@ from evaluation.reporting.measurements import Measurement, compare_models, dedup
 from evaluation.reporting.run_responses import ItemResponse, Responses, read_responses
 
 PREFIX_FRAMES = 6
+"""Number of frames of the prefix that are shown, evenly spread."""
 FRAME_WIDTH = 160
-"""Pixels."""
+"""Width of the shown frames, in pixels."""
 WEBP_QUALITY = 70
 
 
 @dataclass
 class ItemBrowser:
-    """The items of the page, and the comparisons of the models' responses to all items.
+    """The items that the page shows, and comparisons of the models over all items.
 
     Attributes:
-        entries: The items, as the page's script reads them.
-        frames: Data URLs of their frames by name.
-        notes: Sentences on the shown and the missing items of each benchmark.
-        comparisons: Paired comparisons by benchmark.
+        entries: The shown items, in the form that page.js reads.
+        frames: Data URLs of the items' frames, by name.
+        notes: Sentences that say which items and frames are shown and which are missing.
+        comparisons: Paired comparisons of models by benchmark.
     """
 
     entries: list[dict[str, Any]] = field(default_factory=list)
@@ -51,15 +52,15 @@ class ItemBrowser:
         limit: int,
         seed: int,
     ) -> None:
-        """Compare the models of a benchmark, and add at most `limit` of its items.
+        """Compare the models that were measured on a benchmark, and add at most `limit` items.
 
         Args:
-            models: Models by label, with their responses.
+            models: The models with their responses, by label.
         """
         suites = (None, MATCHED_ANCHOR)
         items = {i.item_id: i for suite in suites for i in store.selection("test", suite)}
         by_label = {label: responses for label, (_, responses) in models.items()}
-        # Controls are compared by the run that measured them.
+        # The comparisons with controls are in the reports of the runs that measured them.
         unchanged = {label: model for label, model in models.items() if not model[0].variants}
         self.comparisons[store.name] = compare_models(unchanged, items, seed)
         answered = [i for k, i in items.items() if any(k in r for r in by_label.values())]
@@ -69,7 +70,7 @@ class ItemBrowser:
         self.frames |= frames
         self.notes.append(
             f"{store.name}: {len(shown):,} of {len(answered):,} answered items, spread over "
-            "subtypes and over correct and wrong answers; items=N shows another number."
+            "subtypes and over correct and wrong answers. Set items=N to show another number."
         )
         if errors:
             more = f" ({len(errors) - 1:,} more scenes)" if errors[1:] else ""
@@ -79,10 +80,10 @@ class ItemBrowser:
 def browse_items(
     selections: Sequence[Measurement], stores: Path, limit: int, seed: int
 ) -> ItemBrowser:
-    """Return at most `limit` items of each benchmark with responses.
+    """Return at most `limit` items of each measured benchmark in `stores`, with the responses.
 
     Raises:
-        UserError: Two runs measured different items of one benchmark.
+        UserError: Two runs measured different items of the same item set.
     """
     runs = {m.run.folder: m.run for m in selections}
     by_run = {folder: read_responses(run) for folder, run in runs.items()}
@@ -92,7 +93,7 @@ def browse_items(
 
     first: dict[str, Measurement] = {}
     for m in selections:
-        other = first.setdefault(m.items, m)
+        other = first.setdefault(m.item_set, m)
         names = (str(other.run.folder), str(m.run.folder))
         check_same_items(responses_of(other), responses_of(m), names)
     browser, kept = ItemBrowser(), deduplicate(selections)
@@ -105,10 +106,11 @@ def browse_items(
         try:
             store = open_store(stores / name)
         except UserError as error:
-            browser.notes.append(f"The items of {name} cannot be shown: {error} benchmark={name}.")
+            problem = str(error).replace("benchmark=NAME", f"benchmark={name}")
+            browser.notes.append(f"The items of {name} cannot be shown: {problem}.")
             continue
         if any(m.run.report.build != store.identity for m, _ in models.values()):
-            # Its items can differ although their ids agree.
+            # Items of two builds can differ although they have the same ids.
             browser.notes.append(
                 f"The items of {name} cannot be shown: {store.folder} was rebuilt since the runs."
             )
@@ -122,26 +124,26 @@ def choose_items(
 ) -> list[SelectionItem]:
     """Return at most `limit` random items, sorted by family and subtype.
 
-    Subtypes have equally many items, and so do the combinations of correct and wrong answers in a
-    subtype.
+    The items are spread evenly over the subtypes. Within a subtype, they are spread evenly over the
+    combinations of models that answered correctly.
     """
 
     def subtype(item: SelectionItem) -> tuple[int, str]:
         return FAMILIES.index(item.family), item.subtype
 
-    def verdicts(item: SelectionItem) -> tuple:
-        of_item = [r.get(item.item_id) for r in responses.values()]
-        return *subtype(item), *(r and r.letter == item.letter for r in of_item)
+    def subtype_and_verdicts(item: SelectionItem) -> tuple:
+        to_item = [r.get(item.item_id) for r in responses.values()]
+        return *subtype(item), *(r and r.letter == item.letter for r in to_item)
 
     order = np.random.default_rng(seed).permutation(len(items))
-    spread = interleave([items[k] for k in order], verdicts)
-    return sorted(interleave(spread, subtype)[:limit], key=subtype)
+    interleaved = interleave([items[k] for k in order], subtype_and_verdicts)
+    return sorted(interleave(interleaved, subtype)[:limit], key=subtype)
 
 
 def page_entries(
     items: Sequence[SelectionItem], responses: Mapping[str, Responses], store: Store
 ) -> Iterator[dict[str, Any]]:
-    """Yield the page's data of each item, which names frames as `encode_frames` does."""
+    """Yield the data of each item for the page, with frames by the names in `encode_frames`."""
     for item in items:
         yield {
             "id": item.item_id,
@@ -171,17 +173,17 @@ def page_entries(
 
 
 def describe_truth(item: SelectionItem, store: Store) -> list[str]:
-    """Return sentences on the target and on the collisions before it."""
+    """Return sentences about the target, and about the collisions between the prefix and it."""
     scene = store.scene(item.scene_id)
     sentences = [
         f"{item.letter} is correct: frame {item.target_frame}, "
-        f"{item.target_frame - item.prefix_stop} frames after the prefix. Any two candidates "
-        f"differ by {item.min_displacement:.0f} px or more."
+        f"{item.target_frame - item.prefix_stop} frames after the prefix. Between any two "
+        f"candidates, an object is displaced by {item.min_displacement:.0f} px or more."
     ]
     for collision in scene.collisions:
         if item.prefix_stop < collision.frame <= item.target_frame:
-            one, other = (scene.objects[k].noun_phrase for k in collision.objects)
-            sentences.append(f"The {one} and the {other} collide at frame {collision.frame}.")
+            first, second = (scene.objects[k].noun_phrase for k in collision.objects)
+            sentences.append(f"The {first} and the {second} collide at frame {collision.frame}.")
     return sentences
 
 
@@ -200,8 +202,8 @@ def _prefix(item: SelectionItem) -> list[FrameRef]:
 
 
 def encode_frames(items: Sequence[SelectionItem], store: Store) -> tuple[dict[str, str], list[str]]:
-    """Return the frames of the items as WebP data URLs by name, and an error for each scene whose
-    frames cannot be read."""
+    """Return the frames of the items, and an error message for each scene whose frames cannot be
+    read. Frames are WebP data URLs by name: benchmark, scene and frame index."""
     wanted: dict[str, set[int]] = {}
     for item in items:
         for frame in (*_prefix(item), *item.candidates):
@@ -220,7 +222,7 @@ def encode_frames(items: Sequence[SelectionItem], store: Store) -> tuple[dict[st
 
 
 def encode_webp(pixels: np.ndarray) -> str:
-    """Return pixels (height, width, 3) as the data URL of an image of `FRAME_WIDTH` pixels."""
+    """Return pixels (height, width, 3) as the data URL of an image that is `FRAME_WIDTH` wide."""
     from PIL import Image
 
     height, width = pixels.shape[:2]

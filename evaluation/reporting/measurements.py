@@ -1,4 +1,4 @@
-"""The results of all runs, each with its run and the training of its model; their comparisons."""
+"""The results of all runs, with the training of the measured models, and comparisons of models."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from evaluation.reporting.run_responses import Responses
 from evaluation.reporting.runs import FinishedRun, training_settings
 
 TRANSFER_SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
-"""The paper's transfer suites by their simulator."""
+"""Names of the paper's transfer suites, by the setting `benchmark.simulator`."""
 REGIMES = {
     "answer_only": "answer-only",
     "cot": "full student",
     "cot_no_candidate_analysis": "- candidate analysis",
     "cot_no_match_layout": "- match layout",
 }
-"""The paper's names of the training regimes."""
+"""The paper's names of the training regimes, which differ in the text that a student learns."""
 ABLATED_REGIMES = ("cot_no_candidate_analysis", "cot_no_match_layout")
-"""The regimes without a part of the rationale."""
+"""The regimes whose rationales lack a part."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A result with its run and the training of its model.
+    """A result with its run and the training of the measured model.
 
     Attributes:
-        name: Name of the model in the report, which may differ from the name in its run.
-        training: Settings of the training run; None for a released model, empty if unknown.
+        name: Name of the model in the report: `result.name`, or a longer name that is unique.
+        training: Settings of the model's training run; None for a released model, empty if unknown.
     """
 
     result: SelectionResult | RetrievalResult
@@ -49,14 +49,14 @@ class Measurement:
 
     @property
     def variants(self) -> list[str]:
-        """The suite and the control of its items; empty for the benchmark's unchanged items."""
+        """The suite and the control, if any; empty for the standard items without a control."""
         if isinstance(self.result, RetrievalResult):
             return []
         return [x for x in (self.result.suite, self.result.control) if x is not None]
 
     @property
-    def items(self) -> str:
-        """The name of its item set: benchmark, suite and control."""
+    def item_set(self) -> str:
+        """The name of the measured items: benchmark, suite and control."""
         return ", ".join([self.benchmark, *self.variants])
 
     @property
@@ -80,7 +80,7 @@ class Measurement:
 
     @property
     def seed(self) -> int | None:
-        """The seed of the training."""
+        """The seed of the training, if known."""
         return (self.training or {}).get("seed")
 
     @property
@@ -89,73 +89,78 @@ class Measurement:
 
     @property
     def is_transfer_suite(self) -> bool:
-        """Whether its items are of a transfer suite or of its stand-in."""
+        """Whether the benchmark is a transfer suite, or a simulated stand-in for one."""
         benchmark = self.run.config.get("benchmark", {})
         return bool({benchmark.get("simulator"), benchmark.get("standin")} & {*TRANSFER_SUITES})
 
     @property
-    def line(self) -> tuple:
-        """Identifies the line of a table: results with equal lines have equal names."""
-        of = self.result
-        variant = of.mode if isinstance(of, SelectionResult) else (of.width, of.builder)
-        return self.run.kind, self.items, of.name, variant
+    def row_key(self) -> tuple:
+        """Key of the result's row in a table; results with equal keys need different names."""
+        result = self.result
+        is_selection = isinstance(result, SelectionResult)
+        variant = result.mode if is_selection else (result.width, result.builder)
+        return self.run.kind, self.item_set, result.name, variant
 
 
 def read_measurements(
     runs: Iterable[FinishedRun], root: Path, kinds: Sequence[str]
 ) -> list[Measurement]:
-    """Return the results of the runs of some kinds below `root`."""
+    """Return the results of the runs of some kinds. The training runs are below `root`, too."""
     measurements = []
     for run in runs:
         if run.kind in kinds:
             training = training_settings(run, root)
             for row in run.report.rows:
-                # A trained retriever's report also has rows of its untrained base.
+                # The report of a trained retriever also has rows for its untrained base.
                 trained = None if row.name.startswith(UNTRAINED) else training
                 measurements.append(Measurement(row, run, row.name, trained))
     return measurements
 
 
 def deduplicate(measurements: Iterable[Measurement]) -> list[Measurement]:
-    """Return each result once: reports of several retrievers repeat the row of a common base.
+    """Drop repeated results, and give the others unique names.
 
-    Models of one name with different results are named after their runs, too.
+    Retrievers with the same base each report the results of that base. If different results have
+    the same name, the names of their runs are appended.
     """
     kept: list[Measurement] = []
     for m in measurements:
         if all(m.result != other.result for other in kept):
             kept.append(m)
-    counts = Counter(m.line for m in kept)
+    counts = Counter(m.row_key for m in kept)
     return [
-        replace(m, name=f"{m.result.name}, {m.run.name}") if counts[m.line] > 1 else m for m in kept
+        replace(m, name=f"{m.result.name}, {m.run.name}") if counts[m.row_key] > 1 else m
+        for m in kept
     ]
 
 
 def shared_names(measurements: Iterable[Measurement]) -> list[str]:
-    """Return a name for each result, which a model's results on several benchmarks share.
+    """Return a name for each result. Results of a model on several item sets get the same name.
 
-    A second result of a model on the same items has the name of its run, too.
+    If a model has several results on an item set, only the first gets that name. The others get
+    their unique names, which contain the names of their runs.
     """
     used: set[tuple] = set()
     names = []
     for m in measurements:
-        names.append(m.name if m.line[1:] in used else m.result.name)
-        used.add(m.line[1:])
+        names.append(m.name if m.row_key[1:] in used else m.result.name)
+        used.add(m.row_key[1:])
     return names
 
 
-def group_by_items(measurements: Iterable[Measurement]) -> dict[str, list[Measurement]]:
-    """Return the results by item set: results on different items never share a table."""
+def group_by_item_set(measurements: Iterable[Measurement]) -> dict[str, list[Measurement]]:
+    """Return the results by item set: results on different items are never in the same table."""
     groups: dict[str, list[Measurement]] = {}
     for m in measurements:
-        groups.setdefault(m.items, []).append(m)
+        groups.setdefault(m.item_set, []).append(m)
     return groups
 
 
 def transfer_benchmarks(measurements: Sequence[Measurement]) -> set[str]:
-    """Return the benchmarks that test transfer.
+    """Return the benchmarks that test transfer to other scenes.
 
-    No model was trained on them, and they are transfer suites or measure a trained model.
+    These are the benchmarks on which no model was trained, if they are transfer suites or if a
+    trained model was measured on them.
     """
     trained_on = {m.training_benchmark for m in measurements if m.training_benchmark}
     measured = {m.benchmark for m in measurements if m.is_transfer_suite or m.training_benchmark}
@@ -166,7 +171,7 @@ def widest_results(measurements: Iterable[Measurement]) -> list[Measurement]:
     """Return the results over all queries at each model's largest width, released models first."""
     widest: dict[tuple[Path, str], Measurement] = {}
     for m in measurements:
-        # A report has the widest first.
+        # The rows of a report are sorted by width, widest first.
         if m.result.builder is None:
             widest.setdefault((m.run.folder, m.name), m)
     return sorted(widest.values(), key=lambda m: m.trained)
@@ -175,7 +180,7 @@ def widest_results(measurements: Iterable[Measurement]) -> list[Measurement]:
 def check_builds(measurements: Iterable[Measurement]) -> None:
     """Raise a UserError if two runs measured different builds of a benchmark.
 
-    The items and queries of two builds can differ although their ids agree.
+    Items and queries of two builds can differ although they have the same ids.
     """
     builds: dict[str, Measurement] = {}
     for m in measurements:
@@ -194,10 +199,10 @@ def compare_models(
     items: Mapping[str, SelectionItem],
     seed: int,
 ) -> list[PairedComparison]:
-    """Compare the pairs of models that the paper compares: by family, macro, and over all items.
+    """Compare the pairs of models that the paper compares; see `compare_runs`.
 
     Args:
-        models: Models of one benchmark by label, with their responses.
+        models: The models that were measured on a benchmark, with their responses, by label.
         items: The benchmark's items by id.
         seed: Seed of the bootstrap over scenes.
     """
@@ -215,15 +220,15 @@ def compare_models(
 
 
 def _is_paper_comparison(m: Measurement, other: Measurement) -> bool:
-    """Whether the paper compares such models. These are:
+    """Return whether the paper compares `m` with a model such as `other`. It compares:
 
-    - a student and its base in the same mode,
-    - a student with rationales and one without, of the same base and seed,
-    - the full student and an ablated one, of the same base, seed and mode,
-    - a retriever and its untrained base.
+    - a student with its base, in the same mode;
+    - a student that learned rationales with an answer-only student of the same base and seed;
+    - the full student with an ablated student of the same base, seed and mode;
+    - a retriever with its untrained base.
     """
     if m.run.kind == "similarity":
-        # The row of a common base is kept once, under the run that measured it first.
+        # `other.run` may be another run: a base that several runs measured is kept only once.
         return m.trained and not other.trained and other.result in m.run.report.rows
     if m.regime not in REGIMES or other.base != m.base:
         return False

@@ -15,7 +15,7 @@ from evaluation.reporting.table import Best
 
 
 def render_page(sections: Sequence[Section], browser: ItemBrowser, runs: Sequence[str]) -> str:
-    """Return the page; `runs` are the names of the runs that it covers."""
+    """Return the page as HTML; `runs` are the names of the runs that it covers."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("evaluation.reporting"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
@@ -34,7 +34,7 @@ def render_page(sections: Sequence[Section], browser: ItemBrowser, runs: Sequenc
 
 
 def inline_svg(svg: str, number: int) -> str:
-    """Return an SVG file as an element of the page; `number` makes its ids unique."""
+    """Return the <svg> element of an SVG file, with ids that `number` makes unique on the page."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>f{number}-", svg)

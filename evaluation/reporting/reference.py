@@ -1,4 +1,4 @@
-"""The results that the paper prints, read from `reference.yaml`."""
+"""The results of the paper, read from `reference.yaml`."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from data.records import FAMILIES
 from evaluation.reporting.table import DETAIL, FORMATS, Row, Table
 
 SUITE = "dynapix"
-"""The suite whose items the paper's selection tables cover."""
+"""The suite (set of items) that the paper's selection tables measure."""
 COT_STUDENT = "Physics-grounded CoT"
 """The name of the paper's CoT student in `reference.yaml`."""
 
 
 @cache
 def reference(group: str) -> Any:
-    """Return a group of `reference.yaml`, such as a list of rows.
+    """Return the value of a top-level key of `reference.yaml`, such as a list of rows.
 
-    A row has a `name` and values by column heading.
+    A row is a dictionary of its `name` and of values by column heading.
     """
     text = (files("evaluation.reporting") / "reference.yaml").read_text(encoding="utf-8")
     return yaml.safe_load(text)[group]
@@ -35,10 +35,10 @@ def cot_student() -> dict[str, float]:
 
 
 def reference_rows(group: str) -> list[Row]:
-    """Return the rows of a group for a table; a value that the paper does not print is None.
+    """Return the rows of a group as rows of a `Table`. Values that the paper lacks are None.
 
-    A row with `horizons`, its accuracies in the time family by seconds to the target, is followed
-    by one row for each of them.
+    If a row has `horizons` (accuracies in the time family by the time to the target), a row for
+    each horizon follows.
     """
     rows, columns = [], {column for row in reference(group) for column in row} - {"horizons"}
     for row in reference(group):
@@ -58,13 +58,14 @@ def table_with_paper(
     notes: tuple[str, ...],
 ) -> Table:
     """Return a table with the caption and the paper's rows of `tables[key]` in `reference.yaml`."""
-    table = reference("tables")[key]
+    entry = reference("tables")[key]
     paper = {
-        label: [row for name in names for row in reference_rows(name)]
-        for label, names in table["paper"].items()
+        label: [row for paper_group in paper_groups for row in reference_rows(paper_group)]
+        for label, paper_groups in entry["paper"].items()
     }
-    return Table(name, table["caption"], columns, groups, notes, paper)
+    return Table(name, entry["caption"], columns, groups, notes, paper)
 
 
 def _to_share(column: str, value: Any) -> Any:
+    """Convert a percentage to a fraction; return other values unchanged."""
     return value / 100 if isinstance(value, float) and column not in FORMATS else value

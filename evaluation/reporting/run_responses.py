@@ -1,4 +1,4 @@
-"""The responses of models and the choices of retrievers, read from the folders of their runs."""
+"""The responses of students and the choices of retrievers, read from the folders of runs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class ItemResponse:
     Attributes:
         text: The response, or the scores of a retriever.
         letters: The chosen letters: several for tied scores, none for an unparsed response.
-        reason: Why there is no single letter.
-        truncated: Whether generation stopped before the end of the text.
+        reason: What is wrong with the response, such as tied scores; None for a valid response.
+        truncated: Whether generation stopped at the token limit.
     """
 
     text: str
@@ -30,22 +30,23 @@ class ItemResponse:
 
     @property
     def letter(self) -> str | None:
-        """The letter, if it is the only one."""
+        """The chosen letter; None if there is none or more than one."""
         return self.letters if len(self.letters) == 1 else None
 
     def credit(self, letter: str) -> float:
-        """1/m if `letter` is one of the m chosen letters, else 0."""
+        """Return 1/m if `letter` is one of the m chosen letters, else 0."""
         return (letter in self.letters) / max(1, len(self.letters))
 
 
 Responses = Mapping[str, ItemResponse]
-"""Responses by item."""
+"""Responses by item id."""
 
 
 def read_responses(run: FinishedRun) -> dict[str, Responses]:
-    """Return the responses of a run by `SelectionResult.key` and item.
+    """Return the responses of a run by `SelectionResult.key` and item id.
 
-    Responses under other settings, and lines torn by a kill, are left out.
+    Responses that were generated with other settings than those of the run's report are left out,
+    and so are damaged lines.
 
     Raises:
         UserError: The responses are missing or of another version.
@@ -67,7 +68,7 @@ def read_responses(run: FinishedRun) -> dict[str, Responses]:
 
 
 def nearest_candidates(scores: Sequence[float]) -> ItemResponse:
-    """Return the letters of the candidates with the highest score."""
+    """Return the choice of a retriever: the letters of the candidates with the highest score."""
     by_letter = dict(zip(LETTERS, scores, strict=True))
     letters = "".join(x for x, score in by_letter.items() if score == max(scores))
     text = ", ".join(f"{x} {score:.4f}" for x, score in by_letter.items())

@@ -26,7 +26,7 @@ REPORT_TYPES = {
     **dict.fromkeys(STUDY_KINDS, dict[str, Any]),
 }
 KINDS = (*REPORT_TYPES, *TRAINING_KINDS)
-"""Folders below checkpoints/ with runs that a report covers."""
+"""Names of the folders below checkpoints/ whose runs a report covers."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class FinishedRun:
     """A finished run.
 
     Attributes:
-        kind: The folder of its command, such as select.
-        config: Its settings.
-        report: Its report.json; None for a training run.
-        started: When it was first started, in ISO format.
+        kind: Name of the command's folder, such as select.
+        config: Settings of the run.
+        report: Content of report.json; None for a training run.
+        started: Time of the first start, in ISO format.
     """
 
     folder: Path
@@ -49,6 +49,7 @@ class FinishedRun:
 
     @property
     def title(self) -> str:
+        """Path below checkpoints/, such as select/default."""
         return f"{self.kind}/{self.name}"
 
 
@@ -56,40 +57,40 @@ def gather_runs(root: Path, patterns: Sequence[str] | None) -> list[FinishedRun]
     """Return the finished runs below `root`, oldest first.
 
     Args:
-        patterns: Folders or patterns of folders below `root`, such as select/*; None for all.
+        patterns: Titles of runs, or glob patterns of titles, such as select/*; None for all runs.
 
     Raises:
-        UserError: No evaluation has finished, a pattern matches no finished run, or a run cannot be
-            read.
+        UserError: No evaluation is among the runs, a pattern matches no finished run, or a run
+            cannot be read.
     """
-    # A sweep's jobs are one folder deeper.
+    # The runs of a sweep are one folder deeper.
     depths = ("*/metrics.json", "*/*/metrics.json")
-    folders = [p.parent for k in KINDS for d in depths for p in sorted(root.glob(f"{k}/{d}"))]
-    finished = [folder.relative_to(root).as_posix() for folder in folders]
-    chosen = (
+    files = [f for kind in KINDS for depth in depths for f in sorted(root.glob(f"{kind}/{depth}"))]
+    finished = [file.parent.relative_to(root).as_posix() for file in files]
+    titles = (
         finished if patterns is None else [t for p in patterns for t in _match(root, p, finished)]
     )
-    runs = [_read_run(root, title) for title in dict.fromkeys(chosen)]
+    runs = [_read_run(root, title) for title in dict.fromkeys(titles)]
     if all(run.kind in TRAINING_KINDS for run in runs):
         raise UserError(
-            f"no evaluation has finished below {root}: run python -m evaluation.select "
-            "model=checkpoints/sft/RUN or python -m evaluation.retrieve "
-            "model=checkpoints/contrastive/RUN first",
+            f"no finished evaluation is among the runs below {root}: first run python -m "
+            "evaluation.select model=checkpoints/sft/RUN or python -m evaluation.retrieve "
+            "model=checkpoints/contrastive/RUN",
             code="missing-run",
         )
     return sorted(runs, key=lambda run: (run.started, run.kind, run.name))
 
 
 def _match(root: Path, pattern: str, finished: Sequence[str]) -> list[str]:
-    """Return the `finished` runs that a pattern matches."""
+    """Return the titles in `finished` that a pattern matches. Raises UserError if none does."""
     pattern = pattern.strip("/").removeprefix(f"{root.as_posix().strip('/')}/")
     if matched := fnmatch.filter(finished, pattern):
         return matched
     if (root / pattern).is_dir():
         raise UserError(
             f"runs: {root / pattern} is not a finished run of an evaluation or a training: run its "
-            "command again, which resumes it (or python -m evaluation.study.export, if it is a "
-            "study), or name another run",
+            "command again, which resumes the run (for a study, run python -m "
+            "evaluation.study.export), or name another run",
             code="unfinished-run",
         )
     similar = get_close_matches(pattern, finished, 3, 0.3) or finished[:3]
@@ -115,10 +116,11 @@ def _read_settings(folder: Path) -> dict[str, Any]:
 
 
 def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
-    """Return the settings of the training of a run's model, or else of its matcher.
+    """Return the settings of the run that trained the model of an evaluation. For a two-stage run
+    with an untrained model, return those of its matcher (the retriever that ranks the frames).
 
     Returns:
-        None for a released model, and an empty dictionary if the training folder is gone.
+        None for a released model, and an empty dictionary if the training folder does not exist.
 
     Raises:
         UserError: The settings cannot be read.
@@ -127,7 +129,7 @@ def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
     if model is None:
         return None
     path = Path(str(model))
-    # If the runs have moved, or the report runs in another folder, the model is below `root`.
+    # If the runs were moved, or the working directory is another, the model is below `root`.
     folders = [path, root / Path(*path.parts[1:])]
     found = [folder for folder in folders if (folder / "config.yaml").is_file()]
     return _read_settings(found[0]) if found else {}
@@ -135,7 +137,7 @@ def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
 
 @contextmanager
 def reading(folder: Path, file: str = "report.json") -> Iterator[None]:
-    """Turn a failure to read or interpret a file of a run into a UserError that names the file."""
+    """Turn an error in the block, which reads `file` of a run, into a UserError that names it."""
     failures = (OSError, ValueError, KeyError, TypeError, AttributeError)
     try:
         yield

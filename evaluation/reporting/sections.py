@@ -1,4 +1,4 @@
-"""The sections of the report: tables in the paper's shape, and figures."""
+"""The sections of the report: tables in the layout of the paper's tables, and figures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaluation.reporting.measurements import (
     ABLATED_REGIMES,
     REGIMES,
     Measurement,
-    group_by_items,
+    group_by_item_set,
     transfer_benchmarks,
     widest_results,
 )
@@ -29,12 +29,12 @@ from evaluation.reporting.runs import (
 from evaluation.reporting.table import Row, Table
 from train.common.curves import plot_curves
 
-Rows = Sequence[Measurement]
+Results = Sequence[Measurement]
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure, drawn on demand by `plot(data, file)`."""
+    """A figure, which `plot(data, file)` draws when `svg` is first read."""
 
     name: str
     caption: str
@@ -43,7 +43,7 @@ class Figure:
 
     @cached_property
     def svg(self) -> str:
-        """The figure as SVG with selectable text; equal data give equal bytes."""
+        """The figure as SVG with selectable text. The same data give the same bytes."""
         import matplotlib
 
         file = io.BytesIO()
@@ -55,7 +55,7 @@ class Figure:
 
 @dataclass
 class Section:
-    """A part of the report."""
+    """A titled part of the report. One without tables and figures is left out."""
 
     title: str
     tables: list[Table] = field(default_factory=list)
@@ -63,15 +63,15 @@ class Section:
 
 
 def build_sections(
-    selections: Rows, retrievals: Rows, runs: Sequence[FinishedRun], browser: ItemBrowser
+    selections: Results, retrievals: Results, runs: Sequence[FinishedRun], browser: ItemBrowser
 ) -> list[Section]:
-    """Return the sections that have content, in the paper's order.
+    """Return the sections that have tables or figures, in the order of the paper.
 
     Args:
-        selections, retrievals: The results of `runs`.
+        selections, retrievals: The results of `runs`, without repeated results.
 
     Raises:
-        UserError: A study's report is of another version.
+        UserError: The report of a human study was written by another version.
     """
     unchanged = [m for m in selections if not m.variants]
     transfers = transfer_benchmarks(unchanged)
@@ -92,19 +92,20 @@ def build_sections(
     return [section for section in sections if section.tables or section.figures]
 
 
-def zero_shot(selections: Rows, retrievals: Rows, studies: Sequence[FinishedRun]) -> Section:
+def zero_shot(selections: Results, retrievals: Results, studies: Sequence[FinishedRun]) -> Section:
+    """Released models, without any training by this project, and the votes of humans."""
     section = Section("Zero-shot")
-    for rows in group_by_items(selections).values():
+    for rows in group_by_item_set(selections).values():
         people = [row for study in studies for row in _majority_rows(study, rows[0])]
         section.tables.append(tables.summary_table("selection", rows, people))
         section.figures.append(_family_figure("zero-shot", rows))
-    for rows in group_by_items(m for m in retrievals if not m.trained).values():
+    for rows in group_by_item_set(m for m in retrievals if not m.trained).values():
         section.tables.append(tables.summary_table("retrieval", rows))
     return section
 
 
 def _majority_rows(study: FinishedRun, m: Measurement) -> list[Row]:
-    """Return the row of a study's majority vote, if the study has the same build."""
+    """Return the row of a study's majority vote, or no row if `m` measured another build."""
     with reading(study.folder):
         build = (study.report["benchmark"], study.report.get("build"))
         votes = study.report["majority"]
@@ -113,14 +114,15 @@ def _majority_rows(study: FinishedRun, m: Measurement) -> list[Row]:
         return [tables.human_row(f"Majority vote, {study.name}", votes)]
 
 
-def distillation(selections: Rows, retrievals: Rows, browser: ItemBrowser) -> Section:
+def distillation(selections: Results, retrievals: Results, browser: ItemBrowser) -> Section:
+    """Trained models beside released models, on benchmarks that do not test transfer."""
     section = Section("Distillation")
-    for benchmark, rows in group_by_items(selections).items():
+    for benchmark, rows in group_by_item_set(selections).items():
         if any(m.trained for m in rows):
             section.tables.append(tables.summary_table("distillation-selection", rows))
             section.figures.append(_family_figure("families", rows))
             section.tables += _model_differences(benchmark, browser)
-    for rows in group_by_items(retrievals).values():
+    for rows in group_by_item_set(retrievals).values():
         if trained := {m.run.folder: m.run for m in rows if m.trained}:
             section.tables.append(tables.summary_table("distillation-retrieval", rows))
         for run in trained.values():
@@ -130,8 +132,8 @@ def distillation(selections: Rows, retrievals: Rows, browser: ItemBrowser) -> Se
     return section
 
 
-def ablation(selections: Rows) -> Section:
-    """The regimes with rationales, in reasoning mode."""
+def ablation(selections: Results) -> Section:
+    """The students of all regimes in reasoning mode, if an ablated student was measured."""
     rows = [m for m in selections if m.result.mode == "reasoning" and m.regime in REGIMES]
     if not any(m.regime in ABLATED_REGIMES for m in rows):
         return Section("Ablation")
@@ -140,8 +142,8 @@ def ablation(selections: Rows) -> Section:
     return Section("Ablation", [table])
 
 
-def transfer(selections: Rows, transfers: Container[str], browser: ItemBrowser) -> Section:
-    """Students on benchmarks that they were not trained on, and their bases."""
+def transfer(selections: Results, transfers: Container[str], browser: ItemBrowser) -> Section:
+    """The models that were measured on transfer benchmarks: their accuracies on all benchmarks."""
     section = Section("Transfer")
     models = {(m.result.name, m.result.mode) for m in selections if m.benchmark in transfers}
     if measured := [m for m in selections if (m.result.name, m.result.mode) in models]:
@@ -149,7 +151,7 @@ def transfer(selections: Rows, transfers: Container[str], browser: ItemBrowser) 
             "transfer", measured, lambda m, name: f"{name} ({m.result.mode})"
         )
         section.tables.append(table)
-    for benchmark, rows in group_by_items(selections).items():
+    for benchmark, rows in group_by_item_set(selections).items():
         if benchmark in transfers:
             section.tables.append(tables.summary_table("transfer-selection", rows))
             # The paper's accuracies by family are on CLEVRER.
@@ -159,7 +161,7 @@ def transfer(selections: Rows, transfers: Container[str], browser: ItemBrowser) 
 
 
 def _model_differences(benchmark: str, browser: ItemBrowser) -> list[Table]:
-    """Return the differences between the benchmark's models, overall and, folded, by family."""
+    """Return the differences between models over all items and, in a folded table, by family."""
     comparisons = browser.comparisons.get(benchmark)
     if not comparisons:
         return []
@@ -172,11 +174,11 @@ def _model_differences(benchmark: str, browser: ItemBrowser) -> list[Table]:
     ]
 
 
-def controls(selections: Rows, runs: Sequence[FinishedRun]) -> Section:
-    """The accuracies under controls, and their differences from the unchanged items."""
+def controls(selections: Results, runs: Sequence[FinishedRun]) -> Section:
+    """The accuracies on other suites and under controls, and the paired differences."""
     compared = [run for run in runs if run.kind in SELECTION_KINDS and run.report.controls]
     differences = [_name_table(tables.paired_table(r.report.controls), r.title) for r in compared]
-    groups = group_by_items(selections).values()
+    groups = group_by_item_set(selections).values()
     accuracies = [tables.summary_table("control", rows) for rows in groups]
     return Section("Controls", differences + accuracies)
 
@@ -187,9 +189,9 @@ def _study_table(run: FinishedRun) -> Table:
         return _name_table(tables.human_table(run.report), run.name, title)
 
 
-def selection_details(selections: Rows, transfers: Container[str]) -> Section:
+def selection_details(selections: Results, transfers: Container[str]) -> Section:
     section = Section("Selection in detail")
-    for benchmark, rows in group_by_items(selections).items():
+    for benchmark, rows in group_by_item_set(selections).items():
         if horizons := {m.label: m.result.horizons for m in rows if m.result.horizons}:
             plot = partial(figures.accuracy_figure, with_paper=benchmark not in transfers)
             caption = f"Accuracy by horizon on {benchmark}."
@@ -199,9 +201,9 @@ def selection_details(selections: Rows, transfers: Container[str]) -> Section:
     return section
 
 
-def retrieval_details(retrievals: Rows) -> Section:
+def retrieval_details(retrievals: Results) -> Section:
     section = Section("Retrieval in detail")
-    for benchmark, rows in group_by_items(retrievals).items():
+    for benchmark, rows in group_by_item_set(retrievals).items():
         ordered = sorted(rows, key=lambda m: (-(m.result.width or 0), not m.result.untrained))
         section.tables.append(replace(tables.summary_table("widths", ordered), folded=True))
         if any(m.result.width for m in rows):
@@ -212,7 +214,7 @@ def retrieval_details(retrievals: Rows) -> Section:
 
 
 def training(runs: Sequence[FinishedRun]) -> Section:
-    """The curves of the training loss and of the measures on held-out scenes."""
+    """The curves of the training loss, and of the measures on held-out scenes."""
     section = Section("Training")
     for run in runs:
         journal = run.folder / "metrics.jsonl"
@@ -223,13 +225,13 @@ def training(runs: Sequence[FinishedRun]) -> Section:
 
 
 def _name_table(table: Table, name: str, title: str = "") -> Table:
-    """Name a table after what it is about, such as a benchmark or a run."""
+    """Append a name to the table's name, and `title` (or else the name) to its caption."""
     caption, suffix = f"{table.caption}: {title or name}", name.replace("/", "-")
     return replace(table, name=f"{table.name}-{suffix}", caption=caption)
 
 
-def _family_figure(name: str, rows: Rows, with_paper: bool = True) -> Figure:
+def _family_figure(name: str, rows: Results, with_paper: bool = True) -> Figure:
     plot = partial(figures.accuracy_figure, with_paper=with_paper)
-    caption = f"Accuracy by family on {rows[0].items}, with 95% intervals."
-    shares = {m.label: m.result.families for m in rows}
-    return Figure(f"{name}-{rows[0].items}", caption, plot, shares)
+    caption = f"Accuracy by family on {rows[0].item_set}, with 95% intervals."
+    accuracies = {m.label: m.result.families for m in rows}
+    return Figure(f"{name}-{rows[0].item_set}", caption, plot, accuracies)

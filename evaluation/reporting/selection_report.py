@@ -1,4 +1,4 @@
-"""The report of evaluation.select and evaluation.similarity: report.txt, report.json and
+"""Write the report of evaluation.select or evaluation.similarity: report.txt, report.json and
 selection.png."""
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Choices:
-    """The choices of a model on all items, in one mode and under one control.
+    """The choices of a model for all items, in one mode and under one control.
 
     Attributes:
-        credits: 1 for a correct choice, 1/m for a tie among m candidates, 0 for others.
-        letters: The chosen letters; None for a tie or an unparsed answer.
-        answers: The parsed answers; empty for a retriever.
+        credits: For each item, 1 for a correct choice, 1/m if the target is one of m candidates
+            with the highest score, and 0 otherwise.
+        letters: The chosen letters; None for a tie or a response that cannot be parsed.
+        answers: The responses of a student to the items; empty for a retriever.
     """
 
     name: str
@@ -67,11 +68,11 @@ def write_report(
     build: str,
     asked: Sequence[tuple[str, str | None, str]] = (),
 ) -> list[SelectionResult]:
-    """Write a report into `folder`, and return the result of each of `choices`.
+    """Write the report into `folder`, and return the result of each element of `choices`.
 
     Args:
         seed: Seed of the bootstrap over scenes.
-        suite: As in `SelectCommand`.
+        suite: As in `SelectionResult`.
         build, asked: As in `SelectionReport`.
     """
     results = [selection_result(c, items, benchmark, seed, suite) for c in choices]
@@ -85,7 +86,7 @@ def write_report(
         subtypes={key: accuracy_by_group(subtypes, c.credits) for key, c in by_key.items()},
         readings={key: count_readings(c.answers) for key, c in by_key.items() if c.answers},
         positions={key: measure_position_bias(c.letters, letters) for key, c in by_key.items()},
-        calibration={key: of for key, of in calibrations.items() if of},
+        calibration={key: found for key, found in calibrations.items() if found},
         asked=[*asked],
     )
     parts = [tables.selection_table(results, items[0].suite)]
@@ -94,8 +95,8 @@ def write_report(
     parts += tables.detail_tables({key: (key, report) for key in by_key})
     write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
     write_text(folder / "report.json", json.dumps(asdict(report), indent=1))
-    shares = {f"{r.name} ({r.variant})": r.families for r in results}
-    accuracy_figure(shares, folder / "selection.png", items[0].suite == SUITE)
+    accuracies = {f"{r.name} ({r.variant})": r.families for r in results}
+    accuracy_figure(accuracies, folder / "selection.png", items[0].suite == SUITE)
     return results
 
 
@@ -106,12 +107,12 @@ def selection_result(
     seed: int,
     suite: str | None = None,
 ) -> SelectionResult:
-    """Return the accuracies of choices; `seed` is that of the bootstrap over scenes."""
+    """Return the accuracies of a model's choices. The arguments are those of `write_report`."""
     credits, families = choices.credits, [i.family for i in items]
     macro = macro_by_scene(credits, families, [i.scene_id for i in items], seed)
     timed = [(h, c) for i, c in zip(items, credits, strict=True) if (h := horizon_of(i))]
     by_horizon = accuracy_by_group([h for h, _ in timed], [c for _, c in timed])
-    # Horizons in frames are all below one second.
+    # Horizons in frames come first: they are all shorter than one second.
     ordered = sorted(by_horizon, key=lambda h: (h.endswith(" s"), int(h.split()[0])))
     accuracy, letters = accuracy_by_family(families, credits), choices.letters
     parse_rate = sum(x is not None for x in letters) / len(letters) if choices.answers else None
@@ -123,14 +124,14 @@ def selection_result(
 
 
 def horizon_of(item: SelectionItem) -> str | None:
-    """Return the horizon of an item of the time family in s, or of the window family in frames."""
+    """Return the horizon in seconds (time family) or in frames (window family), else None."""
     if item.family == "time":
         return f"{CELLS[item.subtype]} s"
     return f"{item.horizon} frames" if item.family == "window" else None
 
 
 def count_readings(answers: Sequence[Answer]) -> dict[str, int]:
-    """Count parsed answers, requested records that are valid, and reasons for unparsed answers."""
+    """Count parsed responses, valid records if the mode requests them, and the others by reason."""
     counts = {"with a letter": sum(a.letter is not None for a in answers)}
     if answers[0].valid is not None:
         counts["  in a valid record"] = sum(a.valid for a in answers)
@@ -139,7 +140,7 @@ def count_readings(answers: Sequence[Answer]) -> dict[str, int]:
 
 
 def _calibrate(answers: Sequence[Answer]) -> Calibration | None:
-    """Return the calibration of the confidence in valid records; None without any."""
+    """Return the calibration of the confidences in valid records; None without valid records."""
     valid = [answer for answer in answers if answer.valid]
     return measure_calibration([a.record.confidence for a in valid], [a.right for a in valid])
 
@@ -147,8 +148,8 @@ def _calibrate(answers: Sequence[Answer]) -> Calibration | None:
 def _compare(
     choices: Mapping[str, Choices], items: Sequence[SelectionItem], seed: int
 ) -> list[PairedComparison]:
-    """Compare the unchanged items with the items under each control, and in matched-anchor pairs
-    the questions of the event with those of the time."""
+    """Compare the choices without a control with those under each control, and, for matched-anchor
+    items, the choices for the two questions of each pair."""
     ids = [item.item_id for item in items]
     credits = {key: dict(zip(ids, c.credits, strict=True)) for key, c in choices.items()}
     compared = []

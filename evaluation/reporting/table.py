@@ -1,4 +1,4 @@
-"""A table and its rendering as text, Markdown and LaTeX; the page's template writes HTML."""
+"""A table of results, rendered as text, Markdown or LaTeX. page.html renders it as HTML."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from evaluation.metrics.intervals import Interval
 
 NOTE_WIDTH = 100
 DETAIL = "  "
-"""Prefix of the name of a row that details the row above it."""
+"""Prefix of a row's name if the row gives a detail of the row above."""
 FORMATS = {"MRR": (1, ".3f", ".2f"), "Median": (1, "g", ".0f")}
-"""Scale and digits of the values and of the ends of intervals in a column; others are percents."""
+"""By column: factor, format of values, and format of interval bounds. Others use `PERCENT`."""
 PERCENT = (100, ".1f", ".0f")
 
 _LATEX = {
@@ -32,29 +32,30 @@ _LATEX = {
 }
 
 Row = Mapping[str, Any]
-"""A row's `name` and its values by column: an `Interval`, a share, a count, text, or None for an
-unknown value. A column that the row lacks stays empty."""
+"""A row's `name`, and its values by column: an `Interval`, a number, text, or None for an unknown
+value (shown as -). A `float` is a fraction and an `int` a count. Columns that the row lacks are
+empty. If `ranked` is false, no value of the row is marked as the best."""
 
 
 class Best(str):
-    """A cell that holds the best value of its column: bold, except in plain text."""
+    """The text of a cell with the best value of its column. It is bold, except in plain text."""
 
     __slots__ = ()
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows in groups. A row with intervals is followed by a row of their ends.
+    """A table. Below each row with intervals, another row shows the bounds of the intervals.
 
     Attributes:
-        name: Stem of the files that the table is written to.
-        groups: Rows by the label of their group; an empty label is not printed, and neither is a
-            group without rows.
-        paper: The paper's rows, as in `groups`.
-        best: `max` or `min` for each column whose best value is marked, separately for `groups`
-            and for `paper`. Rows with a false `ranked` do not compete.
-        signed: Whether the values are differences.
-        folded: Whether the page folds the table, and the text of the report leaves it out.
+        name: Name of the files that the table is written to, without suffix.
+        groups: Groups of rows by label. An empty label and a group without rows are not printed.
+        notes: Sentences below the table.
+        paper: Groups of the paper's rows by label, below `groups`.
+        best: For each column whose best value is marked: `max` or `min`. The best value is chosen
+            among `groups` and, separately, among `paper`.
+        signed: Whether the values are differences, which are printed with a sign.
+        folded: Whether the table is collapsed on the page and left out of report.txt.
     """
 
     name: str
@@ -69,7 +70,7 @@ class Table:
 
     @cached_property
     def body(self) -> list[tuple[str, list[list[str]]]]:
-        """The label and the formatted rows of each group with rows."""
+        """The label and the rows of each non-empty group; a row is a list of its name and cells."""
         return [*self._format_groups(self.groups), *self._format_groups(self.paper)]
 
     def _format_groups(
@@ -89,8 +90,8 @@ class Table:
         cells = {column: self._format(row, column) for column in self.columns}
         if row.get("ranked", True):
             cells = {c: Best(cell) if cell == best.get(c) else cell for c, cell in cells.items()}
-        ends = [self._format_ends(row, column) for column in self.columns]
-        below = [[f"{DETAIL}95% interval", *ends]] if any(ends) else []
+        bounds = [self._format_bounds(row, column) for column in self.columns]
+        below = [[f"{DETAIL}95% interval", *bounds]] if any(bounds) else []
         return [[row["name"], *cells.values()], *below]
 
     def _format(self, row: Row, column: str) -> str:
@@ -98,17 +99,17 @@ class Table:
         value = value.value if isinstance(value, Interval) else value
         if isinstance(value, str | int):
             return value if isinstance(value, str) else f"{value:,}"
-        scale, digits, _ = FORMATS.get(column, PERCENT)
-        return "-" if value is None else f"{scale * value:{'+' * self.signed}{digits}}"
+        factor, digits, _ = FORMATS.get(column, PERCENT)
+        return "-" if value is None else f"{factor * value:{'+' * self.signed}{digits}}"
 
-    def _format_ends(self, row: Row, column: str) -> str:
+    def _format_bounds(self, row: Row, column: str) -> str:
         value = row.get(column)
         if not isinstance(value, Interval):
             return ""
-        scale, digits, end_digits = FORMATS.get(column, PERCENT)
+        factor, digits, bound_digits = FORMATS.get(column, PERCENT)
         if self.signed:
-            return f"{scale * value.low:+{digits}} to {scale * value.high:+{digits}}"
-        return f"{scale * value.low:{end_digits}}-{scale * value.high:{end_digits}}"
+            return f"{factor * value.low:+{digits}} to {factor * value.high:+{digits}}"
+        return f"{factor * value.low:{bound_digits}}-{factor * value.high:{bound_digits}}"
 
     def __str__(self) -> str:
         """Return the table as plain text with aligned columns."""
@@ -131,7 +132,7 @@ class Table:
         return self._render("table.md", _escape_markdown, "**{}**")
 
     def as_latex(self) -> str:
-        """Return a LaTeX float, which requires the packages booktabs and graphicx."""
+        """Return the table as a LaTeX float, which needs the packages booktabs and graphicx."""
         return self._render("table.tex", _escape_latex, r"\textbf{{{}}}")
 
     def _render(self, template: str, escape: Callable[[str], str], bold: str) -> str:

@@ -1,4 +1,4 @@
-"""The tables of evaluations and of the report, beside the paper's rows."""
+"""The tables of evaluations and of the report, which also show the paper's results."""
 
 from __future__ import annotations
 
@@ -38,26 +38,26 @@ GROUPS = (
     "two-stage predict-then-match",
     "direct embedders",
 )
-"""Groups of rows in the report's tables, in their order."""
+"""Labels of the groups of rows in the report's tables, in their order."""
 BEST = {
     **dict.fromkeys((*FAMILY_COLUMNS, "Macro", "Micro", *RECALL_COLUMNS, "MRR"), max),
     "Median": min,
 }
-"""Columns of these tables whose best value is marked."""
+"""The columns whose best value is marked, with the function that chooses it."""
 BEST_NOTE = "Bold: the best value of a column among these runs, and among the paper's rows."
 SELECTION_NOTE = (
-    "Wilson 95% intervals; macro's is bootstrapped over scenes. Answers that cannot be parsed "
-    "count as wrong."
+    "Wilson 95% intervals; the interval of macro is bootstrapped over scenes. Answers that cannot "
+    "be parsed count as wrong."
 )
 RETRIEVAL_NOTE = (
     "95% intervals are bootstrapped over scenes. A target that is not ranked counts as last. MiB: "
-    "size of the database's embeddings. s: time to rank all queries; an exact search ranks at all "
-    "widths at once."
+    "size of the database's embeddings. s: time to rank the database for all queries, at all "
+    "widths together."
 )
 
 
 def selection_table(results: Sequence[SelectionResult], suite: str = SUITE) -> Table:
-    """Return the results above the paper's rows, if the items are of the paper's suite."""
+    """Return the results of a run, above the paper's rows if the items are of the paper's suite."""
     rows = [row for r in results for row in selection_rows(f"{r.name} ({r.variant})", r)]
     key = "similarity" if results[0].mode == SIMILARITY else "select"
     table = table_with_paper(key, "selection", SELECTION_COLUMNS, {"": rows}, (SELECTION_NOTE,))
@@ -65,11 +65,11 @@ def selection_table(results: Sequence[SelectionResult], suite: str = SUITE) -> T
 
 
 def selection_rows(name: str, result: SelectionResult) -> list[Row]:
-    """Return a row of `SELECTION_COLUMNS`, and a row per horizon of the time family."""
+    """Return a row of `SELECTION_COLUMNS`, and a row for each horizon of the time family."""
     row = accuracy_row(name, result.families, result.macro_interval, result.micro)
     horizons = [
-        {"name": f"{DETAIL}time, {horizon}", "Time": share, "Items": share.n, "ranked": False}
-        for horizon, share in result.horizons.items()
+        {"name": f"{DETAIL}time, {horizon}", "Time": accuracy, "Items": accuracy.n, "ranked": False}
+        for horizon, accuracy in result.horizons.items()
         if horizon.endswith(" s")
     ]
     return [{**row, "Parsed": result.parse_rate}, *horizons]
@@ -83,45 +83,46 @@ def accuracy_row(
 
 
 def detail_tables(reports: Mapping[str, tuple[str, SelectionReport]]) -> list[Table]:
-    """Return the tables that detail selection results.
+    """Return the tables of the details of selection results.
 
     Args:
-        reports: By the label of a model or mode, the key of its details and the report with them.
+        reports: By label (of a model or mode): the key of its details, and the report with them.
     """
 
     def details(name: str) -> dict[str, Any]:
         by_label = {label: getattr(r, name).get(key) for label, (key, r) in reports.items()}
-        return {label: of for label, of in by_label.items() if of}
+        return {label: found for label, found in by_label.items() if found}
 
     tables = []
     if subtypes := details("subtypes"):
-        counts = {name: share.n for of in subtypes.values() for name, share in of.items()}
+        counts = {name: i.n for intervals in subtypes.values() for name, i in intervals.items()}
         rows = [{**row, "Items": counts[row["name"]]} for row in rows_by_label(subtypes)]
         caption = "Selection accuracy by subtype (%)"
         tables.append(Table("subtypes", caption, [*subtypes, "Items"], {"": rows}))
     makers = {
         "readings": parsing_table, "positions": position_table, "calibration": calibration_table
     }  # fmt: skip
-    return [*tables, *(make(of) for name, make in makers.items() if (of := details(name)))]
+    return [*tables, *(make(found) for name, make in makers.items() if (found := details(name)))]
 
 
 def rows_by_label(values: Mapping[str, Mapping[str, Any]]) -> list[Row]:
-    """Return a row for each name, with a column for each label; missing values are None."""
-    names = dict.fromkeys(name for of_label in values.values() for name in of_label)
+    """Convert values by label and name to a row for each name, with a column for each label."""
+    names = dict.fromkeys(name for by_name in values.values() for name in by_name)
     return [
-        {"name": name, **{label: of_label.get(name) for label, of_label in values.items()}}
+        {"name": name, **{label: by_name.get(name) for label, by_name in values.items()}}
         for name in names
     ]
 
 
 def parsing_table(counts: Mapping[str, Mapping[str, int]]) -> Table:
-    """Return the counts of parsed responses, and of the reasons for the others, by label."""
+    """Return a table of the numbers of parsed responses, and of the others by reason, by label."""
     caption = "Parsed responses, and why others could not be parsed"
     return Table("parsing", caption, [*counts], {"": rows_by_label(counts)})
 
 
 def position_table(positions: Mapping[str, PositionBias]) -> Table:
-    """Return how often each letter was chosen and was correct, and the accuracy at it, by label."""
+    """Return a table with three rows for each label: how often each letter was chosen, how often it
+    was correct, and how often it was chosen where it was correct."""
     rows: list[Row] = []
     for label, bias in positions.items():
         chosen, total = sum(bias.chosen.values()), sum(bias.right.values())
@@ -137,7 +138,7 @@ def position_table(positions: Mapping[str, PositionBias]) -> Table:
 
 
 def calibration_table(calibrations: Mapping[str, Calibration]) -> Table:
-    """Return the calibration of the confidence in valid records, by label."""
+    """Return a table of the calibration of the confidences in valid records, by label."""
     columns = ["Confidence", "Accuracy", "Calibration error", "Brier score", "Records"]
     rows = [
         {
@@ -150,7 +151,7 @@ def calibration_table(calibrations: Mapping[str, Calibration]) -> Table:
 
 
 def paired_table(comparisons: Iterable[PairedComparison]) -> Table:
-    """Return paired differences of accuracy by family, a group for each pair of runs."""
+    """Return a table of paired differences, with a group for each pair of runs."""
     groups: dict[str, list[Row]] = {}
     for p in comparisons:
         label = f"{p.mode}{': ' * bool(p.mode)}{p.left} (left) less {p.right} (right)"
@@ -166,19 +167,20 @@ def paired_table(comparisons: Iterable[PairedComparison]) -> Table:
         "Left", "Right", "Difference", "95%", "Only left", "Only right", "p", "Items",
     ]  # fmt: skip
     note = (
-        "Difference: left less right, its interval bootstrapped over scenes. Only left, only "
-        "right: items that only this side answers correctly. p: McNemar's exact test of these two "
-        "counts, which treats the items of a scene as independent."
+        "Difference: left minus right, with an interval that is bootstrapped over scenes. Only "
+        "left, only right: items that only this side answers correctly. p: p-value of McNemar's "
+        "exact test of these two counts, which treats the items of a scene as independent."
     )
     return Table("paired", "Paired differences of accuracy (%)", columns, groups, (note,))
 
 
 def retrieval_table(results: Sequence[RetrievalResult], command: str = "retrieve") -> Table:
-    """Return the results over all queries, widest first and untrained before trained, above the
-    paper's rows.
+    """Return the results over all queries, above the paper's rows.
+
+    Results are sorted by width, widest first, and by training, untrained first.
 
     Args:
-        command: retrieve or two_stage.
+        command: The command that measured the results: retrieve or two_stage.
     """
     overall = [r for r in results if r.builder is None]
     overall.sort(key=lambda r: (-(r.width or 0), not r.untrained))
@@ -197,12 +199,12 @@ def retrieval_row(name: str, result: RetrievalResult) -> Row:
 
 
 def retrieval_notes(result: RetrievalResult) -> tuple[str, ...]:
-    """Return the notes of a table whose results are on the same queries as `result`."""
+    """Return the notes of a table whose results have the same queries and database as `result`."""
     return f"{result.queries:,} queries, {result.frames:,} frames.", RETRIEVAL_NOTE
 
 
 def builder_tables(results: Sequence[RetrievalResult]) -> list[Table]:
-    """Return a table of the measures by builder and width for each retriever."""
+    """Return a table for each retriever, with a row for each builder and width."""
     tables = []
     for name in dict.fromkeys(r.name for r in results):
         rows = [
@@ -216,7 +218,7 @@ def builder_tables(results: Sequence[RetrievalResult]) -> list[Table]:
 
 
 def rank_differences_table(differences: Iterable[RetrieverDifference]) -> Table:
-    """Return the differences in groups by pair of retrievers, with a row for each width."""
+    """Return a table of differences: a group for each pair of retrievers, a row for each width."""
     columns = [*RECALL_COLUMNS, "MRR"]
     groups: dict[str, list[Row]] = {}
     for d in differences:
@@ -229,10 +231,10 @@ def rank_differences_table(differences: Iterable[RetrieverDifference]) -> Table:
 
 
 def human_table(summary: Mapping[str, Any]) -> Table:
-    """Return the table of a study, above the paper's rows.
+    """Return the table of a human study, above the paper's rows.
 
     Args:
-        summary: As `evaluation.study.agreement.summary` returns it.
+        summary: As `evaluation.study.agreement.summarize_votes` returns it.
     """
     rows = [human_row(name, accuracy) for name, accuracy in summary["accuracy"].items()]
     if summary["majority"]:
@@ -246,13 +248,13 @@ def human_table(summary: Mapping[str, Any]) -> Table:
 
 
 def human_row(name: str, accuracy: Mapping[str, Any]) -> Row:
-    """Return the row of annotators, who do not compete with models for the best value.
+    """Return the row of an annotator or of the majority vote, which is never marked as the best.
 
     Args:
-        accuracy: An entry of a study's summary.
+        accuracy: An `Accuracy` as JSON, from the summary of a study.
     """
-    of = from_json(Accuracy, accuracy)
-    row = accuracy_row(name, of.families, of.macro, of.micro)
+    parsed = from_json(Accuracy, accuracy)
+    row = accuracy_row(name, parsed.families, parsed.macro, parsed.micro)
     return {**row, "Parsed": None, "ranked": False}
 
 
@@ -264,15 +266,15 @@ def _human_notes(summary: Mapping[str, Any]) -> tuple[str, ...]:
         "Wilson 95% intervals over items.",
         f"{summary['judgments']:,} judgments of {summary['items']:,} items; items by their number "
         f"of judgments: {', '.join(depth)}.",
-        f"A majority is more than half of an item's votes; {undecided} items have none and count "
-        "as wrong.",
+        f"A majority is more than half of an item's votes; {undecided} items have no majority and "
+        "count as wrong.",
         f"Fleiss' kappa: {_agreement(kappa['value'])} on the {kappa['items']} items that all "
         f"{len(summary['annotators'])} annotators answered (paper: {reference('human_kappa'):.2f} "
-        "on 19).",
+        "on 19 items).",
         f"Krippendorff's alpha: {_agreement(alpha['value'])} on the {alpha['items']} items with "
         "two votes or more.",
-        "Seconds: only pages that were loaded once; the server's clock includes time in which the "
-        "server was down.",
+        "Median seconds: over items whose page was loaded only once. The server's clock includes "
+        "time in which the server was down.",
     )
 
 
@@ -285,11 +287,11 @@ def _width(width: int | None) -> str:
 
 
 def summary_table(name: str, rows: Sequence[Measurement], people: Sequence[Row] = ()) -> Table:
-    """Return the results of many runs on the same items, in the paper's groups.
+    """Return the results of many runs on the same items, in the groups of the paper's tables.
 
     Args:
-        name: A table of `reference.yaml`.
-        people: Rows of a human study.
+        name: Key below `tables` in `reference.yaml`.
+        people: Rows of human studies.
     """
     groups: dict[str, list[Row]] = {label: [] for label in GROUPS}
     if isinstance(rows[0].result, SelectionResult):
@@ -301,9 +303,9 @@ def summary_table(name: str, rows: Sequence[Measurement], people: Sequence[Row] 
         for m in rows:
             groups[_group(m)].append(retrieval_row(m.name, m.result))
     groups["people, on the items of their study"] = [*people]
-    items = rows[0].items
-    table = table_with_paper(name, f"{name}-{items.replace(', ', '-')}", columns, groups, notes)
-    return replace(table, caption=f"{table.caption}, on {items}", best=BEST)
+    item_set = rows[0].item_set
+    table = table_with_paper(name, f"{name}-{item_set.replace(', ', '-')}", columns, groups, notes)
+    return replace(table, caption=f"{table.caption}, on {item_set}", best=BEST)
 
 
 def _group(m: Measurement) -> str:
@@ -318,33 +320,33 @@ def _group(m: Measurement) -> str:
 def overall_table(
     name: str, rows: Sequence[Measurement], label: Callable[[Measurement, str], str]
 ) -> Table:
-    """Return the accuracy over all items of a benchmark, with a line for each model and a column
-    for each benchmark.
+    """Return a table of the accuracies over all items of a benchmark, with a row for each model and
+    a column for each benchmark.
 
     Args:
-        name: A table of `reference.yaml`.
-        label: Returns the label of a result from the result and the name of its model.
+        name: Key below `tables` in `reference.yaml`.
+        label: Returns the name of a result's row from the result and the name of its model.
     """
     names, benchmarks = shared_names(rows), _benchmark_columns(rows)
     columns = list(dict.fromkeys(["In domain", *TRANSFER_SUITES.values(), *benchmarks]))
-    lines: dict[str, dict[str, Any]] = {}
+    by_label: dict[str, dict[str, Any]] = {}
     for m, model, column in zip(rows, names, benchmarks, strict=True):
         empty = {"name": label(m, model), **dict.fromkeys(columns)}
-        lines.setdefault(empty["name"], empty)[column] = m.result.micro
+        by_label.setdefault(empty["name"], empty)[column] = m.result.micro
     notes = ("Wilson 95% intervals over items.", BEST_NOTE)
-    table = table_with_paper(name, name, columns, {"": [*lines.values()]}, notes)
+    table = table_with_paper(name, name, columns, {"": [*by_label.values()]}, notes)
     return replace(table, best=dict.fromkeys(columns, max))
 
 
 def _benchmark_columns(rows: Sequence[Measurement]) -> list[str]:
-    """Return the column of each row: "In domain", its transfer suite, or its benchmark.
+    """Return the column of each result: "In domain", a transfer suite, or a benchmark.
 
-    A column that several benchmarks would share is divided, and also names the benchmark.
+    If several benchmarks would have the same column, each gets its own, with its name appended.
     """
     trained_on = {m.training_benchmark for m in rows if m.training_benchmark}
 
     def column(m: Measurement) -> str:
-        # A released model has no training benchmark: it is in domain where some student is.
+        # A released model has no training benchmark. It is in domain if a trained model is.
         if m.benchmark in ({m.training_benchmark} if m.trained else trained_on):
             return "In domain"
         simulator = m.run.config.get("benchmark", {}).get("simulator")

@@ -1,9 +1,9 @@
 """Exact ranks: every frame of a database is scored for every query, at every width, in blocks.
 
-A score is the fp32 number nearest to the cosine of two embeddings' first entries. It is
-bit-identical in any block and position, so that equal frames tie and a target never loses to
-itself. Plain floating-point sums would depend on the order of the additions, which changes with the
-shape of a block; here no sum is rounded at all (see `GridEmbeddings`).
+The score at a width is the cosine of the first entries of two embeddings, as fp32. It is
+bit-identical in any block and at any position. Equal frames therefore tie, and a target never ranks
+below itself. Sums of floating-point numbers depend on the order of the additions, which changes
+with the shape of a block. Here the sums over entries are exact (see `GridEmbeddings`).
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from data.parallel import batched
 from evaluation.metrics.ranking import count_above_and_equal
 
 GRID = 2.0**26
-"""Steps of a unit vector's entries."""
-QUERIES, FRAMES = 256, 1024
-"""Size of a block: its scores stay in a core's cache while they are counted."""
+"""Entries of unit vectors are rounded to multiples of 1 / GRID."""
+BLOCK_QUERIES, BLOCK_FRAMES = 256, 1024
+"""Size of a block, whose scores fit in the cache of a core while they are counted."""
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """The frames that rank before each query's target.
+    """The numbers of frames that determine the rank of each query's target.
 
     Attributes:
-        widths: Widest first.
-        greater, tied: (widths, queries) frames that score above the target, and other frames that
-            score exactly as it does.
-        found: (queries,) False for a query that cannot be ranked: a miss.
-        frames: Size of the database.
-        vectors: Vectors that were searched; a multi-vector retriever has several per frame.
-        seconds: Time to rank for all queries, at all widths together.
+        widths: Embedding widths, widest first.
+        greater, tied: (widths, queries) numbers of frames that score above the target, and of other
+            frames that score exactly as the target does.
+        found: (queries,) False for a miss: a query that could not be ranked.
+        frames: Number of frames in the database.
+        vectors: Number of vectors in the database; a multi-vector retriever has several per frame.
+        seconds: Time to rank the database for all queries at all widths.
     """
 
     widths: tuple[int, ...]
@@ -50,23 +50,25 @@ class Ranks:
     def from_counts(
         cls, widths: Sequence[int], counts: np.ndarray, frames: int, vectors: int, began: float
     ) -> Ranks:
-        """Build the ranks from the counts (2, widths, queries) of the frames above each target, and
-        of those with its score, which include the target."""
+        """Build ranks without misses from the counts (2, widths, queries) of the frames that score
+        above the target and of the frames that score as it does, including the target itself.
+        `began` is the value of `time.perf_counter()` before the ranking."""
         (greater, equal), found = counts, np.ones(counts.shape[2], bool)
         seconds = time.perf_counter() - began
         return cls(tuple(widths), greater, equal - 1, found, frames, vectors, seconds)
 
 
 class GridEmbeddings:
-    """Embeddings split at their widths, each piece a unit vector rounded to an integer grid.
+    """Embeddings that are split at the widths into pieces, which are rounded to a grid.
 
-    The integers count steps of 1/`GRID`. By Cauchy-Schwarz, the products of two such pieces add up
-    to little more than 2^52 in any order, and float64 holds every integer up to 2^53: a dot product
-    of pieces is exact. The grid changes a cosine by about 2^-27, less than fp32 resolves.
+    Each piece is scaled to length 1 and stored as integers that count steps of 1 / `GRID`. By
+    Cauchy-Schwarz, the products of the entries of two pieces add up to little more than 2^52 in any
+    order. float64 represents every integer up to 2^53, so that the dot product of two pieces is
+    exact. The rounding changes a cosine by about 2^-27, less than the resolution of fp32.
 
     Attributes:
-        pieces: (rows, entries) float64 of each piece, narrowest first.
-        lengths: (pieces, rows) length of each piece, divided by `GRID`.
+        pieces: For each piece, from the first entries to the last, (rows, entries) in float64.
+        lengths: (pieces, rows) length of each piece before it is scaled, divided by `GRID`.
         norms: (pieces, rows) length of all entries up to the piece's end; 1 if they are all zero.
     """
 
@@ -93,9 +95,9 @@ class GridEmbeddings:
 
 
 def row_sums(values: np.ndarray) -> np.ndarray:
-    """Sum each row in place (rows,), by adding halves.
+    """Return the sums of the rows (rows,) and overwrite `values`.
 
-    Each row's sum is then the same whatever the other rows are.
+    The halves of the rows are added repeatedly, so that a sum does not depend on other rows.
     """
     while (width := values.shape[1]) > 1:
         half = (width + 1) // 2
@@ -105,16 +107,14 @@ def row_sums(values: np.ndarray) -> np.ndarray:
 
 
 def block_scores(queries: GridEmbeddings, frames: GridEmbeddings) -> Iterator[np.ndarray]:
-    """Yield the fp32 scores (queries, frames) of all pairs at each width, narrowest first."""
+    """Yield the fp32 scores (queries, frames) of all pairs at each width, narrowest width first."""
     products = (a @ b.T for a, b in zip(queries.pieces, frames.pieces, strict=True))
     return _cosines(products, queries.lengths[..., None], queries.norms[..., None], frames)
 
 
 def pair_scores(queries: GridEmbeddings, frames: GridEmbeddings) -> Iterator[np.ndarray]:
-    """Yield the fp32 scores (rows,) of each query and the frame in the same row, narrowest first.
-
-    They are bit-identical to those of `block_scores`.
-    """
+    """Yield the fp32 scores (rows,) of each query and the frame in the same row at each width,
+    narrowest width first. They are bit-identical to the scores of `block_scores`."""
     products = (
         np.einsum("ij,ij->i", a, b) for a, b in zip(queries.pieces, frames.pieces, strict=True)
     )
@@ -124,7 +124,7 @@ def pair_scores(queries: GridEmbeddings, frames: GridEmbeddings) -> Iterator[np.
 def _cosines(
     products: Iterable[np.ndarray], lengths: np.ndarray, norms: np.ndarray, frames: GridEmbeddings
 ) -> Iterator[np.ndarray]:
-    """Combine the exact products of pieces into each score separately, in one fixed order."""
+    """Add the exact products of the pieces, in the order of the pieces, and divide by the norms."""
     total = None
     for k, product in enumerate(products):
         product *= lengths[k]
@@ -136,24 +136,25 @@ def _cosines(
 def exact_ranks(
     queries: np.ndarray, targets: np.ndarray, database: Iterable[np.ndarray], widths: Sequence[int]
 ) -> Ranks:
-    """Count, for every query and width, the frames above its target and those that tie with it.
+    """Count, for every query and width, the frames that score above its target or tie with it.
 
     Args:
         queries: (queries, entries) finite fp32 embeddings.
         targets: (queries, entries) embeddings of each query's target, which is in the database.
-        database: Parts (frames, entries) of any size and order, of which one is in memory.
-        widths: Widest first.
+        database: Parts (frames, entries) in any order; only one of them is in memory at a time.
+        widths: Embedding widths, widest first.
     """
     began = time.perf_counter()
     grid = GridEmbeddings(queries, widths)
-    targets_of = list(pair_scores(grid, GridEmbeddings(targets, widths)))
+    target_scores = list(pair_scores(grid, GridEmbeddings(targets, widths)))
     counts = np.zeros((2, len(widths), len(queries)), np.int64)
     frames = 0
-    blocks = (rows for part in database for rows in batched(part, FRAMES))
+    blocks = (rows for part in database for rows in batched(part, BLOCK_FRAMES))
     for block in (GridEmbeddings(rows, widths) for rows in blocks):
         frames += len(block)
-        for start in range(0, len(queries), QUERIES):
-            some = slice(start, start + QUERIES)
-            for k, scores in enumerate(block_scores(grid[some], block)):
-                counts[:, k, some] += count_above_and_equal(scores, targets_of[k][some])
+        for start in range(0, len(queries), BLOCK_QUERIES):
+            rows = slice(start, start + BLOCK_QUERIES)
+            for k, scores in enumerate(block_scores(grid[rows], block)):
+                counts[:, k, rows] += count_above_and_equal(scores, target_scores[k][rows])
+    # The scores begin with the narrowest width, the ranks with the widest.
     return Ranks.from_counts(widths, counts[:, ::-1], frames, frames, began)

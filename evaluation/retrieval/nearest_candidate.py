@@ -1,4 +1,4 @@
-"""Choose the candidate that is nearest to an item's query, and score the choice."""
+"""Choose the candidate with the highest similarity to an item's prefix and question."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def score_candidates(
     frames: EmbeddingCache,
     preset: RetrieverConfig,
 ) -> np.ndarray:
-    """Return fp32 scores (items, candidates) at the widest width.
+    """Return the fp32 scores (items, candidates) at the widest width.
 
-    They are the scores that retrieval ranks by: equal embeddings tie to the last bit.
+    They are computed as in retrieval: equal embeddings have bit-identical scores.
     """
     query_rows = queries.rows([item.name for item in items])
     columns = []
@@ -31,13 +31,14 @@ def score_candidates(
 
             columns.append(late_scores(query_rows, frame_rows, preset.late.width))
         else:
-            rows = (GridEmbeddings(of, preset.widths[:1]) for of in (query_rows, frame_rows))
-            columns += pair_scores(*rows)
+            grids = [GridEmbeddings(r, preset.widths[:1]) for r in (query_rows, frame_rows)]
+            columns += pair_scores(*grids)
     return np.stack(columns, axis=1)
 
 
 def credit_choices(scores: np.ndarray, answers: Sequence[int]) -> np.ndarray:
-    """Return credits (items,): 1 for a target with the highest score, 1/m for one of m maxima."""
+    """Return credits (items,): 1 if the target alone has the highest score, 1/m if m candidates
+    with the target among them have it, and 0 otherwise."""
     best = is_best(scores)
     return best[np.arange(len(best)), answers] / best.sum(axis=1)
 

@@ -1,4 +1,8 @@
-"""The standard test of retrieval: its queries and database, the ranks, and the report."""
+"""The standard test of retrieval: its queries and database, the ranks and the report.
+
+The queries are test queries, equally many of each builder (the procedure that made a query). The
+database holds frames of test scenes, with every target among them.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 def load_standard_test(store: Store) -> tuple[list[RetrievalQuery], list[FrameRef]]:
-    """Return the queries and the database. Errors are those of `check_test`."""
+    """Return the queries and the database. Raise UserError as `check_test` does."""
     queries, database = store.standard_test(), store.database("test")
     check_test(store, queries, database)
     return queries, database
@@ -37,7 +41,7 @@ def rank_targets(
     targets: np.ndarray,
     database: Iterable[np.ndarray],
 ) -> Ranks:
-    """Rank exactly with a retriever's own scores. Arguments are those of `exact_ranks`."""
+    """Rank with `late_ranks` if the preset is a multi-vector retriever, else with `exact_ranks`."""
     if preset.late is not None:
         from evaluation.retrieval.late_interaction import late_ranks
 
@@ -48,15 +52,14 @@ def rank_targets(
 def write_ranks(
     folder: Path, ranks: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
 ) -> None:
-    """Write ranks.jsonl: for each retriever and query, the frames `before` the target and the other
-    frames `tied` with it, at each width; null for a miss."""
+    """Write ranks.jsonl. For a retriever and a query, a row has at each width the number of frames
+    `before` the target and the number of other frames `tied` with it."""
     rows = []
-    for name, retriever_ranks in ranks.items():
+    for name, result in ranks.items():
         for k, query in enumerate(queries):
-            row = {"by": name, "query_id": query.query_id, "widths": retriever_ranks.widths}
-            for key, of in (("before", retriever_ranks.greater), ("tied", retriever_ranks.tied)):
-                missing = [None] * len(retriever_ranks.widths)
-                row[key] = of[:, k].tolist() if retriever_ranks.found[k] else missing
+            row = {"by": name, "query_id": query.query_id, "widths": result.widths}
+            row["before"] = result.greater[:, k].tolist()
+            row["tied"] = result.tied[:, k].tolist()
             rows.append(row)
     write_json_lines(folder / "ranks.jsonl", rows)
 
@@ -68,12 +71,12 @@ def write_report(
     command: str = "retrieve",
     **entries: Any,
 ) -> None:
-    """Write report.txt, report.json and the figures.
+    """Write report.txt, report.json and retrieval.png.
 
     Args:
-        command: retrieve or two_stage, which have different reference rows.
-        extra_tables: Tables for report.txt after the main one.
-        entries: More entries of report.json.
+        extra_tables: Tables that follow the main table in report.txt.
+        command: retrieve or two_stage; determines which rows of the paper are shown.
+        entries: Entries of report.json besides `rows`.
     """
     table = str(tables.retrieval_table(rows, command))
     log.info("%s", table)

@@ -1,7 +1,7 @@
 """Two-stage retrieval: texts that a model writes about queries and frames, and the ranks by them.
 
-store/<name>/texts/<key>/texts.jsonl holds the texts in a `ResponseLog`. The key is the hash of the
-writing model's revision, so that every matcher uses the same texts.
+store/<name>/texts/<key>/texts.jsonl holds the texts in a `ResponseLog`. The key is a hash of the
+identity of the model that writes them, so that every matcher uses the same texts.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from models.student.prompts import Sample
 from teacher.sections import SECTIONS, split_sections
 
 TEXTS = "texts"
-"""Their folder in a store."""
+"""Folder of the texts in a store."""
 FUTURE_SECTIONS = ("Prediction", "Outcome")
-"""The sections of a rationale that describe the future state."""
+"""The sections of a rationale that describe the target."""
 HEADING = re.compile(
     rf"^[\W\d_]*({'|'.join(SECTIONS)})(?:[*_ \t]*:[*_ \t]*|[*_ \t]*$)", re.MULTILINE | re.IGNORECASE
 )
@@ -49,9 +49,10 @@ class Route:
     """A pipeline from a query to its ranking.
 
     Attributes:
-        title: Its name in tables, as in the paper's.
+        title: The route's name in tables, as in the paper.
         mode: The mode in which the model writes about a query.
-        captions: Whether captions of the database's frames are matched instead of the frames.
+        captions: Whether a query's text is matched to the model's captions of the frames instead
+            of to the frames.
     """
 
     title: str
@@ -67,10 +68,10 @@ ROUTES = {
 """The paper's three routes (Models and metrics)."""
 
 Texts = dict[str, str]
-"""Texts by the name of a query or frame; empty if nothing usable was written."""
+"""Texts by the name of a query or frame. A text is empty if the response has no usable text."""
 
 
-def write_texts(
+def collect_texts(
     cfg: TwoStageCommand,
     student: StudentConfig,
     model: Generator,
@@ -80,22 +81,23 @@ def write_texts(
     database: Sequence[FrameRef],
     store: Store,
 ) -> dict[str, list[ModelResponse]]:
-    """Return a model's responses by mode, in the modes that the routes need: to every frame in
-    caption mode, otherwise to every query.
+    """Return a model's responses by mode, in the modes that the routes need: to every frame of the
+    database in caption mode, to every query in the other modes.
 
     Raises:
         UserError: Another process collects this model's texts, or the model cannot respond.
     """
     modes = sorted({route.mode for route in routes}, reverse=True)
     modes += ["caption"] if any(route.captions for route in routes) else []
+    # The prompts of these modes do not depend on a training regime.
     settings = {
-        mode: response_settings(mode, "", student, cfg.seed, model.revision, store.identity, None)
+        mode: response_settings(mode, "", student, cfg.seed, model.identity, store.identity, None)
         for mode in modes
     }
-    folder = store.folder / TEXTS / settings_key(model.revision)
+    folder = store.folder / TEXTS / settings_key(model.identity)
     folder.mkdir(parents=True, exist_ok=True)
     responses = {}
-    busy = f"{folder} is in use by another process; run this again when it is done"
+    busy = f"{folder} is in use by another process: run this again when that process has ended"
     with lock_folder(folder, busy):
         log = ResponseLog(folder / "texts.jsonl", settings, [*queries, *database])
         for mode in modes:
@@ -108,26 +110,26 @@ def write_texts(
 
 
 def future_text(text: str) -> str:
-    """Return the prediction and outcome of a response if it has these sections, else all of it.
+    """Return the sections prediction and outcome of a response, or all of it if it lacks both.
 
-    A thought is left out; of a response that ends within its thought nothing is left.
+    Thinking is removed. A response that ends within its thinking yields an empty text.
     """
     return _future_sections(text) or _without_thought(text)
 
 
 def _without_thought(text: str) -> str:
-    # A tokenizer cannot read half of a surrogate pair, which a server may return.
+    # A server may return an unpaired surrogate, which tokenizers reject.
     return (strip_thought(text.encode(errors="replace").decode()) or "").strip()
 
 
 def _future_sections(text: str) -> str:
-    plain = HEADING.sub(lambda h: f"{h[1].capitalize()}: ", _without_thought(text))
+    plain = HEADING.sub(lambda match: f"{match[1].capitalize()}: ", _without_thought(text))
     sections = [(name, plain[start:stop].strip()) for name, start, stop in split_sections(plain)]
     return " ".join(text for name, text in sections if text and name in FUTURE_SECTIONS)
 
 
 def count_texts(responses: Sequence[ModelResponse]) -> dict[str, int]:
-    """Count a model's texts: all, empty, truncated, and those with a prediction or an outcome."""
+    """Count all texts, the empty and truncated ones, and those with a prediction or an outcome."""
     texts = [response.text for response in responses]
     return {
         "texts": len(texts),
@@ -146,22 +148,23 @@ def rank_by_text(
 ) -> Ranks:
     """Rank the database for every query by its text.
 
-    A query without a text is a miss. If captions are matched, so is a query whose target has none.
+    A query is a miss if its text is empty or, on a route with captions, its target's caption is.
 
     Args:
         texts: The texts of queries, and the captions of frames, by mode.
 
     Raises:
-        UserError: No query has a text, or embedding fails.
+        UserError: All queries are misses, or the texts or frames cannot be embedded.
     """
     names = [frame.name for frame in database]
+    # Without captions, the names stand for the frames: none of them is empty.
     captions = texts["caption"] if route.captions else {name: name for name in names}
     text_of = [texts[route.mode][query.name] for query in queries]
     valid = [bool(t and captions[q.target.name]) for t, q in zip(text_of, queries, strict=True)]
     if not any(valid):
         raise UserError(
-            f"{route.title}: no query has a text to match, see {matcher.store.folder / TEXTS}; a "
-            "thought may have taken all of student.max_new_tokens",
+            f"{route.title}: no query has a text to match (see {matcher.store.folder / TEXTS}): if "
+            "thinking takes all of student.max_new_tokens, raise this limit",
             code="no-texts",
         )
     text_of = list(compress(text_of, valid))

@@ -1,6 +1,6 @@
 """Run a human study: annotators sign in by personal links and answer selection items in a browser.
 
-The run's study.sqlite holds everything; after a stop or a kill the same command resumes the study.
+The run's study.sqlite has all data. After a stop or a kill, the same command resumes the study.
 `python -m evaluation.study.export run=NAME` exports the votes with their accuracy and agreement.
 """
 
@@ -38,7 +38,7 @@ def main(cfg: StudyCommand, run: Run) -> None:
         # Links are secrets: they go to the screen and to their file, not into the run's log.
         for name, link in auth.write_links(db, links, cfg.address).items():
             print(f"{name}  {link}")
-        log.info("a link signs in once; %s always holds the unused ones", links)
+        log.info("a link signs in once; %s always has the current, unused links", links)
         log.info("the study is running; stop it with Ctrl-C, resume it with the same command")
         app = routes.build_app(db, cfg, lambda: auth.write_links(db, links, cfg.address))
         routes.serve(app, listener)

@@ -1,7 +1,7 @@
 """Accuracy of annotators and of their majority, agreement, and decision times.
 
-A majority is strictly more than half of an item's votes. Items without one (1-1, 1-1-1) are
-undecided and count as wrong.
+A majority is strictly more than half of an item's votes. Items without a majority, such as items
+with one vote for each of two candidates, are undecided and count as wrong.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ def summarize_votes(votes: pd.DataFrame, items: int, annotators: Sequence[str]) 
 
     Args:
         votes: As `storage.read_votes` returns them.
-        items: Number of items in the study, answered or not.
+        items: Number of items in the study, with or without votes.
         annotators: All annotators, with or without votes.
 
     Returns:
-        `items`, `judgments`; `annotators`, those with votes; `depth`, the number of items by their
-        number of votes; `accuracy` by annotator, as `evaluation.metrics.results.Accuracy`;
-        `majority`, the same over the items with votes, and how many of them are `undecided`;
-        `fleiss_kappa` and its `items`, which all annotators answered; `krippendorff_alpha` and its
-        `items`, which have two votes or more; and median `seconds` by family.
+        `items`; `judgments`, the number of votes; `annotators` with votes; `depth`, the number of
+        items by number of votes; `accuracy` by annotator, as `evaluation.metrics.results.Accuracy`;
+        `majority`, the accuracy of the majority vote over the items with votes, and the number of
+        `undecided` items; `fleiss_kappa` over the `items` that all annotators with votes answered;
+        `krippendorff_alpha` over the `items` with two votes or more; and median `seconds`.
     """
-    # Votes (items, 4) for each candidate.
+    # The number of votes for each candidate (items, 4).
     counts = pd.crosstab(votes.item_id, votes.choice)
     counts = counts.reindex(columns=range(len(LETTERS)), fill_value=0)
     depth = counts.sum(axis=1)
@@ -41,8 +41,8 @@ def summarize_votes(votes: pd.DataFrame, items: int, annotators: Sequence[str]) 
     several = counts[depth > 1]
     items_by_depth = {0: items - len(counts), **depth.value_counts()}
     accuracy = {
-        name: asdict(accuracy_by_family(list(of.family), list(of.right)))
-        for name, of in votes.groupby("annotator")
+        name: asdict(accuracy_by_family(list(own.family), list(own.right)))
+        for name, own in votes.groupby("annotator")
     }
     return {
         "items": items,
@@ -58,36 +58,36 @@ def summarize_votes(votes: pd.DataFrame, items: int, annotators: Sequence[str]) 
 
 
 def majority(counts: pd.DataFrame) -> pd.Series:
-    """Return the choice of more than half of each item's votes; NaN for an item without one."""
+    """Return the candidate with more than half of each item's votes; NaN if there is none."""
     return counts.idxmax(axis=1).where(2 * counts.max(axis=1) > counts.sum(axis=1))
 
 
 def fleiss_kappa(counts: pd.DataFrame) -> float | None:
-    """Return Fleiss' kappa of items with the same number of votes, two or more; None if there are
-    no items, or all votes are for one candidate index."""
+    """Return Fleiss' kappa of items that all have the same number of votes, at least two. Return
+    None if there are no items, or if all votes are for the same candidate index."""
     from statsmodels.stats.inter_rater import fleiss_kappa as kappa
 
     return None if _is_undefined(counts) else float(kappa(counts.to_numpy()))
 
 
 def krippendorff_alpha(counts: pd.DataFrame) -> float | None:
-    """Return Krippendorff's alpha for nominal votes: one minus the disagreement within items over
-    the disagreement between any two votes. Items have two votes or more; None as for Fleiss' kappa.
-    """
+    """Return Krippendorff's alpha for nominal data: one minus the ratio of the disagreement within
+    items to the disagreement between any two votes. All items have at least two votes. Return None
+    in the same cases as `fleiss_kappa`."""
     if _is_undefined(counts):
         return None
     table = counts.to_numpy()
     depth, total = table.sum(axis=1), table.sum(axis=0)
     votes = total.sum()
-    # Ordered pairs of unequal votes; a pair within an item weighs one over its other votes.
+    # Ordered pairs of unequal votes. A pair in an item with n votes has the weight 1 / (n - 1).
     within = ((depth**2 - (table**2).sum(axis=1)) / (depth - 1)).sum() / votes
     between = (votes**2 - (total**2).sum()) / (votes * (votes - 1))
     return float(1 - within / between)
 
 
 def median_seconds(votes: pd.DataFrame) -> dict[str, dict[str, float | int]]:
-    """Return median decision times by family and clock, over votes whose page was loaded once: the
-    total viewing time of the others is unknown."""
+    """Return median decision times by family and clock. Only votes whose page was loaded once are
+    used: if a page was loaded several times, its total viewing time is unknown."""
     clocks = {"server": ("seconds", "median"), "client": ("client_seconds", "median")}
     once = votes[votes.loads == 1].groupby("family")
     return once.agg(**clocks, votes=("seconds", "size")).to_dict("index")

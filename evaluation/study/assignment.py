@@ -1,4 +1,4 @@
-"""The order of the items for each annotator, and the letters of their candidates."""
+"""Each annotator's order of the items, and order of the candidates of each item."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from data.tracks.quota import named_rng
 
 @dataclass(frozen=True)
 class Assignment:
-    """An item of an annotator.
+    """How one item is presented to one annotator.
 
     Attributes:
-        rank: Among items that may come next, the lowest rank comes first.
+        rank: Random rank of the item; among the items that may come next, the lowest rank is shown.
         order: The index of the candidate at each letter.
     """
 
@@ -30,23 +30,23 @@ class Assignment:
 def assign_items(
     items: Sequence[SelectionItem], annotators: Sequence[str], seed: int
 ) -> list[Assignment]:
-    """Return every annotator's order of items and candidates, by a cyclic Latin square.
+    """Return an assignment for each annotator and item.
 
-    The correct answers of an annotator are equally frequent at each letter, within one, over all
-    items and within each family. Each candidate of an item moves by one letter from one annotator
-    to the next, so that four annotators see it at four letters and comparing their pages does not
-    reveal the correct one.
+    For each annotator, every letter is correct equally often (up to a difference of one), over all
+    items and within each family. The orders of an item are a cyclic Latin square: from each
+    annotator to the next, every candidate moves by one letter. Four annotators thus see a candidate
+    at four letters, and comparing their pages does not reveal the correct candidate.
     """
-    # The item ids are part of the seed: without them nobody can compute the orders.
+    # The item ids are part of the seed, so that the orders cannot be computed without them.
     digest = hashlib.sha256("\n".join(i.item_id for i in items).encode()).hexdigest()
     rng = named_rng(seed, "study", digest)
     assignments = []
-    for turn, annotator in enumerate(annotators):
-        if turn % len(LETTERS) == 0:
+    for shift, annotator in enumerate(annotators):
+        if shift % len(LETTERS) == 0:
             orders = _balanced_orders(items, rng)
         ranks = named_rng(seed, "study", digest, annotator).permutation(len(items))
         for rank, item in zip(ranks, items, strict=True):
-            order = tuple(np.roll(orders[item.item_id], turn).tolist())
+            order = tuple(np.roll(orders[item.item_id], shift).tolist())
             assignments.append(Assignment(annotator, item.item_id, int(rank), order))
     return assignments
 
@@ -54,8 +54,8 @@ def assign_items(
 def _balanced_orders(
     items: Sequence[SelectionItem], rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Return a random order of each item's candidates. The letter of the correct answer advances by
-    one from item to item, family after family."""
+    """Return a random order of each item's candidates, by item id. If the items are sorted by
+    family, the letter of the correct candidate advances by one from each item to the next."""
     shuffled = [items[k] for k in rng.permutation(len(items))]
     start = int(rng.integers(len(LETTERS)))
     orders = {}

@@ -1,4 +1,4 @@
-"""Sign-in links, sessions, and protection against other sites."""
+"""Sign-in links, sessions, and protection against requests from other sites."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ HEADERS = {
     "X-Frame-Options": "DENY",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
-    # With no-referrer, browsers would not send a form's origin either.
+    # With no-referrer, browsers would send "null" as the origin of a form.
     "Referrer-Policy": "same-origin",
     "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
     "X-Robots-Tag": "noindex, nofollow",
-    # An answered item must not be shown again from a cache.
+    # A browser must not show an answered item again from its cache.
     "Cache-Control": "no-store",
 }
 """Headers of every response."""
@@ -45,35 +45,35 @@ def new_token() -> str:
 
 
 def write_links(db: sqlite3.Connection, path: Path, address: str) -> dict[str, str]:
-    """Write every annotator's unused link to a file that only its owner can read; return the links
-    by annotator."""
+    """Write the unused link of each annotator to a file that only its owner can read. Return the
+    links by annotator."""
     rows = db.execute("SELECT name, link FROM annotator ORDER BY rowid")
     links = {row["name"]: f"{address}/link/{row['link']}" for row in rows}
-    note = "# A link signs in once; a new one then replaces it, for another device of that person."
+    note = "# A link signs in once. Then a new link replaces it, for signing in on another device."
     path.touch(mode=0o600)
     path.chmod(0o600)
     path.write_text("\n".join([note, *(f"{name}  {link}" for name, link in links.items()), ""]))
     return links
 
 
-def is_unused(db: sqlite3.Connection, link: str) -> bool:
-    return db.execute("SELECT 1 FROM annotator WHERE link = ?", (link,)).fetchone() is not None
+def is_unused(db: sqlite3.Connection, token: str) -> bool:
+    return db.execute("SELECT 1 FROM annotator WHERE link = ?", (token,)).fetchone() is not None
 
 
-def sign_in(db: sqlite3.Connection, link: str) -> tuple[str, str] | None:
-    """Use a link, end the annotator's previous session, and return the annotator and the secret of
-    the new session; None if the link is used or unknown."""
+def sign_in(db: sqlite3.Connection, token: str) -> tuple[str, str] | None:
+    """Start a session with the token of a link, and end the annotator's previous session. Return
+    the annotator and the secret of the session; None if the link was used or is unknown."""
     session = new_token()
     with transaction(db):
         row = db.execute(
             "UPDATE annotator SET session = ?, link = ? WHERE link = ? RETURNING name",
-            (_hash(session), new_token(), link),
+            (_hash(session), new_token(), token),
         ).fetchone()
     return row and (row["name"], session)
 
 
 def find_annotator(db: sqlite3.Connection, session: str) -> sqlite3.Row | None:
-    """Return the annotator of a session, or None."""
+    """Return the annotator of a session, given by its secret, or None."""
     query = "SELECT * FROM annotator WHERE session = ?"
     return db.execute(query, (_hash(session),)).fetchone()
 
@@ -83,9 +83,9 @@ def _hash(session: str) -> str:
 
 
 def is_cross_site(headers: Headers) -> bool:
-    """Return whether the browser sent the form from a page of another site."""
+    """Return whether a browser sent the form from a page of another site."""
     if (site := headers.get("sec-fetch-site")) is not None:
         return site not in ("same-origin", "none")
-    # Browsers omit that header on plain http, except on this machine.
+    # Without https, browsers send that header only to this machine.
     origin = headers.get("origin")
     return origin is not None and origin.partition("://")[2] != headers.get("host")

@@ -1,4 +1,4 @@
-"""Export a study's votes with their accuracy and agreement; the study may be running."""
+"""Export the votes of a study with their accuracy and agreement. The study may be running."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The images and videos of an item, encoded from its pixels and without metadata."""
+"""Encode the frames of items as images and videos without metadata."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ VIDEO, IMAGE = "video/mp4", "image/png"
 PREFIX = -1
 """Slot of an item's prefix; the candidates have slots 0 to 3, in the item's order."""
 CRF = "12"
-"""Constant rate factor (quality) of x264, without visible loss."""
+"""Constant rate factor (quality) of x264: the loss is not visible."""
 SEI = "6"
-"""Type of the H.264 units in which x264 writes its version and settings."""
+"""Type of the H.264 units (SEI messages) in which x264 writes its version and settings."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Medium:
 
 
 def encode_media(item: SelectionItem, frames: FrameReader) -> list[Medium]:
-    """Encode an item's prefix as a video of all its frames at the scene's rate, and its candidates
-    as images of equal file size.
+    """Encode an item's prefix as a video with all of its frames at the scene's frame rate, and its
+    candidates as images of equal file size.
 
     Raises:
         UserError: The frames differ in size, or cannot be read.
@@ -44,7 +44,7 @@ def encode_media(item: SelectionItem, frames: FrameReader) -> list[Medium]:
     if len(sizes) > 1:
         raise UserError(
             f"item {item.item_id} has frames of different sizes, which would distinguish its "
-            "candidates: choose the study's items without it by items=FILE",
+            "candidates: give items=FILE with a list of items that leaves it out",
             code="frame-size",
         )
     [(height, width)] = sizes
@@ -52,7 +52,7 @@ def encode_media(item: SelectionItem, frames: FrameReader) -> list[Medium]:
     for pixels in candidates:
         Image.fromarray(pixels).save(target := io.BytesIO(), "PNG")
         images.append(target.getvalue())
-    # File sizes must not distinguish candidates. Decoders ignore what follows the end of a PNG.
+    # File sizes must not distinguish candidates. Decoders ignore bytes after the end of a PNG.
     size = max(map(len, images))
     video = encode_video(prefix, frames.scene(item.scene_id).fps)
     return [
@@ -64,7 +64,7 @@ def encode_media(item: SelectionItem, frames: FrameReader) -> list[Medium]:
 def encode_video(pixels: np.ndarray, fps: float) -> bytes:
     """Encode (frames, height, width, 3) uint8 as an mp4 (H.264) without dates or an encoder's name.
 
-    The codec needs even sides: an odd side repeats its last line.
+    The codec needs an even height and width: the last row or column of an odd size is repeated.
     """
     import av
     from av.bitstream import BitStreamFilterContext

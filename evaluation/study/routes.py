@@ -1,4 +1,4 @@
-"""The study's pages and its server. `/` always shows the page of the annotator's current stage."""
+"""The study's pages and server. `/` always shows the page of the annotator's current stage."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ COOKIE = "study"
 COOKIE_SECONDS = 90 * 24 * 3600
 MAX_FORM_BYTES = 4096
 MAX_SECONDS = 1e7
-"""Longest plausible time of a browser's clock."""
+"""Upper limit of the decision times that browsers may report."""
 BACKLOG = 2048
-"""Connections that may wait to be accepted."""
+"""Maximum number of connections that wait to be accepted."""
 REFUSALS = {
     401: "You are not signed in on this device. Open your link; if it has been used, ask for a new "
     "one.",
@@ -39,11 +39,11 @@ REFUSALS = {
     410: "This link has been used or is not valid. Ask for a new one.",
     500: "The server failed. Try again in a moment.",
 }
-"""Explanations of what annotators may meet; other requests come from no page of the study."""
+"""Explanations of the errors that annotators may see. The study's pages cause no other errors."""
 
 
 class Pages:
-    """The pages of one study. It calls `on_sign_in` after a link is used."""
+    """The pages of one study. `on_sign_in` is called after a link was used."""
 
     def __init__(
         self, db: sqlite3.Connection, cfg: StudyCommand, on_sign_in: Callable[[], object]
@@ -78,7 +78,7 @@ class Pages:
         return self._render(page, stage=stage, question=question)
 
     async def link(self, request: Request) -> Response:
-        # The link is used only when the form is sent, because mail programs open links too.
+        # The link is used only when this page's form is sent: mail programs also open links.
         link = request.path_params["link"]
         if not auth.is_unused(self._db, link):
             raise HTTPException(410)
@@ -93,8 +93,8 @@ class Pages:
         try:
             self._on_sign_in()
         except OSError as error:
-            # The link is already used, so that a failed request would lock its owner out.
-            log.warning("the file of links still holds the used link of %s: %s", name, error)
+            # The link is already used: if this request failed, its owner could not sign in.
+            log.warning("the file of links still has the used link of %s: %s", name, error)
         response = RedirectResponse("/", 303)
         response.set_cookie(
             COOKIE, session, max_age=COOKIE_SECONDS, httponly=True, samesite="lax",
@@ -133,13 +133,13 @@ class Pages:
         return Response(medium["content"], media_type=medium["kind"])
 
     async def refuse(self, request: Request, error: Exception) -> Response:
-        """Render the page of a refused request, which repeats nothing of the request."""
+        """Render the page of a refused request. It repeats no part of the request."""
         status = error.status_code if isinstance(error, HTTPException) else 500
         reason = REFUSALS.get(status, f"{HTTPStatus(status).phrase}.")
         return self._render("refusal", status, status=status, reason=reason)
 
     def _annotator(self, request: Request) -> sqlite3.Row:
-        """Return the annotator of the request's session; raise HTTPException 401 without one."""
+        """Return the annotator of the request's session. Raises HTTPException 401 if none."""
         annotator = auth.find_annotator(self._db, request.cookies.get(COOKIE, ""))
         if annotator is None:
             raise HTTPException(401)
@@ -166,7 +166,7 @@ async def read_form(request: Request) -> dict[str, str]:
     """Return the fields of a form.
 
     Raises:
-        HTTPException: 403 for a form on another site, 400 for a body that is not a form.
+        HTTPException: 403 for a form of another site, 400 for a body that is not a form.
     """
     if auth.is_cross_site(request.headers):
         raise HTTPException(403)
@@ -187,7 +187,7 @@ def _parse_seconds(text: str) -> float | None:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Open a listening socket; raise UserError if the address is in use or not this machine's."""
+    """Open a listening socket. Raises UserError if the address cannot be used."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family, backlog=BACKLOG)
@@ -201,7 +201,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 def serve(app: Starlette, listener: socket.socket) -> None:
     """Serve until Ctrl-C or SIGTERM."""
-    # Uvicorn's own log would record who requested what.
+    # Uvicorn's own log would record the requests of each annotator.
     settings = uvicorn.Config(
         app, log_config=None, log_level="warning", access_log=False, server_header=False,
         proxy_headers=False, lifespan="off", ws="none", backlog=BACKLOG,

@@ -24,22 +24,22 @@ from evaluation.study.media import encode_media
 
 
 def create_study(cfg: StudyCommand, path: Path) -> sqlite3.Connection:
-    """Create a study without media. Raises UserError."""
+    """Create a study without media. Raises UserError if its items cannot be chosen."""
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     items = choose_items(cfg, store)
     practice = sample_items(store.selection("train"), cfg.practice, cfg.seed, "practice")
     names = [f"A{k + 1}" for k in range(cfg.annotators)]
-    assignments = [a for of in (items, practice) for a in assign_items(of, names, cfg.seed)]
-    links = {name: auth.new_token() for name in names}
+    assignments = [a for chosen in (items, practice) for a in assign_items(chosen, names, cfg.seed)]
+    link_tokens = {name: auth.new_token() for name in names}
     about = {"benchmark": store.name, "identity": store.identity}
-    return storage.create(path, about, items, practice, links, assignments)
+    return storage.create(path, about, items, practice, link_tokens, assignments)
 
 
 def add_missing_media(cfg: StudyCommand, db: sqlite3.Connection, path: Path) -> None:
-    """Encode the media that the study lacks: all of them for a new study.
+    """Encode the media that the study lacks. A new study lacks all media.
 
     Raises:
-        UserError: The benchmark was rebuilt, or lacks the frames.
+        UserError: The benchmark differs from the study's, or its frames cannot be read.
     """
     missing = storage.items_without_media(db)
     if not missing:
@@ -58,7 +58,7 @@ def add_missing_media(cfg: StudyCommand, db: sqlite3.Connection, path: Path) -> 
 
 
 def choose_items(cfg: StudyCommand, store: Store) -> list[SelectionItem]:
-    """Return the test items that `items` names or counts. Raises UserError."""
+    """Return the test items that `cfg.items` lists, or as many as it says. Raises UserError."""
     if cfg.items.isdecimal():
         return sample_items(store.selection("test"), int(cfg.items), cfg.seed, "items")
     pool = store.selection("test") + store.selection("test", MATCHED_ANCHOR)
@@ -67,30 +67,30 @@ def choose_items(cfg: StudyCommand, store: Store) -> list[SelectionItem]:
     if missing := [item_id for item_id in ids if item_id not in by_id]:
         more = f" ({len(missing) - 1} more are missing)" if len(missing) > 1 else ""
         raise UserError(
-            f"item {missing[0]} is not a test item of {store.folder}{more}: name items of its "
-            "selection.parquet, or choose another benchmark=",
+            f"item {missing[0]} is not a test item of {store.folder}{more}: list items of its "
+            "selection.parquet, or give another benchmark=NAME",
             code="unknown-item",
         )
     return [by_id[item_id] for item_id in ids]
 
 
 def check_items(cfg: StudyCommand, db: sqlite3.Connection) -> None:
-    """Raise UserError if the file `items` names other items than those of the study."""
+    """Raise UserError if the file `cfg.items` lists other items than those of the study."""
     if cfg.items.isdecimal():
         return
     if read_item_ids(Path(cfg.items)) != storage.item_ids(db, practice=False):
         raise UserError(
-            f"items={cfg.items} names other items than the study in this run has: restore the "
+            f"items={cfg.items} lists other items than those of this run's study: restore the "
             "file, or start another study with run=NAME",
             code="different-items",
         )
 
 
 def read_item_ids(path: Path) -> list[str]:
-    """Return the ids in a file, one per line, plain or as the item_id of a JSON object.
+    """Return the item ids in a file. A line is an id, or a JSON object with an item_id.
 
     Raises:
-        UserError: The file cannot be read, names no item, or names an item twice.
+        UserError: The file cannot be read, lists no item, or lists an item twice.
     """
     try:
         lines = [line.strip() for line in path.read_text("utf-8").splitlines() if line.strip()]
@@ -108,7 +108,7 @@ def read_item_ids(path: Path) -> list[str]:
         ) from error
     repeated = [item_id for item_id, count in Counter(ids).items() if count > 1]
     if repeated or not ids:
-        problem = f"names {repeated[0]} more than once" if repeated else "names no item"
+        problem = f"lists {repeated[0]} more than once" if repeated else "lists no item"
         raise UserError(f"items={path} {problem}", code="invalid-items")
     return ids
 
@@ -116,11 +116,13 @@ def read_item_ids(path: Path) -> list[str]:
 def sample_items(
     pool: Sequence[SelectionItem], count: int, seed: int, setting: str
 ) -> list[SelectionItem]:
-    """Sample `count` items, the families in turn and the subtypes in turn within a family. Scenes
-    repeat only if no others are left, because one item's images could answer another item.
+    """Sample `count` items, spread evenly over the families, and over the subtypes of a family.
+
+    The images of an item could answer another item of the same scene. An item whose scenes were
+    already used is therefore sampled only if its family has no other items left.
 
     Raises:
-        UserError: The pool has fewer items than `setting`.
+        UserError: `pool` has fewer than `count` items; the message names `setting`.
     """
     if count > len(pool):
         raise UserError(

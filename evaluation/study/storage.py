@@ -27,6 +27,7 @@ MEDIA_PER_ITEM = 5
 
 SCHEMA = """
 CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
+-- place: position among the items, or among the practice items. answer: correct candidate index.
 CREATE TABLE item (
     item_id TEXT PRIMARY KEY, practice INTEGER NOT NULL, place INTEGER NOT NULL,
     suite TEXT NOT NULL, family TEXT NOT NULL, subtype TEXT NOT NULL, question TEXT NOT NULL,
@@ -37,14 +38,20 @@ CREATE TABLE medium (
     width INTEGER NOT NULL, height INTEGER NOT NULL, content BLOB NOT NULL,
     PRIMARY KEY (item_id, slot)
 ) STRICT;
+-- link: token of the unused link. session: hash of the session's secret. consented and begun: when
+-- the pages before practice and before the items were left. rests: number of breaks that were left.
 CREATE TABLE annotator (
     name TEXT PRIMARY KEY, link TEXT NOT NULL UNIQUE, session TEXT UNIQUE,
     consented REAL, begun REAL, rests INTEGER NOT NULL DEFAULT 0
 ) STRICT;
+-- rank and shown: `rank` and `order` of an `Assignment`.
 CREATE TABLE plan (
     annotator TEXT NOT NULL REFERENCES annotator, item_id TEXT NOT NULL REFERENCES item,
     rank INTEGER NOT NULL, shown TEXT NOT NULL, PRIMARY KEY (annotator, item_id)
 ) STRICT;
+-- An item that was opened for an annotator, and the answer. opened, loaded, answered: Unix times.
+-- loads: number of times that the page was loaded. choice: chosen candidate index. closed: 1 when
+-- the annotator has left the page.
 CREATE TABLE turn (
     token TEXT PRIMARY KEY, annotator TEXT NOT NULL, item_id TEXT NOT NULL, opened REAL NOT NULL,
     loaded REAL, loads INTEGER NOT NULL DEFAULT 0, letter TEXT, choice INTEGER,
@@ -60,16 +67,16 @@ def create(
     about: dict[str, str],
     items: Sequence[SelectionItem],
     practice: Sequence[SelectionItem],
-    links: dict[str, str],
+    link_tokens: dict[str, str],
     assignments: Sequence[Assignment],
 ) -> sqlite3.Connection:
     """Create a study without media.
 
     Args:
-        links: The token in the personal link of each annotator, by name.
+        link_tokens: The token in the link of each annotator, by name.
         assignments: One for each annotator and item, practice items included.
     """
-    # Only the owner may read the votes. SQLite's other files get the permissions of this one.
+    # Only the owner may read the votes. SQLite's other files get the permissions of this file.
     path.touch(mode=0o600)
     path.chmod(0o600)
     db = _connect(path)
@@ -89,14 +96,14 @@ def create(
             ":question, :scene_id, :prefix_stop, :answer)",
             item_rows,
         )
-        db.executemany("INSERT INTO annotator (name, link) VALUES (?, ?)", links.items())
+        db.executemany("INSERT INTO annotator (name, link) VALUES (?, ?)", link_tokens.items())
         db.executemany("INSERT INTO plan VALUES (?, ?, ?, ?)", plan_rows)
         db.execute(f"PRAGMA user_version = {VERSION}")
     return db
 
 
 def open_study(path: Path) -> sqlite3.Connection | None:
-    """Return the database of a study; None if it does not exist, or its creation was interrupted.
+    """Return the database of a study; None if it does not exist or its creation was interrupted.
 
     Raises:
         UserError: The database is damaged, locked, unreadable or of another version.
@@ -133,7 +140,7 @@ def open_study(path: Path) -> sqlite3.Connection | None:
 
 @contextmanager
 def transaction(db: sqlite3.Connection, read_only: bool = False) -> Iterator[None]:
-    """Commit the changes of the block at its end, or roll all of them back on an exception. A
+    """Commit the changes of the block at its end; after an exception, roll all of them back. A
     read-only transaction does not block writers."""
     db.execute("BEGIN" if read_only else "BEGIN IMMEDIATE")
     try:
@@ -145,7 +152,7 @@ def transaction(db: sqlite3.Connection, read_only: bool = False) -> Iterator[Non
 
 
 def read_about(db: sqlite3.Connection) -> dict[str, str]:
-    """Return the name of the study's benchmark as `benchmark`, and its digest as `identity`."""
+    """Return the name of the study's benchmark as `benchmark`, and its hash as `identity`."""
     return dict(tuple(row) for row in db.execute("SELECT key, value FROM about"))
 
 
@@ -171,14 +178,14 @@ def add_media(db: sqlite3.Connection, item_id: str, media: Sequence[Medium]) -> 
 
 
 def read_votes(db: sqlite3.Connection) -> pd.DataFrame:
-    """Return one row per annotator and answered item, without practice, ordered by the time of the
-    answer.
+    """Return the votes: a row for each annotator and answered item, without practice items, in the
+    order of the answers.
 
-    `answer` and `choice` are the indices of the correct and the chosen candidate in the benchmark's
-    order; `letter` is the chosen letter on the page, and `right` whether the choice is correct.
-    `seconds` (the server's clock) and `client_seconds` (the browser's) start when all media of the
-    page are loaded; if it was loaded several times (`loads`), at the last time. `answered` is an
-    ISO 8601 time in UTC.
+    `answer` and `choice` are the indices of the correct and the chosen candidate in the item of the
+    benchmark. `letter` is the chosen letter on the page. `right` is whether the choice is correct.
+    `seconds` (the server's clock) and `client_seconds` (the browser's clock) start when all media
+    of the page are loaded; if the page was loaded several times (`loads`), the last load counts.
+    `answered` is an ISO 8601 time in UTC.
     """
     import pandas as pd
 

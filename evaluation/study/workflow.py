@@ -1,7 +1,7 @@
 """The stages of an annotator: consent, practice, items with breaks between them, and the end.
 
-The stage follows from the database alone, so that nothing is lost when a page closes or the server
-stops. A step that does not belong to the current stage changes nothing.
+The database alone determines the stage, so that nothing is lost if a page is closed or the server
+stops. A request that does not belong to the current stage changes nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from evaluation.study.media import PREFIX
 from evaluation.study.storage import transaction
 
 ABANDONED_SECONDS = 3600.0
-"""Age from which an open, unanswered item no longer counts as a vote."""
+"""An item that was opened counts as a vote in `NEXT_ITEM` for this time, even without an answer."""
 TURN = "SELECT * FROM turn JOIN plan USING (annotator, item_id) JOIN item USING (item_id)"
 NEXT_ITEM = """
 WITH
@@ -37,11 +37,12 @@ WITH
 SELECT item_id FROM waiting JOIN progress USING (family) LEFT JOIN vote USING (item_id)
 WHERE prefix_stop = earliest ORDER BY share, coalesce(votes, 0), rank LIMIT 1
 """
-"""The item that an annotator opens next.
+"""Selects the item that is opened next for an annotator.
 
-An annotator progresses evenly through the families, so that the answers of one who stops early
-represent each in proportion. Within a family, the items with the fewest votes come first. Within a
-scene, the earliest prefix comes first, because a later one shows what follows it.
+It is of the family of which the annotator has seen the smallest share, so that even the answers of
+an annotator who stops early cover the families in proportion. Within a family, the items with the
+fewest votes come first. Within a scene, the item with the earliest prefix comes first, because a
+later prefix shows what happens after an earlier one.
 """
 
 
@@ -50,10 +51,10 @@ class Stage:
     """An annotator's current stage.
 
     Attributes:
-        page: consent, practice, feedback, ready, item, rest or done.
-        key: Value of the form field that identifies this step; an item's key cannot be guessed.
-        number: Number of the item on the page, or of the answered items.
-        total: Number of all items.
+        page: consent, practice, feedback (on a practice item), ready, item, rest or done.
+        key: Identifies the page in its form. The key of an item is its token, which is random.
+        number: Number of the item on the page, or else of the answered items.
+        total: Number of the practice items during practice, otherwise of the items.
     """
 
     page: str
@@ -63,7 +64,7 @@ class Stage:
 
 
 def current_stage(db: sqlite3.Connection, annotator: sqlite3.Row, rest_every: int) -> Stage:
-    """Return an annotator's stage, and open the next item if none is open."""
+    """Return an annotator's stage. If it shows an item and none is open, open the next item."""
     if annotator["consented"] is None:
         return Stage("consent", "consent")
     name = annotator["name"]
@@ -86,7 +87,7 @@ def current_stage(db: sqlite3.Connection, annotator: sqlite3.Row, rest_every: in
 
 
 def _progress(db: sqlite3.Connection, name: str, practice: bool) -> tuple[list[sqlite3.Row], int]:
-    """Return an annotator's answered turns, and the number of items."""
+    """Return the rows of an annotator's answered items, and the number of all items."""
     turns = db.execute(
         f"{TURN} WHERE annotator = ? AND practice = ? AND answered IS NOT NULL", (name, practice)
     )
@@ -95,7 +96,7 @@ def _progress(db: sqlite3.Connection, name: str, practice: bool) -> tuple[list[s
 
 
 def leave_page(db: sqlite3.Connection, annotator: sqlite3.Row, key: str, rest_every: int) -> None:
-    """Leave the page with this key, if it is the current one and asks no question."""
+    """Leave the page with this key, if it is the current page and has no open question."""
     stage = current_stage(db, annotator, rest_every)
     changes = {
         "consent": ("consented", time.time()),
@@ -114,7 +115,7 @@ def leave_page(db: sqlite3.Connection, annotator: sqlite3.Row, key: str, rest_ev
 
 
 def record_loaded(db: sqlite3.Connection, name: str, token: str) -> bool:
-    """Start the clock of an open item whose page is completely visible; return False if it is not
+    """Start the clock of an open item, whose media are loaded. Return False if the item is not
     open."""
     with transaction(db):
         changed = db.execute(
@@ -128,7 +129,7 @@ def record_loaded(db: sqlite3.Connection, name: str, token: str) -> bool:
 def record_answer(
     db: sqlite3.Connection, name: str, token: str, letter: str, client_seconds: float
 ) -> bool:
-    """Store the answer to an open, loaded item; return False if there is no such item."""
+    """Store the answer to an item. Return False if the item is not open or not loaded."""
     with transaction(db):
         turn = db.execute(
             f"{TURN} WHERE token = ? AND annotator = ? AND answered IS NULL AND loaded IS NOT NULL",
@@ -146,8 +147,8 @@ def record_answer(
 
 
 def load_question(db: sqlite3.Connection, token: str) -> dict[str, Any]:
-    """Return an item's `text` and the `width` and `height` of its media in px; of an answered
-    practice item also the `correct` and the `chosen` letter, which are else None."""
+    """Return the `text` of an item's question, the `width` and `height` of its media in pixels, and
+    the `correct` and the `chosen` letter if it is an answered practice item (otherwise None)."""
     turn = db.execute(f"{TURN} WHERE token = ?", (token,)).fetchone()
     query = "SELECT width, height FROM medium WHERE item_id = ? AND slot = ?"
     size = dict(db.execute(query, (turn["item_id"], PREFIX)).fetchone())
@@ -159,8 +160,8 @@ def load_question(db: sqlite3.Connection, token: str) -> dict[str, Any]:
 
 
 def load_medium(db: sqlite3.Connection, name: str, token: str, place: str) -> sqlite3.Row | None:
-    """Return the kind and content of a medium of the annotator's current page, or None. `place` is
-    prefix, or a candidate's letter."""
+    """Return the kind and content of a medium of the annotator's current page; None if there is no
+    such medium. `place` is "prefix" or the letter of a candidate."""
     query = f"{TURN} WHERE token = ? AND annotator = ? AND NOT closed"
     turn = db.execute(query, (token, name)).fetchone()
     if turn is None or place not in ("prefix", *LETTERS):
@@ -171,7 +172,7 @@ def load_medium(db: sqlite3.Connection, name: str, token: str, place: str) -> sq
 
 
 def _open_item(db: sqlite3.Connection, name: str, practice: bool) -> str:
-    """Return the token of the open item, and open the next item if none is open."""
+    """Return the token of the open item. If none is open, open the next item."""
     turn = db.execute(
         f"{TURN} WHERE annotator = ? AND practice = ? AND answered IS NULL", (name, practice)
     ).fetchone()

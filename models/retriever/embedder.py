@@ -1,11 +1,10 @@
 """Load retrievers with sentence-transformers, and embed queries and frames.
 
-A query is a video and a text; a frame is an image.
-
-Inputs follow Qwen3-VL-Embedding: the instruction is the system message, the video precedes the
-text, and a generation prompt ends the input. The embedding is the normalised hidden state of the
-last token, or one vector per token (`models.retriever.multi_vector`). Saved retrievers are plain
-`SentenceTransformer` or `MultiVectorEncoder` models.
+Inputs have the form of Qwen3-VL-Embedding's: the instruction is the system message, a video and a
+question (a query) or an image (a frame) are the user message, and a generation prompt follows. The
+embedding is the normalised hidden state of the last token, or one vector per token
+(`models.retriever.multi_vector`). Saved retrievers are plain `SentenceTransformer` or
+`MultiVectorEncoder` models.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from models.attention import choose_attention
-from models.checks import PEFT, check_family, check_modules, check_processor
+from models.checks import PEFT, check_is_qwen3_vl, check_modules, check_processor
 from models.compat import keep_differentiable
 from models.distributed import main_first
 from models.loading import (
@@ -44,15 +43,15 @@ from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
 Retriever = SentenceTransformer | MultiVectorEncoder
-"""A retriever with one vector per input, or with many."""
+"""A single-vector or a multi-vector retriever."""
 Item = RetrievalQuery | FrameRef
-"""What a retriever embeds."""
+"""An input of a retriever (not a selection item)."""
 
 ADAPTERS = "adapter_model.safetensors"
 """The file name of saved adapters."""
 PROCESSING = {
-    # By default sentence-transformers truncates long inputs, even within a video. Inputs are never
-    # truncated here: `train.common.audit` raises an error before training if a query is too long.
+    # By default, sentence-transformers truncates long inputs, even within a video. Here, inputs are
+    # not truncated; `train.common.audit` raises an error before training if a query is too long.
     "text": {"truncation": False},
     "video": {"do_sample_frames": False},
     "chat_template": {"add_generation_prompt": True},
@@ -65,17 +64,15 @@ def load_retriever(
     """Load a retriever for training.
 
     Args:
-        cfg: The preset.
         precision: bf16 or fp32, the precision of the forward and backward passes.
-        texts: Training texts of the tokenizer, if the preset has an `architecture` from which the
-            base is built. Otherwise unused.
-        folder: Where that base is saved before it is loaded.
+        texts: Texts on which the tokenizer is trained if the base is built from an `architecture`.
+        folder: Where a built base is saved before it is loaded.
 
     Raises:
-        UserError: The model is not on this machine and cannot be downloaded; it is not a Qwen3-VL,
-            has no vision tower or has the processor of another model; it is a saved retriever with
-            another pooling than the last token, or with trained modules after its backbone; or
-            `lora.targets` is an invalid pattern or matches no module that LoRA supports.
+        UserError: The model is not on this machine and cannot be downloaded; it is not a Qwen3-VL
+            or has the processor of another model; it is a saved retriever that does not pool the
+            last token, or that has other modules after its backbone; or `lora.targets` is an
+            invalid pattern or matches no module that LoRA supports.
     """
     source = cfg.model
     if cfg.architecture is not None:
@@ -90,7 +87,7 @@ def load_retriever(
         if is_sentence_transformer_model(source, revision=cfg.revision):
             check_modules(source, cfg.revision, late=cfg.late is not None)
         config = AutoConfig.from_pretrained(source, **origin)
-        check_family(source, config)
+        check_is_qwen3_vl(source, config)
         backbone = Transformer(
             source,
             model_kwargs={**weight_options(cfg, precision), **origin},
@@ -110,7 +107,7 @@ def load_retriever(
     else:
         pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
         model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **options)
-    # Training rows contain indices instead of texts, so a model card has no examples to show.
+    # Training rows contain indices instead of texts, of which a model card can show no examples.
     model.model_card_data.generate_widget_examples = False
     choose_attention(backbone.model, precision, cfg.max_length)
     keep_differentiable(backbone)
@@ -120,16 +117,13 @@ def load_retriever(
             model.add_adapter(config)
         for weight in backbone.parameters():
             if weight.requires_grad:
-                # Updates of this size would vanish in bf16's rounding.
+                # Updates of the adapters would vanish in bf16's rounding.
                 weight.data = weight.data.float()
     return model
 
 
 def load_adapters(model: Retriever, folder: Path) -> None:
-    """Load the adapters and the head that were saved in a folder into a retriever.
-
-    The head is the modules after the backbone.
-    """
+    """Load adapters, and the weights of the modules after the backbone, from a folder."""
     import peft
 
     weights = load_file(folder / ADAPTERS)
@@ -143,17 +137,17 @@ def load_adapters(model: Retriever, folder: Path) -> None:
 
 
 def load_head(model: Retriever, folder: Path) -> None:
-    """Load the weights of the modules after a retriever's backbone from a folder."""
-    for part in json.loads((folder / "modules.json").read_text())[1:]:
-        weights = folder / part["path"] / "model.safetensors"
+    """Load the weights of the modules after a retriever's backbone (its head) from a folder."""
+    for module in json.loads((folder / "modules.json").read_text())[1:]:
+        weights = folder / module["path"] / "model.safetensors"
         if weights.exists():
-            model[part["idx"]].load_state_dict(load_file(weights))
+            model[module["idx"]].load_state_dict(load_file(weights))
 
 
 def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retriever:
     """Load a retriever that `train.contrastive` or `train.export` saved in `folder`.
 
-    Adapters that are not merged are loaded over their base, in 4 bits if they were trained so.
+    Unless they are merged, adapters are loaded on their base, which is quantised as in training.
 
     Raises:
         UserError: `folder` contains no complete retriever, or its base is not on this machine.
@@ -169,12 +163,8 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
 
 
 def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
-    """Load a merged retriever that `train.export` saved, with sentence-transformers alone, in the
-    precision of its weights.
-
-    Raises:
-        UserError: The retriever cannot be read.
-    """
+    """Load a retriever that `train.export` merged, in the precision of its weights and with
+    sentence-transformers' classes only. Raises UserError if it cannot be read."""
     return _load_saved(folder, cfg, model_kwargs={"dtype": "auto", "use_safetensors": True})
 
 
@@ -187,20 +177,20 @@ def _load_saved(folder: Path, cfg: RetrieverConfig, **options: Any) -> Retriever
 def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
     """Return texts to train a tokenizer on: questions, instructions, roles and timestamps."""
     questions = sorted({q.question for q in queries})
-    clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
+    timestamps = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     roles = ["system", "user", "assistant"]
-    return [*questions, cfg.query_instruction, cfg.frame_instruction, *roles, *clock] * 10
+    return [*questions, cfg.query_instruction, cfg.frame_instruction, *roles, *timestamps] * 10
 
 
 def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQuery:
-    """Return the query with the most tokens. All clips have the same length; only texts differ."""
+    """Return the query with the most tokens. Only questions differ: all clips have one length."""
     encoded = tokenizer([q.question for q in queries], add_special_tokens=False).input_ids
     return queries[max(range(len(queries)), key=lambda k: len(encoded[k]))]
 
 
 def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig) -> dict[str, Any]:
-    """Return a query as sentence-transformers takes it: the prefix with its true times, and the
-    question."""
+    """Return a query as an input of sentence-transformers: the prefix as a video with its true
+    times, and the question."""
     indices = sample_prefix_frames(query.prefix_start, query.prefix_stop, cfg.frames)
     clip = load_clip(query.scene_id, indices, frames)
     array = torch.from_numpy(clip.pixels).permute(0, 3, 1, 2)
@@ -208,14 +198,14 @@ def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig
 
 
 def frame_input(frame: FrameRef, frames: FrameReader) -> Any:
-    """Return a frame as sentence-transformers takes it: an image."""
+    """Return a frame as an input of sentence-transformers: an image."""
     return frames.image(frame.scene_id, frame.frame)
 
 
 def model_inputs(
     items: Sequence[Item], frames: FrameReader, cfg: RetrieverConfig
 ) -> tuple[list[Any], str]:
-    """Return queries, or frames, as sentence-transformers takes them, and their instruction."""
+    """Return inputs of sentence-transformers, and their instruction; all items are of one type."""
     if isinstance(items[0], FrameRef):
         return [frame_input(frame, frames) for frame in items], cfg.frame_instruction
     return [query_input(query, frames, cfg) for query in items], cfg.query_instruction
@@ -228,13 +218,13 @@ def embed(
     cfg: RetrieverConfig,
     batch: int,
 ) -> list[torch.Tensor]:
-    """Embed queries or frames. Items are all of one kind.
+    """Embed queries or frames; all items are of one type.
 
     Args:
-        batch: Items per rank of which pixels are in memory at a time.
+        batch: Number of items per rank whose pixels are in memory at the same time.
 
     Returns:
-        An fp32 tensor on the CPU for each item, (width,) or (vectors, width).
+        For each item an fp32 tensor on the CPU, (width,) or, with many vectors, (vectors, width).
 
     Raises:
         UserError: An embedding is not finite.

@@ -1,8 +1,8 @@
 """The modules of a multi-vector retriever after its backbone.
 
 Each scored token has a vector: the backbone's state, projected to `late.width` and normalised. The
-score of a frame is, summed over the query's vectors, the greatest similarity with one of the
-frame's vectors (late interaction, ColBERT's MaxSim).
+score of a frame is the sum, over the query's vectors, of the greatest similarity to any vector of
+the frame (late interaction, ColBERT's MaxSim).
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ from models.retriever.scored_tokens import ScoredTokens
 
 MESSAGE_END = "<|im_end|>"
 
-# A saved model names its module by this path, and the library finds the file in the folder.
+# A saved model refers to the module by this path, and sentence-transformers finds the file in the
+# model's folder.
 ScoredTokens.__module__ = "scored_tokens"
 
 
 def load_multi_vector(folder: str, **options: Any) -> MultiVectorEncoder:
-    """Load a saved retriever with this project's `ScoredTokens`; code in the folder is not
-    executed."""
+    """Load a saved retriever with this project's `ScoredTokens`, without executing the copy of the
+    class in the folder."""
     classes = {"scored_tokens.ScoredTokens": ScoredTokens}
     return MultiVectorEncoder._load_with_module_classes(folder, classes, **options)
 
 
 def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module]:
-    """Return the backbone and the modules that compute vectors from its states. The projection is
-    initialised from a fixed seed."""
+    """Return the backbone and the modules that compute vectors from its states. The projection's
+    initial weights come from a fixed seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         projection = Dense(
@@ -52,12 +53,12 @@ def multi_vector_modules(backbone: Transformer, late: LateConfig) -> list[Module
 
 
 def keep_head_fp32(model: MultiVectorEncoder) -> None:
-    """Compute the projection in fp32: updates of its size vanish in bf16's steps."""
+    """Compute the projection in fp32: updates of its weights would vanish in bf16's rounding."""
     model[1].float().register_forward_pre_hook(cast_to_fp32)
 
 
 def cast_to_fp32(_: nn.Module, args: tuple[dict[str, Any]]) -> None:
-    """Convert the token states to fp32. This is a hook that is called before a `forward`."""
+    """Convert the token states to fp32. This is a forward pre-hook of the projection."""
     args[0]["token_embeddings"] = args[0]["token_embeddings"].float()
 
 

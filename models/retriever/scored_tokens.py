@@ -1,7 +1,7 @@
-"""Selects the tokens of a multi-vector retriever that are scored.
+"""Select the tokens whose vectors a multi-vector retriever compares (the scored tokens).
 
-This file is saved beside every model that uses it and needs only sentence-transformers:
-`MultiVectorEncoder(FOLDER, trust_remote_code=True)` loads the model without this project.
+This file is copied into the folder of every model that uses it, and needs only
+sentence-transformers: `MultiVectorEncoder(FOLDER, trust_remote_code=True)` loads the model.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from sentence_transformers.base.modules import Module
 
 
 class ScoredTokens(Module):
-    """Reduces `attention_mask` to the scored tokens: those of images and clips, and those after the
-    last of them up to the end of the message. The instruction, the template's tokens and a clip's
-    timestamps are not scored.
+    """Reduces `attention_mask` to the scored tokens: those of images and clips, and those from the
+    end of the last image or clip to the end of its message. The instruction, the template's tokens
+    and a clip's timestamps are not scored.
 
-    The library's `MultiVectorMask` selects tokens by id, which cannot separate the words and digits
-    of a question from those of the instruction and the timestamps.
+    Sentence-transformers' `MultiVectorMask` selects tokens by id, and thus cannot distinguish the
+    words and digits of a question from those of the instruction and the timestamps.
 
     Args:
         media_ids: Ids of the placeholder tokens of pixels.
@@ -40,14 +40,14 @@ class ScoredTokens(Module):
         return features
 
     def scored(self, ids: torch.Tensor, attended: torch.Tensor) -> torch.Tensor:
-        """(B, L) whether each token of `ids`, (B, L), is scored. Padding is not attended.
+        """Return a (B, L) mask of the scored tokens of `ids`, (B, L); `attended` is 0 for padding.
 
         Raises:
             ValueError: A row has neither an image nor a clip.
         """
         ends = ids == self.media_end
         if not ends.any(dim=1).all():
-            raise ValueError("an input has neither an image nor a clip, and only these are scored")
+            raise ValueError("an input has neither an image nor a clip, so it cannot be scored")
         text = ends.flip(1).cumsum(dim=1).flip(1) == 0
         text &= (text & (ids == self.message_end)).cumsum(dim=1) == 0
         media = torch.isin(ids, torch.tensor(self.media_ids, device=ids.device))
@@ -55,5 +55,5 @@ class ScoredTokens(Module):
 
     def save(self, output_path: str, *args: Any, **kwargs: Any) -> None:
         self.save_config(output_path)
-        # The library looks for the code of a module in the model's folder.
+        # Sentence-transformers looks for the code of a module in the model's folder.
         shutil.copy(__file__, Path(output_path).parent)

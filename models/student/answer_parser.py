@@ -1,9 +1,9 @@
 """Read the chosen letter from a model's response to a selection item.
 
-Only the text after the last `</think>` counts. A record (a JSON object with the key `choice` or
-`forced_choice`) is the only source if there is one; otherwise lines such as "Answer: B" are, and
-otherwise the response must be nothing but a letter, such as "(B)" or "Option b". The parser never
-guesses: a response that names several letters, or names one in passing, has no letter.
+Only the text after the last `</think>` is read. If it contains records (JSON objects with the key
+`choice` or `forced_choice`), the letter is read from these only; otherwise from lines such as
+"Answer: B"; and without such lines, the text must be nothing but a letter, such as "(B)" or "Option
+b". The parser never guesses: several letters, or a letter in passing, are no answer.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from data.records import LETTERS
 
 
 class Reason(StrEnum):
-    """Why a response has no letter. Beside a letter, `CUT_OFF` and `MALFORMED` mean that the record
-    is invalid JSON although its choice is complete; without one, that the choice is unreadable."""
+    """Why a response has no letter. A response with a letter may have the reasons `CUT_OFF` and
+    `MALFORMED` too: its record is then invalid JSON, but the choice in it is complete."""
 
     NO_ANSWER = "no answer"
     CUT_OFF = "cut off"
@@ -38,7 +38,7 @@ class ParsedAnswer:
     Attributes:
         letter: The chosen letter in upper case, or None.
         reason: What is wrong with the response, or None.
-        record: The text of the record, if the response holds exactly one and it is valid JSON.
+        record: The text of the record, if there is exactly one and it is valid JSON.
     """
 
     letter: str | None
@@ -55,8 +55,8 @@ _STRING = r""""(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*'"""
 _JUNK = r"""[^a-z0-9"']{0,4}"""
 _CHOICE = rf"(?:{_JUNK.join('forced')}{_JUNK})?{_JUNK.join('choice')}"
 _KEY = rf"""["']{_JUNK}{_CHOICE}{_JUNK}["'][^a-z0-9"':]{{0,4}}:\s*"""
-# A string, a list, or unquoted text, whose length is bounded: a long response is read in linear
-# time. A string that text follows at once, or on a new line, has lost a quote or a comma.
+# A value is a string, a list, or unquoted text. Bounding the length of the latter makes the time
+# linear. If text follows a string directly or on a new line, a quote or a comma is missing.
 _VALUE = (
     rf"""(?:{_STRING})(?=\s*(?:[,}}\]"']|$))|\[[^\[\]{{}}]*\]|(?!,|(?:{_STRING})(?:\w|\s*[\n:]))"""
     rf"""(?:[^\n{{}}"'\[\]]|{_STRING}){{1,200}}?(?=,\s*["'}}]|[\n}}])"""
@@ -100,7 +100,7 @@ _REFUSAL = re.compile(
     r"(?:answer|option|choice|candidate|image)",
     re.IGNORECASE,
 )
-# A letter that its own sentence or the next line withdraws.
+# Text after a letter, in the same sentence or in the next line, that withdraws it.
 _WITHDRAWAL = re.compile(
     r"\bwait\b|\b(?:that|this|it)(?:['’]s| is) (?:wrong|incorrect|not right)"
     r"|^\W*(?:(?:which|that|this|it)\s+)?(?:(?:is|was|seems|looks|would be)\s+)?"
@@ -117,13 +117,11 @@ _SECOND_THOUGHT = re.compile(
 
 
 def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedAnswer:
-    """Read the choice of a response.
-
-    A chat template that opens `<think>` itself leaves it out of the response: put it back in front,
-    or a thought that was cut off is read as an answer.
+    """Read the chosen letter from a response.
 
     Args:
-        raw: The whole response.
+        raw: The whole response. If the prompt ends with `<think>`, prepend the tag to the response;
+            otherwise a thought that was cut off is read as an answer.
         letters: The letters of the candidates, upper case.
         cut: Whether generation stopped at the token limit, so that the last word may be incomplete.
     """
@@ -138,7 +136,7 @@ def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedA
         return ParsedAnswer(answer.letter, broken or answer.reason, record)
     if flag is Reason.CUT_OFF:
         return ParsedAnswer(None, flag)
-    # "xx" extends a last word that was cut off, so that it cannot be read as a letter.
+    # With "xx" appended, a last word that may have been cut off cannot be read as a letter.
     answer = _read_prose(f"{prose}xx" if cut else prose, letters)
     if cut and answer.reason is Reason.NO_ANSWER:
         return ParsedAnswer(None, Reason.CUT_OFF)
@@ -146,14 +144,14 @@ def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedA
 
 
 def strip_thought(text: str) -> str | None:
-    """Return the text after the last `</think>`, or None if a thought is not closed."""
+    """Return the text after the last `</think>`, or None if a later `<think>` is not closed."""
     response = _THOUGHT_END.split(text)[-1]
     return None if _THOUGHT_START.search(response) else response
 
 
 def _read_records(text: str) -> tuple[list[str | None], list[str], Reason | None, str]:
-    """Return the choices of all records, the records with a choice, what is wrong with the records,
-    and the text outside them."""
+    """Return the choices of all records (None for an unreadable one), the complete records with a
+    choice, what is wrong with the records (None if nothing is), and the text outside of records."""
     choices, records, prose, flag, position = [], [], [], None, 0
     while match := _RECORD_START.search(text, position):
         prose.append(text[position : match.start()])
@@ -169,11 +167,11 @@ def _read_records(text: str) -> tuple[list[str | None], list[str], Reason | None
 
 
 def _read_record(text: str, start: int) -> tuple[list[str | None], int | None]:
-    """Return the choices of the record that opens at `start` (None for one that cannot be read),
-    and its end (None if it is cut off).
+    """Return the choices in the record that begins at `start` (None for an unreadable choice), and
+    the record's end (None if it is cut off).
 
-    The choice stands at the record's outermost level. Deeper ones only contradict it: a new record
-    may follow one that was broken off.
+    Without a choice at its outermost level, a record has no choices. With one, choices at deeper
+    levels count too, because another record may begin inside a record that was broken off.
     """
     choices: list[tuple[int, str | None]] = []
     depth, end = 0, None
@@ -207,7 +205,7 @@ def _is_json(text: str) -> bool:
 
 
 def _read_prose(prose: str, letters: str) -> ParsedAnswer:
-    """Read answer lines, or a text that is only a letter."""
+    """Read answer lines, such as "Answer: B"; without these, a text that is only a letter."""
     lines = [*_ANSWER_LINE.finditer(prose)]
     if not lines:
         return _read_lone_letter(prose, letters)
@@ -219,7 +217,7 @@ def _read_prose(prose: str, letters: str) -> ParsedAnswer:
 
 
 def _apply_second_thought(answer: ParsedAnswer, line: str, letters: str) -> ParsedAnswer:
-    """Drop a letter that the line after it withdraws, alone or for another letter."""
+    """Discard the letter of an answer if the next line withdraws it or names another letter."""
     opening = _SECOND_THOUGHT.match(line)
     rest = line[opening.end() :] if opening else line
     if (opening and not rest.strip()) or _WITHDRAWAL.fullmatch(
@@ -243,7 +241,7 @@ def _read_lone_letter(text: str, letters: str) -> ParsedAnswer:
 
 def _read_statement(value: str | None, letters: str) -> ParsedAnswer:
     """Read a short statement, such as "B", "option (C)" or "B, because the cube has turned"; None
-    is an unreadable one."""
+    stands for an unreadable statement."""
     if value is None:
         return ParsedAnswer(None, Reason.MALFORMED)
     value = _strip_markup(value)
@@ -269,7 +267,7 @@ def _strip_markup(value: str) -> str:
 
 
 def _agreed(answers: Sequence[ParsedAnswer]) -> ParsedAnswer:
-    """Combine several statements; those without an answer do not count."""
+    """Combine several answers into one; those with the reason `NO_ANSWER` are ignored."""
     distinct = {answer for answer in answers if answer.reason is not Reason.NO_ANSWER}
     if len(distinct) > 1:
         return ParsedAnswer(None, Reason.SEVERAL)

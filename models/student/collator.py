@@ -1,9 +1,9 @@
 """Turn conversations into tensors.
 
-The ids of a prompt are exactly those that the processor returns at inference. The response is
-encoded separately and appended, so that the supervised tokens are those that have to be generated.
-Batches are padded on the left: the supervised tokens are then the last ones of every row, and only
-their positions pass the head.
+The token ids of a prompt are the same in training and inference. The response is encoded separately
+and appended, so that it consists of the tokens that the model has to generate. Batches are padded
+on the left, so that the supervised tokens are the last ones of every row and the language head only
+has to compute the logits of these positions.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from data.records import LETTERS
 from models.student.prompts import Sample, answer_line
 
 IGNORED = -100
-"""Label of an unsupervised token, torch's default `ignore_index`."""
+"""Label of a token that is not in the loss: the default `ignore_index` of torch's cross-entropy."""
 MEDIA = {
     "image": ("pixel_values", "image_grid_thw"),
     "video": ("pixel_values_videos", "video_grid_thw"),
@@ -47,13 +47,13 @@ def encode(
     """Encode a conversation; without a response, only its prompt.
 
     Args:
-        thinking: Value of `enable_thinking` for chat templates that have it.
+        thinking: Value of the variable `enable_thinking` of chat templates that have it.
 
     Raises:
-        UserError: the conversation is longer than `max_length` tokens. It is never truncated, since
-            the cut could fall within an image.
+        UserError: The conversation has more than `max_length` tokens. It is not truncated, because
+            an image could be cut.
     """
-    # The processor would receive a variable that the template does not use.
+    # A variable that the template does not use would be passed on to the processor.
     options = {"enable_thinking": thinking}
     text = processor.apply_chat_template(
         [{"role": "user", "content": sample.content}],
@@ -79,8 +79,8 @@ def encode(
     if len(ids) + len(response) > max_length:
         raise UserError(
             f"sample {sample.sample_id} has {len(ids) + len(response)} tokens, more than "
-            f"student.max_length={max_length}: raise it, or lower student.image_size or "
-            "student.frames",
+            f"student.max_length={max_length}: raise student.max_length, or lower "
+            "student.image_size or student.frames",
             code="sample-too-long",
         )
     media = {name: prompt[name] for name in MEDIA_INPUTS if name in prompt}
@@ -89,10 +89,10 @@ def encode(
 
 
 class Collator:
-    """Makes left-padded batches of conversations: tensors that the model's `forward` takes.
+    """Makes left-padded batches of conversations: the tensors that the model's `forward` takes.
 
-    Batches with responses also have `labels` (B, K) for the last K positions, which
-    `logits_to_keep` (K,) lists; the logits of position j predict label j + 1.
+    Batches with responses also contain `labels` (B, K) for the last K positions, and the indices
+    `logits_to_keep` (K,) of these positions. The logits at position j predict label j + 1.
     """
 
     def __init__(self, processor: ProcessorMixin, max_length: int, thinking: bool = False) -> None:
@@ -106,7 +106,7 @@ class Collator:
         labels = batch.pop("labels")
         if (labels == IGNORED).all():
             return batch
-        # The position before the first supervised token predicts it.
+        # The logits that predict the first supervised token are at the position before it.
         start = int((labels != IGNORED).any(dim=0).nonzero()[0]) - 1
         labels[[not sample.supervised for sample in samples]] = IGNORED
         batch["labels"] = labels[:, start:]
@@ -115,7 +115,7 @@ class Collator:
 
 
 def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:
-    """Left-pad to the longest conversation and concatenate the media in order."""
+    """Left-pad conversations to the longest one, and concatenate their media in order."""
 
     def stack(rows: Iterable[list[int]], filler: int) -> torch.Tensor:
         tensors = [torch.tensor(row) for row in rows]
@@ -134,10 +134,10 @@ def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:
 
 
 def letter_ids(processor: ProcessorMixin) -> list[int]:
-    """Return the token of each letter in an answer line.
+    """Return the ids of the tokens that stand for the letters in an answer line.
 
     Raises:
-        UserError: the tokenizer has no single token for each letter.
+        UserError: The tokenizer has no single token for each letter.
     """
     encode_text = processor.tokenizer.encode
     lines = [encode_text(answer_line(letter), add_special_tokens=False) for letter in LETTERS]
@@ -145,7 +145,7 @@ def letter_ids(processor: ProcessorMixin) -> list[int]:
     if len({tuple(line[:-1]) for line in lines}) != 1 or len(set(last)) != len(LETTERS):
         raise UserError(
             f"the tokenizer of {processor.tokenizer.name_or_path} has no single token for each "
-            "answer letter: give a student.model with another tokenizer",
+            "answer letter: choose a student.model with another tokenizer",
             code="unsuitable-tokenizer",
         )
     return last

@@ -1,7 +1,7 @@
 """Generate text with a model that is loaded in this process.
 
-Tokens are sampled with one seed per response, so that the sample does not depend on the other
-responses of its batch, or on where a killed command resumed.
+Each response is sampled with its own seed, so that it depends neither on the other responses in its
+batch nor on the response at which a killed command resumes.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from conf.schema import StudentConfig
 from models.loading import DTYPES
 
 ANSWER_TOKENS = 16
-"""Maximum number of new tokens in answer mode: enough for the answer line, even a malformed one."""
+"""Maximum number of new tokens in answer mode: enough for an answer line, even a malformed one."""
 THOUGHT_TAG = "<think>"
-"""Opens a thought. A prompt may end with it."""
+"""Tag that opens a thought. Some chat templates end prompts with it."""
 TAG_SEARCH_TOKENS = 8
-"""Number of a prompt's last tokens that are searched for the tag."""
+"""Number of tokens at the end of a prompt in which the tag is searched."""
 
 
 def response_token_limit(mode: str, max_new_tokens: int, thinking: bool = False) -> int:
     """Return the maximum number of new tokens: `ANSWER_TOKENS` in answer mode without thinking,
-    else `max_new_tokens`."""
+    otherwise `max_new_tokens`."""
     return ANSWER_TOKENS if mode == "answer" and not thinking else max_new_tokens
 
 
 @dataclass(frozen=True)
 class GeneratedText:
-    """A model's text, and whether the token limit cut it."""
+    """A generated text, and whether it was cut off at the token limit."""
 
     text: str
     cut: bool = False
@@ -53,10 +53,10 @@ def generate(
     precision: str,
     processors: LogitsProcessorList | None = None,
 ) -> list[GeneratedText]:
-    """Generate a response to each of a batch of left-padded prompts.
+    """Generate a response to each prompt of a left-padded batch.
 
-    Each new token has the largest logit after `processors` are applied; with those of
-    `sampling_processors` it is a sample.
+    Decoding is greedy: each new token has the largest logit after `processors` are applied. With
+    the processors of `sampling_processors`, this token is a random sample.
 
     Args:
         inputs: What `Collator` returns for samples without responses, all in one mode.
@@ -69,7 +69,7 @@ def generate(
     device = next(model.parameters()).device
     inputs = {name: value.to(device) for name, value in inputs.items() if name != "labels"}
     autocast = torch.autocast(device.type, DTYPES[precision], enabled=precision == "bf16")
-    # Not torch.inference_mode: tensors that the model keeps could not be used in training later.
+    # Tensors that the model stores under torch.inference_mode could not be used in later training.
     with torch.no_grad(), autocast:
         ids = model.generate(
             **inputs,
@@ -92,8 +92,8 @@ def generate(
 
 
 def sampling_processors(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProcessorList:
-    """Return logits processors that turn greedy decoding into sampling, with one seed per row. The
-    list is empty at temperature 0."""
+    """Return logits processors that turn greedy decoding into sampling, with one seed per row. At
+    temperature 0, the list is empty."""
     processors = LogitsProcessorList()
     if cfg.temperature:
         processors.append(TemperatureLogitsWarper(float(cfg.temperature)))
@@ -106,7 +106,7 @@ def sampling_processors(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProce
 
 
 class GumbelNoise(LogitsProcessor):
-    """Adds Gumbel noise to the logits (B, V): the argmax is then a sample from their softmax."""
+    """Adds Gumbel noise to logits (B, V), whose argmax is then a sample from their softmax."""
 
     def __init__(self, seeds: Sequence[int]) -> None:
         self._seeds = seeds
@@ -114,7 +114,7 @@ class GumbelNoise(LogitsProcessor):
 
     def __call__(self, input_ids: torch.LongTensor, scores: torch.FloatTensor) -> torch.FloatTensor:
         if self._generators is None:
-            # The device is not known earlier.
+            # The device is known only from the first logits.
             self._generators = [
                 torch.Generator(scores.device).manual_seed(seed) for seed in self._seeds
             ]

@@ -1,12 +1,12 @@
 """Build the conversations that a student reads and writes.
 
-A selection prompt is the prefix as a video with its true times, the question, the four candidates
-as labelled images, and an instruction. In reasoning mode the response is the rationale as the
-regime keeps it, one line per candidate that says whether it matches (the match layout, in regimes
-that have it), and the answer line; in answer mode it is the answer line alone.
+A selection prompt consists of the prefix as a video with its true times, the question, the four
+candidates as labelled images, and an instruction. In reasoning mode, the response is the rationale,
+the match layout (one line per candidate that says whether it matches) and the answer line; some
+regimes (`train.regime`) leave parts out. In answer mode, it is only the answer line.
 
-Prompts without candidates ask for text: a description of the future frame of a retrieval query,
-with or without reasoning, or of a single frame.
+Prompts without candidates ask for a text: a rationale about a retrieval query, or a description of
+the query's future frame or of a single frame.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ TEXT_INSTRUCTIONS = {
     "caption": "Describe in a sentence or two the objects that the frame shows, and where each of "
     "them is.",
 }
-"""Instructions for prompts without candidates."""
+"""Instructions of prompts without candidates, by mode."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class Clip:
 
     Attributes:
         pixels: (T, S, S, 3) uint8.
-        indices: The scene's frame that each of the T frames is.
+        indices: Index in the scene of each of the T frames, in ascending order.
         fps: Frames per second of the scene.
-        total: Frames of the scene.
+        total: Number of frames of the scene.
     """
 
     pixels: np.ndarray
@@ -60,7 +60,7 @@ class Clip:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """The true times, so that a processor neither samples frames nor assumes a frame rate."""
+        """The true times; given them, a processor neither samples frames nor assumes a rate."""
         return {
             "fps": float(self.fps),
             "total_num_frames": self.total,
@@ -70,10 +70,11 @@ class Clip:
 
 @dataclass(frozen=True)
 class ObjectLabel:
-    """An object that is visible in one of a sample's pictures.
+    """A visible object in a picture of a sample: in an image, or in a pair of a clip's frames,
+    which the vision tower encodes together.
 
     Attributes:
-        picture: Index of the picture: pairs of a clip's frames first, then images.
+        picture: Index of the picture; the pictures of the clip precede the images.
         place: Column and row of the object as shares of the picture's width and height.
         words: The words that name the object.
     """
@@ -88,11 +89,11 @@ class Sample:
     """A conversation with its media, before tokenization.
 
     Attributes:
-        content: Parts of the user message as chat templates take them; media are placeholders.
+        content: Parts of the user message in the form of chat templates, without pixels.
         clip: The prefix, or None for a prompt without video.
-        images: (S, S, 3) uint8 pixels of each image in order, such as the candidates.
+        images: (S, S, 3) uint8 pixels of the images, such as the candidates, in order.
         response: The assistant's text, or None if it is to be generated.
-        supervised: Whether the response is trained on. An unsupervised sample only fills a batch.
+        supervised: Whether the response is trained on; if not, the sample only fills a batch.
         object_labels: Visible objects, for the training of the tiny base.
     """
 
@@ -106,7 +107,7 @@ class Sample:
 
     @property
     def pictures(self) -> int:
-        """Images, and pairs of a clip's frames."""
+        """Number of pictures: images, and pairs of a clip's frames."""
         return len(self.images) + ((len(self.clip.indices) + 1) // 2 if self.clip else 0)
 
 
@@ -115,7 +116,7 @@ def answer_line(letter: str) -> str:
 
 
 def instruction(mode: str, regime: str) -> str:
-    """Return the instruction that ends a prompt."""
+    """Return the instruction with which a prompt of this mode and regime ends."""
     if mode in TEXT_INSTRUCTIONS:
         return TEXT_INSTRUCTIONS[mode]
     if mode == "answer":
@@ -131,11 +132,11 @@ def instruction(mode: str, regime: str) -> str:
 
 
 def response(rationale: str, matches: Sequence[str], letter: str, mode: str, regime: str) -> str:
-    """Return the response that a student of a regime is trained on.
+    """Return the response on which a regime trains a student in a mode.
 
     Args:
-        rationale: The teacher's full text; unused in answer mode.
-        matches: One line per candidate, in order.
+        rationale: The teacher's full text; not used in answer mode.
+        matches: The lines of the match layout, one per candidate.
     """
     if mode == "answer":
         return answer_line(letter)
@@ -169,11 +170,10 @@ def selection_sample(
     """Return the conversation about a selection item.
 
     Args:
-        mode: reasoning or answer.
-        frame_count: Frames of the prefix that are visible.
+        frame_count: Number of frames of the prefix that are visible.
         response: The assistant's text, or None if it is to be generated.
-        control: How the prefix is altered (see `data.tracks.controls`).
-        text: The instruction, if it is not that of the mode.
+        control: How the prefix is altered (see `data.tracks.controls`); None leaves it unchanged.
+        text: The instruction; None uses the instruction of the mode and the regime.
     """
     visible = prefix_under_control(item, frame_count, control)
     parts: list[str | np.ndarray] = [item.question]
@@ -187,8 +187,8 @@ def selection_sample(
 def text_sample(
     frames: FrameReader, frame_count: int, mode: str, subject: RetrievalQuery | FrameRef
 ) -> Sample:
-    """Return the prompt of a mode of `TEXT_INSTRUCTIONS` about a query (its prefix and question) or
-    about a frame."""
+    """Return a prompt with an instruction of `TEXT_INSTRUCTIONS`, about a query (its prefix and
+    question) or about a single frame."""
     name, text = f"{subject.name} ({mode})", f"\n{TEXT_INSTRUCTIONS[mode]}"
     if isinstance(subject, FrameRef):
         pixels = frames.array(subject.scene_id, subject.frame)
@@ -199,7 +199,7 @@ def text_sample(
 
 
 def load_clip(scene_id: str, indices: list[int], frames: FrameReader) -> Clip:
-    """Return frames of a scene as a clip. The times increase whatever the order of `indices`."""
+    """Return frames of a scene as a clip. Its times ascend, even if the frames are shuffled."""
     scene = frames.scene(scene_id)
     return Clip(frames.stack(scene_id, indices), sorted(indices), scene.fps, scene.frames)
 
@@ -211,7 +211,8 @@ def conversation(
     clip: Clip | None = None,
     object_labels: Sequence[ObjectLabel] = (),
 ) -> Sample:
-    """Return a sample of a clip, if any, followed by `parts`: texts and (S, S, 3) uint8 images."""
+    """Return a sample whose user message is the clip, if any, and then `parts`, which are texts and
+    (S, S, 3) uint8 images."""
     content: list[dict[str, Any]] = [{"type": "video"}] if clip else []
     content += [
         {"type": "text", "text": part} if isinstance(part, str) else {"type": "image"}

@@ -1,11 +1,11 @@
 """Finds every number in prose: digits, number words, and disguised spellings of both.
 
-Policy: counts, counting ordinals, fractions, multiples, quantities and measured time are numbers.
-"First," at the start of a sentence, "both", "pair", "one another", "the other one", "once struck",
-"no one" and "one side" are not.
+Counts, ordinals, fractions, multiples, quantities and measured times are numbers. "First," at the
+start of a sentence, "both", "pair", "one another", "the other one", "once struck", "no one" and
+"one side" are not.
 
-The text is normalized (see `normalization`) and split into words. Most words are never numbers; for
-each other word, a rule looks at its neighbors and returns the span of words that state a number.
+The text is normalized (see `normalization`) and split into words. Most words are never numbers. For
+each other word, a rule reads the words around it and returns the span of a number, if there is one.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from teacher.numbers.normalization import (
 )
 
 Rule = Callable[["Prose", int], "tuple[int, int] | None"]
+"""Takes a text and a word's index; returns the first and last word of a number there, or None."""
 
-_any = "|".join
+_any_of = "|".join
 ENGLISH = {
     *("one", "first", *LEXICON.cardinals, *LEXICON.ordinals, *LEXICON.quantities, *LEXICON.times)
 }
@@ -34,25 +35,25 @@ WORDS = {normalize_word(w) for w in (*ENGLISH, *LEXICON.misspelt, *LEXICON.forei
     "first",
 }
 PIECED = {w for w in ENGLISH if len(w) > 2}
-"""Words that are also detected when spaced, split or stretched."""
+"""Words that are also detected when spaced ("t w o"), split ("th ree") or stretched ("twooo")."""
 PREFIXES = {word[:k] for word in PIECED for k in range(1, len(word) + 1)}
-_scene = _any(sorted(LEXICON.scene, key=len, reverse=True))
-_count = _any(sorted((*LEXICON.cardinals, *LEXICON.ordinals), key=len, reverse=True))
+_scene = _any_of(sorted(LEXICON.scene, key=len, reverse=True))
+_count = _any_of(sorted((*LEXICON.cardinals, *LEXICON.ordinals), key=len, reverse=True))
 GLUED = re.compile(
     rf"(?:{_scene})*(?:one)?(?:{_count})(?:and|one|{_count})*"
-    rf"(?:{_any(LEXICON.suffixes)}|(?:{_scene})+)?"
+    rf"(?:{_any_of(LEXICON.suffixes)}|(?:{_scene})+)?"
     rf"|(?:one|first|twice|half|double|single|triple)(?:{_scene})+"
     r"|(?:twent|thirt|fort|fift|sixt|sevent|eight|ninet)ies|one(?:fold|time|x)"
-    rf"|(?:{_any(LEXICON.scales)})s?fold|half(?:ed|th|s)"
+    rf"|(?:{_any_of(LEXICON.scales)})s?fold|half(?:ed|th|s)"
 )
 ARABIC_PREFIXES = "(?:[وفبلك]|ال|لل)+"
 """Articles and prepositions that Arabic joins to the next word."""
 ARABIC = re.compile(
-    normalize_word(ARABIC_PREFIXES) + rf"(?:{_any(w for w in WORDS if '؀' <= w[0] <= 'ۿ')})"
+    normalize_word(ARABIC_PREFIXES) + rf"(?:{_any_of(w for w in WORDS if '؀' <= w[0] <= 'ۿ')})"
 )
-UNSPACED = re.compile(_any(map(normalize_word, LEXICON.unspaced)))
+UNSPACED = re.compile(_any_of(map(normalize_word, LEXICON.unspaced)))
 MAX_LETTERS = 60
-"""Letters of a word after which the rest is ignored."""
+"""Number of letters of a word that the rules read; the rest is ignored."""
 ASCII_WORD = re.compile(r"([A-Za-z]+)")
 # To `re`, Indic vowel signs are not letters, although they are parts of words.
 WORD = re.compile(r"((?:[^\W\d_]+|[\u0900-\u0dff]+)+)")
@@ -63,13 +64,13 @@ UPPER_ROMAN = re.compile(r"M{0,3}(?:CM|CD|D?C{0,3})(?:XC|XL|L?X{0,3})(?:IX|IV|V?
 CLAUSE = re.compile(r"[.!?:;\n•–—*#>(\"“]|\s-\s")
 """Marks between two words that end a clause."""
 COUNTABLE = LEXICON.nouns | LEXICON.events | LEXICON.units
-"""Nouns that "one" counts even after "the" or an adjective."""
-ADJECTIVAL = ("er", "est", "ing", "ed", "most")
+"""Nouns before which "one" is a number even after "the" or an adjective."""
+ADJECTIVE_ENDINGS = ("er", "est", "ing", "ed", "most")
 CLAUSE_ENDS, SENTENCE_ENDS = frozenset(".,;:!?)…—–"), frozenset(".;!?)")
 
 
 class Prose:
-    """Text split into words and gaps: word k is between gaps k and k + 1."""
+    """A text split into words and the gaps between them: word k is between gaps k and k + 1."""
 
     def __init__(self, text: str) -> None:
         pieces = (ASCII_WORD if text.isascii() else WORD).split(text)
@@ -78,19 +79,19 @@ class Prose:
         self.bounds = [0, *accumulate(map(len, pieces))]
 
     def word(self, index: int) -> str:
-        """A word in lower case; empty outside the text."""
+        """Return a word in lower case; "" for an index outside the text."""
         return self.lower[index] if 0 <= index < len(self.lower) else ""
 
     def before(self, index: int, by: int = 1) -> str:
-        """The word `by` words before, in lower case; "" across other marks than hyphens."""
+        """Return the word `by` words before, in lower case; "" across punctuation but hyphens."""
         return self.lower[index - by] if self._is_joined(index - by, index) else ""
 
     def after(self, index: int, by: int = 1) -> str:
-        """The word `by` words after, in lower case; "" across other marks than hyphens."""
+        """Return the word `by` words after, in lower case; "" across punctuation but hyphens."""
         return self.lower[index + by] if self._is_joined(index, index + by) else ""
 
     def _is_joined(self, first: int, last: int) -> bool:
-        """Whether only white space and hyphens separate the words from `first` to `last`."""
+        """Return whether only white space and hyphens separate the words from `first` to `last`."""
         if first < 0 or last >= len(self.words):
             return False
         return all(gap == "-" or gap.isspace() for gap in self.gaps[first + 1 : last + 1])
@@ -99,7 +100,7 @@ class Prose:
         return index == 0 or bool(CLAUSE.search(self.gaps[index][-8:]))
 
     def ends(self, index: int, marks: Collection[str]) -> bool:
-        """Whether a word is the last of the text, or one of some marks follows it."""
+        """Return whether one of `marks` follows a word, or the text ends after it."""
         gap = self.gaps[index + 1].lstrip()
         return gap[:1] in marks if gap else index + 1 == len(self.words)
 
@@ -108,7 +109,7 @@ class Prose:
 
 
 def find_numbers(text: str) -> list[tuple[int, int]]:
-    """Spans (start, stop) of `text` that state a number, in order and disjoint; never raises."""
+    """Return the spans (start, stop) that state a number, in order and disjoint; never raises."""
     spans: Spans = []
     for reading in normalize(text):
         spans += reading.original(_scan(reading.text))
@@ -116,11 +117,12 @@ def find_numbers(text: str) -> list[tuple[int, int]]:
 
 
 def _merged(spans: Spans, text: str) -> Spans:
+    """Join spans that overlap or that only a space or a hyphen separates."""
     spans.sort()
     merged: Spans = []
     first, last = spans[0]
     for start, stop in spans:
-        # Combining marks normalize to nothing and belong to the character before them.
+        # Combining marks, whose normalized form is empty, belong to the character before them.
         while stop < len(text) and text[stop] > "\x7f" and not fold_character(text[stop]):
             stop += 1
         if start <= last or (start == last + 1 and text[last] in "- "):
@@ -147,7 +149,7 @@ def _scan(text: str) -> Spans:
 
 @lru_cache(maxsize=1 << 16)
 def rule_of(token: str) -> Rule | None:
-    """The rule for a word in its original case; None for words that are never numbers."""
+    """Return the rule for a word in its original case; None if the word is never a number."""
     word = token.casefold()
     if word in RULES:
         return RULES[word]
@@ -193,7 +195,7 @@ def _always(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _assembled(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A number word whose letters are spaced ("t w o") or that is split ("tw-o", "th ree")."""
+    """A number word that is split ("tw-o", "th ree") or whose letters are spaced ("t w o")."""
     words, gaps = prose.lower, prose.gaps
     joined, last = words[index], index
     while joined in PREFIXES and last + 1 < len(words):
@@ -225,7 +227,7 @@ def _one(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _is_pronoun(prose: Prose, index: int) -> bool:
-    """Whether "one" is a pronoun and counts nothing."""
+    """Return whether "one" is a pronoun, as in "the other one"."""
     if prose.gaps[index + 1] in ("'", "’") and prose.word(index + 1) == "s":
         return True
     previous, following = prose.before(index), prose.after(index)
@@ -233,19 +235,19 @@ def _is_pronoun(prose: Prose, index: int) -> bool:
         return True
     if following in COUNTABLE or rule_of(previous[:MAX_LETTERS]) is _always:
         return False
-    is_adjectival = len(previous) > 4 and previous.endswith(ADJECTIVAL)
+    is_adjectival = len(previous) > 4 and previous.endswith(ADJECTIVE_ENDINGS)
     if following in LEXICON.modals or previous in LEXICON.adjectives:
         return True
     if is_adjectival and previous not in LEXICON.not_adjectives:
         return True
     if not previous or previous in LEXICON.not_adjectives or previous in COUNTABLE:
         return False
-    # An article before the previous word, as in "the opaque one".
+    # With a determiner before the previous word, "one" is a pronoun, as in "the opaque one".
     return prose.before(index, 2) in ("the", "a", "an", "each", "every", "its", "their")
 
 
 def _first(prose: Prose, index: int) -> tuple[int, int] | None:
-    """Not a number in "First, ...", "at first" and "first of all"."""
+    """A number, except in "First, ..." at the start of a clause, "at first" and "first of all"."""
     if prose.before(index) == "at":
         return None
     aside = prose.gaps[index + 1].lstrip()[:1] in (",", ":", "—", "–")
@@ -255,7 +257,7 @@ def _first(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _once(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A number if it counts events, but not as a conjunction, as in "once struck"."""
+    """A number if it counts events, and not if it is a conjunction, as in "once struck"."""
     previous, following = prose.before(index), prose.after(index)
     if previous == "at" or following in ("more", "again"):
         return None
@@ -277,7 +279,7 @@ def _starts_number(prose: Prose, index: int) -> bool:
 
 
 def _unit(prose: Prose, index: int) -> tuple[int, int] | None:
-    """ "A few frames", "a frame later", "within a frame", "a pixel"."""
+    """Finds measures with a unit: "a few frames", "a frame later", "within a frame", "a pixel"."""
     back = 1
     while back <= 3 and prose.before(index, back) in LEXICON.fillers:
         back += 1
@@ -297,7 +299,7 @@ def _unit(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _minute(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A number if it measures time, but not in the sense of "tiny"."""
+    """A number if it is a unit of time, and not if it means "tiny"."""
     previous, following = prose.before(index), prose.after(index)
     if previous in LEXICON.before_minute:
         return index - 1, index
@@ -315,12 +317,12 @@ def _score(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _secondary(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A number before an event, as in "the secondary collision"."""
+    """A number before a noun for an event, as in "the secondary collision"."""
     return (index, index + 1) if prose.after(index) in LEXICON.events else None
 
 
 def _letter(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A lone I, V or X that is a numeral: "phase I", "(i)", "No. V", "I." before an entry."""
+    """A number if a single I, V or X is a numeral: "phase I", "(i)", "No. V", "I." before text."""
     before, after = prose.gaps[index], prose.gaps[index + 1]
     if after[:1] in ("'", "’") or prose.word(index + 1) == "e":
         return None
@@ -334,14 +336,14 @@ def _letter(prose: Prose, index: int) -> tuple[int, int] | None:
 
 
 def _italian(prose: Prose, index: int) -> tuple[int, int] | None:
-    """ "Due" and "metà" are numbers before or after an Italian word."""
+    """A number if "due" or "metà" is before or after an Italian word."""
     if prose.after(index) in LEXICON.italian:
         return index, index + 1
     return (index - 1, index) if prose.before(index) in LEXICON.italian else None
 
 
 def _except_before(*words: str) -> Rule:
-    """A rule for a word that states a number unless one of some words follows."""
+    """Return the rule for a word that is a number unless one of `words` follows."""
     return lambda prose, index: None if prose.after(index) in words else (index, index)
 
 
@@ -355,9 +357,9 @@ RULES: dict[str, Rule] = {
     "secondary": _secondary,
     **dict.fromkeys(map(normalize_word, LEXICON.foreign_firsts), _first),
     **dict.fromkeys(("due", "meta"), _italian),
-    # The Italian "second", or "according to" before an article.
+    # Italian: "second", or, before an article, "according to".
     "secondo": _except_before("la", "il", "le", "i", "lo", "gli"),
-    # The Hindi "one", or half of "each other".
+    # Hindi: "one", or, before this word, a part of "each other".
     normalize_word("एक"): _except_before(normalize_word("दूसरे")),
     **dict.fromkeys("ivx", _letter),
 }

@@ -1,7 +1,8 @@
 """Normalizes disguised text: HTML entities, markup, styled letters and look-alike letters.
 
-A reading is a normalized text with, for each character, the span of the original that it comes
-from. In a reading, numerals of every script are ASCII digits.
+The result is one or two readings. A reading is a normalized text that records the span of the
+original text from which each character comes. It has ASCII digits in place of the numerals of every
+script, most of which become "1", since only the presence of a number matters.
 """
 
 from __future__ import annotations
@@ -20,17 +21,15 @@ import yaml
 Spans = list[tuple[int, int]]
 
 _LISTS = yaml.safe_load((files("teacher.numbers") / "lexicon.yaml").read_text(encoding="utf-8"))
-LEXICON = SimpleNamespace(
-    lookalikes=_LISTS.pop("lookalikes"),
-    **{name: dict.fromkeys(text.split()) for name, text in _LISTS.items()},
-)
+_LOOKALIKES: dict[str, str] = _LISTS.pop("lookalikes")
+LEXICON = SimpleNamespace(**{name: dict.fromkeys(text.split()) for name, text in _LISTS.items()})
 """The word lists of lexicon.yaml, each as the keys of a dict: a set in the order of the file."""
 
 LOOKALIKES = {
     chr(base + i): chr(65 + i) for base in (0x1F130, 0x1F150, 0x1F170, 0x1F1E6) for i in range(26)
 }
-"""The letter that a styled or foreign letter looks like."""
-for _letters, _plain in LEXICON.lookalikes.items():
+"""For each styled or foreign letter, the ASCII letter that it looks like."""
+for _letters, _plain in _LOOKALIKES.items():
     LOOKALIKES |= zip(_letters, _plain, strict=True)
 PICTOGRAPHS = {
     *(chr(c) for c in range(0x1F550, 0x1F568)),  # clock faces
@@ -43,31 +42,34 @@ MAX_FOLD = 6
 ENTITY = re.compile(r"&(?:#\d{1,7}|#[xX][0-9a-fA-F]{1,6}|[A-Za-z]\w{1,31});?")
 NOT_ASCII = re.compile(r"[^\x00-\x7f]")
 DISGUISE = re.compile(r"[&*`~_<$|@]|[A-Za-z]![A-Za-z]")
+"""Parts of a text that normalization may change, besides characters outside ASCII."""
 TAG = r"</?[A-Za-z][^<>]{0,60}>"
 IDIOM = re.compile("|".join(LEXICON.idioms))
 SEAM = re.compile(rf"[*`~\u200b]+|{TAG}")
-"""Invisible parts of a word: markup and zero-width characters (all normalized to U+200B)."""
+"""Parts that readers do not see within a word: markup, and zero-width characters, all of which are
+normalized to U+200B."""
 SEAMS_TO_SPACES = str.maketrans("*`~\u200b_", "     ")
 LEET = re.compile(r"(?<=[A-Za-z])[!|@](?=[A-Za-z])|\$(?=[A-Za-z])")
 LEET_LETTERS = {"!": "i", "|": "i", "@": "a", "$": "s"}
+"""The letters that these characters replace within a word, as in "s!x"."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Normalized text; character k comes from the original's [starts[k], stops[k])."""
+    """A normalized text. Its character k comes from [starts[k], stops[k]) of the original text."""
 
     text: str
     starts: Sequence[int]
     stops: Sequence[int]
 
     def original(self, spans: Spans) -> Spans:
-        """The spans of the original that correspond to spans of the reading."""
+        """Convert spans of the reading to spans of the original text."""
         return [(self.starts[start], self.stops[stop - 1]) for start, stop in spans]
 
 
 @lru_cache(maxsize=1 << 16)
 def fold_character(c: str) -> str:
-    """The normalized form of a character."""
+    """Return the normalized form of a character; empty for a combining mark."""
     plain = unicodedata.normalize("NFKC", c)
     if c in LEXICON.ideographs or c in PICTOGRAPHS or any(map(_is_numeral, (c, *plain))):
         digits = "".join(p for p in plain if p in "0123456789")
@@ -87,19 +89,20 @@ def _is_numeral(c: str) -> bool:
 
 
 def normalize_word(word: str) -> str:
-    """A lexicon entry in its normalized form."""
+    """Return the normalized form of an entry of the lexicon."""
     return "".join(map(fold_character, word)).casefold()
 
 
 def normalize(text: str) -> list[Reading]:
-    """The readings of a text. Markup or an invisible character between letters gives two: with a
-    space in its place, and without."""
+    """Return the readings of a text. If markup or zero-width characters may split words, there are
+    two: one with spaces in their place (tags stay as they are), and one without them."""
     reading = Reading(text, range(len(text)), range(1, len(text) + 1))
     if text.isascii() and not DISGUISE.search(text):
         return [reading]
-    # Twice, since an entity may itself be escaped.
+    # Twice, since an entity may itself be escaped, as in "&amp;#50;".
     for _ in range(2):
-        reading = _substitute(reading, ENTITY, _meaning)
+        reading = _substitute(reading, ENTITY, _unescape)
+    # The numerals in idioms count nothing, so a character without a numeric value replaces them.
     folded = IDIOM.sub(lambda m: "人" * len(m[0]), reading.text)
     reading = Reading(folded, reading.starts, reading.stops)
     reading = _substitute(reading, NOT_ASCII, fold_character)
@@ -113,7 +116,7 @@ def normalize(text: str) -> list[Reading]:
 
 
 def _substitute(reading: Reading, pattern: re.Pattern[str], new: Callable[[str], str]) -> Reading:
-    """Replace the matches of a pattern; a new character comes from the whole span of its match."""
+    """Replace the matches of a pattern. Each new character gets the span of the whole match."""
     pieces: list[str] = []
     starts: list[int] = []
     stops: list[int] = []
@@ -133,6 +136,6 @@ def _substitute(reading: Reading, pattern: re.Pattern[str], new: Callable[[str],
 
 
 @lru_cache(maxsize=4096)
-def _meaning(entity: str) -> str:
-    # An entity of no character stays as it is.
+def _unescape(entity: str) -> str:
+    # An entity that stands for no character stays as it is.
     return html.unescape(entity) or entity

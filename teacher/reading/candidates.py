@@ -1,5 +1,5 @@
-"""Reads claims about candidates: what each shows, lacks, adds or displaces, and which one
-agrees."""
+"""Reads claims about candidates: where they show objects, which objects they lack, add or displace,
+and which candidate agrees with the target."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ ERRORS = {"error", "errors", "mistake", "mistakes", "fault", "faults", "flaw", "
 
 
 class CandidateReader(TopicReader):
-    """Collects claims about candidates and about the objects in them."""
+    """Reads sentences about candidates, and records claims about them and their objects."""
 
     def end(self) -> None:
-        if not self.lasting and len(self.letters) == 1 and not self.doubted:
+        if not self.keeps_topic and len(self.letters) == 1 and not self.doubted:
             self._add_choice(self.letters[0])
-        for claim in self.found:
+        for claim in self.drafts:
             if claim.candidate != "":
                 self.claims.append(claim)
-            elif claim.kind == "region" and not self.lasting:
-                # Before it names a candidate, an outcome describes the target.
+            elif claim.kind == "region" and not self.keeps_topic:
+                # A region that an outcome states before it names a candidate is about the target.
                 self.claims.append(claim._replace(candidate=None))
 
     def _add_choice(self, letter: str) -> None:
-        """Record that a candidate agrees if an outcome names it alone and without an error."""
-        named = {str(t.value) for t in self.sentence if t.tag == "candidate"}
-        wrong = {c.candidate for c in self.found if c.kind == "agrees" and not c.affirmed}
-        described = any(c.candidate == letter for c in self.found)
+        """Record that a candidate agrees if the sentence says nothing else about it, and names no
+        other candidate except as wrong."""
+        named = {str(t.value) for t in self.sentence if t.name == "candidate"}
+        wrong = {c.candidate for c in self.drafts if c.kind == "agrees" and not c.affirmed}
+        described = any(c.candidate == letter for c in self.drafts)
         if not described and named <= wrong | {letter}:
-            tag = self.choice or self.sentence.tags[-1]
-            self.found.append(self.claim("agrees", (), "", True, TARGET, tag, letter))
+            tag = self.topic_tag or self.sentence.tags[-1]
+            self.drafts.append(self.claim("agrees", (), "", True, TARGET, tag, letter))
 
     # Claims about an object in a candidate.
 
@@ -42,11 +43,11 @@ class CandidateReader(TopicReader):
                 self.add_claim_of_any("region", tag)
             return
         if self.expected or self.negated:
-            # The place where the object should be or is not, whatever the candidate.
+            # The place where the object should be or is not: a claim about the target.
             affirmed = self.contrasted or not (self.expected and self.negated)
             for name in self.objects:
                 claim = self.claim("region", [name], str(tag.value), affirmed, TARGET, tag)
-                self.found.append(claim)
+                self.drafts.append(claim)
         else:
             self.add_claim("region", str(tag.value), True, tag)
 
@@ -56,7 +57,7 @@ class CandidateReader(TopicReader):
         if self.near(-1).words != "from" and not self.expected and not self.negated:
             if self.objects:
                 self.add_claim("displaced", str(tag.value), True, tag)
-            elif self.near(-1).tag in ("off", "slight", "clear"):
+            elif self.near(-1).name in ("off", "slight", "clear"):
                 self.add_claim_of_any("displaced", tag)
 
     def on_off(self, tag: Tag) -> None:
@@ -64,17 +65,17 @@ class CandidateReader(TopicReader):
             self.add_claim("displaced", "", not self.negated, tag)
 
     def on_misplace(self, tag: Tag) -> None:
-        self.moving = not self.negated
+        self.misplacing = not self.negated
 
     def on_slight(self, tag: Tag) -> None:
-        self._extent("slightly", tag)
+        self._add_extent("slightly", tag)
 
     def on_clear(self, tag: Tag) -> None:
         if tag.words == "clearly":
-            self._extent("clearly", tag)
+            self._add_extent("clearly", tag)
 
-    def _extent(self, extent: str, tag: Tag) -> None:
-        beside = (self.near(1).tag, self.near(-1).tag)
+    def _add_extent(self, extent: str, tag: Tag) -> None:
+        beside = (self.near(1).name, self.near(-1).name)
         if not self.expected and not self.negated and {"off", "direction"} & set(beside):
             self.add_claim("displaced", extent, True, tag)
 
@@ -82,14 +83,14 @@ class CandidateReader(TopicReader):
         if not self.negated and not self.skipped:
             self.lacking = True
 
-    def on_passed(self, tag: Tag) -> None:
+    def on_no_contact(self, tag: Tag) -> None:
         if tag.words.startswith("miss"):
             self.on_lack(tag)
         elif tag.words.startswith("avoid"):
             self.negated = True
 
     def on_moves(self, tag: Tag) -> None:
-        # "A misses the move of the X."
+        # "A misses the move of the red cube" does not say that the cube is missing.
         self.lacking = False
 
     on_moving = on_moves
@@ -98,7 +99,7 @@ class CandidateReader(TopicReader):
         self.skipped |= tag.words == "would"
 
     def on_gone(self, tag: Tag) -> None:
-        if self.near(1).tag == "object":
+        if self.near(1).name == "object":
             self.lacking = not self.negated
         elif not self.expected:
             self.add_claim("lacks", "", not self.negated, tag)
@@ -119,8 +120,8 @@ class CandidateReader(TopicReader):
     def on_adds(self, tag: Tag) -> None:
         self.adding = not self.negated
 
-    def on_strangers(self, tag: Tag) -> None:
-        if self.lacking or self.near(1).tag in ("region", "off", "direction", "expected"):
+    def on_other_objects(self, tag: Tag) -> None:
+        if self.lacking or self.near(1).name in ("region", "off", "direction", "expected"):
             self.lacking = False
         elif not self.skipped:
             self.add_candidate_claim("other objects", not self.negated, tag)
@@ -129,46 +130,46 @@ class CandidateReader(TopicReader):
     # Claims about a whole candidate.
 
     def on_agree(self, tag: Tag) -> None:
-        if self.near(1).tag == "candidate" and self.is_compared(self.at + 1):
-            # "D matches B in everything but the X."
+        if self.near(1).name == "candidate" and self.is_compared(self.cursor + 1):
+            # "D matches B in everything but the red cube."
             self.doubted = True
         elif self._is_choice_ahead():
-            self.passing = not self.negated
+            self.choosing = not self.negated
         elif not self.letters:
-            self.passing = not self.negated and not (self.lasting and self.objects)
+            self.choosing = not self.negated and not (self.keeps_topic and self.objects)
         elif not self.objects and not self._is_partial():
-            self.add_candidate_claim("agrees", not (self.negated or self.refused), tag)
+            self.add_candidate_claim("agrees", not (self.negated or self.denies_candidate), tag)
 
     def _is_choice_ahead(self) -> bool:
-        """Whether the candidate named next is the one that agrees: "the answer is therefore B"."""
-        stop = self.sentence.skip(self.at + 1, {"be", "word", "break", "future"})
-        copula = any(t.tag in ("be", "future") for t in self.sentence.tags[self.at + 1 : stop])
-        return copula and self.sentence[stop].tag == "candidate"
+        """Return whether the next candidate is said to agree: "the answer is therefore B"."""
+        stop = self.sentence.skip(self.cursor + 1, {"be", "word", "break", "future"})
+        copula = any(t.name in ("be", "future") for t in self.sentence.tags[self.cursor + 1 : stop])
+        return copula and self.sentence[stop].name == "candidate"
 
     def on_differ(self, tag: Tag) -> None:
         self.doubted = True
         if tag.words.startswith("differ") and self._is_between():
-            # "A and B differ in the X", "A differs from B in the X."
+            # "A and B differ in the red cube", "A differs from B in the red cube".
             return
         if self.lacking:
             # "D does not have the error of C."
             self.lacking = False
-        elif self.objects and self.near(-1).tag == "comma" and tag.words in ERRORS:
+        elif self.objects and self.near(-1).name == "comma" and tag.words in ERRORS:
             # "It is near the left, an error not seen in B."
             self.objects, self.skipped = [], True
         elif not self.objects and not self.negated:
             self.add_candidate_claim("agrees", False, tag)
 
     def _is_between(self) -> bool:
-        """Whether the candidates differ from each other."""
-        if self.next_of(BOUNDARIES | {"object", "candidate"}).tag == "candidate":
+        """Return whether candidates are said to differ from each other, not from the target."""
+        if self.next_of(BOUNDARIES | {"object", "candidate"}).name == "candidate":
             return True
-        return len(self.letters) > 1 and self.near(1).tag != "ignore"
+        return len(self.letters) > 1 and self.near(1).name != "ignore"
 
     def _is_partial(self) -> bool:
-        """Whether an agreement is limited to an object or has an exception."""
-        rest = {tag.tag for tag in self.sentence.tags[self.at + 1 :]}
+        """Return whether the agreement is limited to some objects or has an exception."""
+        rest = {tag.name for tag in self.sentence.tags[self.cursor + 1 :]}
         if rest & {"lack", "gone", "off", "differ", "misplace", "extra"}:
             return True
-        limit = self.sentence[self.sentence.skip(self.at + 1, {"by", "word", "with"})]
-        return limit.tag == "object"
+        limit = self.sentence[self.sentence.skip(self.cursor + 1, {"by", "word", "with"})]
+        return limit.name == "object"

@@ -1,5 +1,4 @@
-"""Checks single claims against the predicates: true, false, or None if the predicates do not
-tell."""
+"""Claims, and their check against the predicates of an item."""
 
 from __future__ import annotations
 
@@ -10,20 +9,24 @@ from teacher.predicates import COMPASS, OUT_OF_VIEW, Difference, ObjectFacts, Pr
 from teacher.reading.phrases import COARSE
 
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
-"""The moment of a claim: the cut, the path from the cut to the target, the target, or, if the
-words are ambiguous, the cut or the target."""
+"""The moment of a claim: the cut (the last frame that the predicates treat as observed), the time
+from the cut to the target, the target, or, if the text leaves it open, the cut or the target."""
 VERDICTS = ("supported", "contradicted", "unknown")
-PLACES = ("close region", "place of either")
-"""Kinds of claims about the place of a pair."""
 
 
 class Claim(NamedTuple):
-    """A statement of a rationale and the predicates' verdict on it.
+    """A statement of a rationale, and the verdict of the predicates on it.
 
-    `value` is a word of the predicates, or "" if the kind needs none; a leading "~" marks a value
-    that must hold only approximately. `when` is the moment of the claim, `candidate` the letter of
-    the candidate it describes, `span` its position in the text. `verdict` is "supported",
-    "contradicted" or "unknown"; only a `certain` claim can be contradicted.
+    "The red cube is not near the left" has the kind "region", the subject "red metal cube" and the
+    value "near the left" (words of the predicates), and is not `affirmed`. `subjects` is empty if
+    the text leaves it open; a value after "~" is meant roughly. `when` is the moment, `candidate`
+    the letter of the candidate that the claim is about (None for the scene), and `span` the
+    position in the text. Only a `certain` claim can have the verdict "contradicted".
+
+    Kinds for an object: "mention" (it exists), "region", "direction", "speed", "still" (at rest),
+    "extent", "sight", "leaves", "enters". For a pair: "course", "meeting", "time" (of the meeting),
+    "close", "close region" (of a close pair), "place of either" (of the pair or its second object).
+    For a candidate: "agrees", "other objects"; objects: "region", "lacks", "extra", "displaced".
     """
 
     kind: str
@@ -43,16 +46,14 @@ class Claim(NamedTuple):
         return " ".join(filter(None, (*words, f"({names})" if names else "", where)))
 
 
-class Ground:
-    """An item's predicates, indexed for lookup."""
+class IndexedPredicates:
+    """The predicates of an item in dictionaries, by object, pair or candidate."""
 
     def __init__(self, predicates: Predicates) -> None:
         self.objects = {o.object: o for o in predicates.objects}
         self.courses = {frozenset(m.objects): m.when for m in predicates.courses}
         self.contacts = {frozenset(m.objects): m.when for m in predicates.contacts}
-        self.close: dict[frozenset[str], str] = {
-            frozenset(c.objects): c.region for c in predicates.close
-        }
+        self.close = {frozenset(c.objects): c.region for c in predicates.close}
         self.candidates = {c.letter: c for c in predicates.candidates}
         self.differences: dict[str, dict[str, Difference]] = {
             c.letter: {d.object: d for d in c.differences} for c in predicates.candidates
@@ -65,6 +66,8 @@ class Ground:
         }
 
     def verdict(self, claim: Claim) -> str:
+        """Return one of `VERDICTS`; "unknown" if the predicates do not tell, or if they contradict
+        a claim that is not certain."""
         truth = self.truth(claim)
         if truth is None:
             return "unknown"
@@ -73,21 +76,21 @@ class Ground:
         return "contradicted" if claim.certain else "unknown"
 
     def truth(self, claim: Claim) -> bool | None:
-        """Whether a claim holds, ignoring its negation."""
+        """Return whether a claim without its negation holds; None if predicates do not tell."""
         if claim.candidate is not None:
             return self._truth_in_candidate(claim.candidate, claim)
         if claim.kind == "mention":
             name = claim.subjects[0]
-            # A candidate may show an object that the scene lacks.
+            # The text may name an object that only a candidate shows.
             return name in self.objects or (claim.when == EITHER and name in self.extras)
-        if claim.kind in PLACES and not claim.subjects:
+        if claim.kind in ("close region", "place of either") and not claim.subjects:
             return self._truth_of_any(claim._replace(kind="region"))
-        if claim.kind in PAIRS:
-            return PAIRS[claim.kind](self, claim)
+        if claim.kind in PAIR_CHECKS:
+            return PAIR_CHECKS[claim.kind](self, claim)
         if not claim.subjects:
             return self._truth_of_any(claim)
         facts = self.objects.get(claim.subjects[0])
-        return None if facts is None else OBJECTS[claim.kind](facts, claim.value, claim.when)
+        return None if facts is None else OBJECT_CHECKS[claim.kind](facts, claim.value, claim.when)
 
     def _truth_in_candidate(self, letter: str, claim: Claim) -> bool | None:
         if letter not in self.candidates:
@@ -100,19 +103,19 @@ class Ground:
         if not claim.subjects:
             return self._truth_of_any_shown(claim, differences.values())
         name = claim.subjects[0]
-        return SHOWN[claim.kind](self.objects.get(name), differences.get(name), claim.value)
+        return SHOWN_CHECKS[claim.kind](self.objects.get(name), differences.get(name), claim.value)
 
     def _truth_of_any(self, claim: Claim) -> bool | None:
-        """False for a region without any object or a direction without any moving object: the claim
-        is then false whatever its subject is."""
+        """Return False if a claim is false of every object, as "it is near the top" if no object is
+        there; otherwise None."""
         if claim.kind not in ("region", "direction") or not claim.affirmed:
             return None
-        truths = {OBJECTS[claim.kind](o, claim.value, EITHER) for o in self.objects.values()}
+        truths = {OBJECT_CHECKS[claim.kind](o, claim.value, EITHER) for o in self.objects.values()}
         near = claim.kind == "region" and any(_same(claim.value, r) for r in self.close.values())
         return False if truths == {False} and not near else None
 
     def _truth_of_any_shown(self, claim: Claim, found: Collection[Difference]) -> bool | None:
-        """False for a region or a displacement that no object of a candidate has."""
+        """Return False if no object of a candidate has the region or displacement, else None."""
         if claim.kind not in ("region", "displaced") or not claim.affirmed:
             return None
         if claim.kind == "displaced":
@@ -129,7 +132,8 @@ class Ground:
 
 
 def _same(value: str, actual: str | None) -> bool | None:
-    """Whether the stated value is the actual one; a coarse value is false only if it is far off."""
+    """Return whether a value is the actual one. A rough value may also be neither true nor false:
+    "~west" for a direction at most 90 degrees from west, "~near the left" for its corners."""
     if actual is None:
         return None
     if not value.startswith(COARSE):
@@ -150,7 +154,7 @@ def _either(*found: bool | None) -> bool | None:
 
 
 def _at(when: str, cut: str, target: str) -> tuple[str, ...]:
-    """The values at the moment of a claim."""
+    """Return the values at the moment `when` of a claim."""
     return {CUT: (cut,), TARGET: (target,)}.get(when, (cut, target))
 
 
@@ -189,7 +193,7 @@ def _sight(o: ObjectFacts, value: str, when: str) -> bool | None:
     return any(sight != "shown" if value == "unseen" else sight == value for sight in sights)
 
 
-OBJECTS: dict[str, Callable[[ObjectFacts, str, str], bool | None]] = {
+OBJECT_CHECKS: dict[str, Callable[[ObjectFacts, str, str], bool | None]] = {
     "region": _region,
     "direction": _direction,
     "speed": lambda o, value, when: _same(value, o.speed),
@@ -199,59 +203,59 @@ OBJECTS: dict[str, Callable[[ObjectFacts, str, str], bool | None]] = {
     "leaves": lambda o, value, when: None if when == CUT else o.leaves,
     "enters": lambda o, value, when: None if when == CUT else o.enters,
 }
-"""The check of each kind of claim about an object."""
+"""For each kind of claim about an object, the check of its value at its moment."""
 
 
 def _has_pair(pairs: Iterable[frozenset[str]], claim: Claim) -> bool:
-    """Whether a pair contains the subjects of a claim, which may be one object or none."""
+    """Return whether a pair contains the subjects of a claim, which may be one object or none."""
     return any(set(claim.subjects) <= pair for pair in pairs)
 
 
-def _course(ground: Ground, claim: Claim) -> bool | None:
-    if _has_pair(ground.courses, claim):
+def _course(predicates: IndexedPredicates, claim: Claim) -> bool | None:
+    if _has_pair(predicates.courses, claim):
         return True
-    if claim.value == COARSE and _has_pair(ground.contacts, claim):
-        # "Headed for contact" applies to every pair that meets.
+    if claim.value == COARSE and _has_pair(predicates.contacts, claim):
+        # "Headed for contact" also describes a pair that meets without a collision course.
         return True if claim.affirmed else None
     return False
 
 
-def _meeting(ground: Ground, claim: Claim) -> bool | None:
+def _meeting(predicates: IndexedPredicates, claim: Claim) -> bool | None:
     if not claim.affirmed and claim.when != BETWEEN:
         # "They have not met yet" does not exclude later meetings.
-        return None if claim.when == CUT else _has_pair(ground.contacts, claim)
-    met = [when for pair, when in ground.courses.items() if set(claim.subjects) <= pair]
-    if _has_pair(ground.contacts, claim) or any(when not in (None, "unseen") for when in met):
+        return None if claim.when == CUT else _has_pair(predicates.contacts, claim)
+    met = [when for pair, when in predicates.courses.items() if set(claim.subjects) <= pair]
+    if _has_pair(predicates.contacts, claim) or any(when not in (None, "unseen") for when in met):
         return True
     return None if "unseen" in met else False
 
 
-def _time(ground: Ground, claim: Claim) -> bool | None:
+def _time(predicates: IndexedPredicates, claim: Claim) -> bool | None:
     pair = frozenset(claim.subjects)
-    when = ground.contacts.get(pair) or ground.courses.get(pair)
+    when = predicates.contacts.get(pair) or predicates.courses.get(pair)
     return None if when in (None, "unseen") else when == claim.value
 
 
-def _close(ground: Ground, claim: Claim) -> bool | None:
+def _close(predicates: IndexedPredicates, claim: Claim) -> bool | None:
     if claim.when != TARGET:
         return None
-    if any(ground.objects[name].target_sight == OUT_OF_VIEW for name in claim.subjects):
+    if any(predicates.objects[name].target_sight == OUT_OF_VIEW for name in claim.subjects):
         return None if claim.value == COARSE else False
-    return frozenset(claim.subjects) in ground.close
+    return frozenset(claim.subjects) in predicates.close
 
 
-def _close_region(ground: Ground, claim: Claim) -> bool | None:
-    region = ground.close.get(frozenset(claim.subjects))
+def _close_region(predicates: IndexedPredicates, claim: Claim) -> bool | None:
+    region = predicates.close.get(frozenset(claim.subjects))
     return None if claim.when != TARGET else _same(claim.value, region)
 
 
-def _place_of_either(ground: Ground, claim: Claim) -> bool | None:
-    region = ground.close.get(frozenset(claim.subjects))
-    partner = ground.objects[claim.subjects[-1]]
+def _place_of_either(predicates: IndexedPredicates, claim: Claim) -> bool | None:
+    region = predicates.close.get(frozenset(claim.subjects))
+    partner = predicates.objects[claim.subjects[-1]]
     return _either(_same(claim.value, region), _region(partner, claim.value, EITHER))
 
 
-PAIRS: dict[str, Callable[[Ground, Claim], bool | None]] = {
+PAIR_CHECKS: dict[str, Callable[[IndexedPredicates, Claim], bool | None]] = {
     "course": _course,
     "meeting": _meeting,
     "time": _time,
@@ -292,10 +296,10 @@ def _displaced(facts: ObjectFacts | None, difference: Difference | None, value: 
     return True if not value else _same(value, difference.heading)
 
 
-SHOWN: dict[str, Callable[[ObjectFacts | None, Difference | None, str], bool | None]] = {
+SHOWN_CHECKS: dict[str, Callable[[ObjectFacts | None, Difference | None, str], bool | None]] = {
     "region": _shown_region,
     "lacks": _lacks,
     "extra": _extra,
     "displaced": _displaced,
 }
-"""The check of each kind of claim about an object in a candidate."""
+"""For each kind of claim about an object in a candidate, the check of its value."""

@@ -1,21 +1,27 @@
-"""Reads claims about pairs of objects: collision courses, contacts, their time, and closeness."""
+"""Reads claims about pairs: collision courses, contacts, the time of contacts, and closeness."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET, Ground
+from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET, IndexedPredicates
 from teacher.reading.reader import Names, Reader
 from teacher.reading.tagging import BOUNDARIES, Tag
 
-RELATIONS = {"course", "meet", "contact", "passed", "close"}
+RELATIONS = {"course", "meet", "contact", "no_contact", "close"}
+"""Tags that state a relation between two objects."""
 LIMITS = {"moment", "yet", "then", "before", "until", "far"}
-"""Last words of phrases that limit the time up to which an event is denied."""
+"""Last words of tags that limit a denial to the time up to the target, as "by then"."""
 
 
 @dataclass
 class Relation:
-    """A pair in the current clause: its participants and time, as far as they have been read."""
+    """A relation of the current clause, as far as it has been read.
+
+    In "the red cube meets the sphere", `tag` stands for "meets", the cube is the only subject and
+    the sphere the only partner. `denied_subject` is true for a subject such as "no pair", `between`
+    if both objects are partners ("a contact between the cube and the sphere").
+    """
 
     kind: str
     tag: Tag
@@ -27,18 +33,17 @@ class Relation:
 
 
 class PairReader(Reader):
-    """Collects the participants of a relation and records it when its clause ends."""
+    """Collects the objects of a relation, and records its claims when its clause ends."""
 
-    def __init__(self, ground: Ground, moment: str) -> None:
-        """`moment`: the moment of the section's present tense."""
-        super().__init__(ground)
+    def __init__(self, predicates: IndexedPredicates, moment: str) -> None:
+        """`moment`: the moment that the present tense of the section refers to."""
+        super().__init__(predicates)
         self.moment = moment
-        self.still_when = CUT if moment == CUT else EITHER
+        self.still_moment = CUT if moment == CUT else EITHER
         self.subjects: Names = []
         self.negated = self.maybe = self.future = False
 
     def record_verb(self) -> None:
-        """Record that the clause has its verb."""
         raise NotImplementedError
 
     def begin_pairs(self) -> None:
@@ -47,17 +52,18 @@ class PairReader(Reader):
         """Whether the subject is a phrase such as "no pair"."""
         self.relation: Relation | None = None
         self.time: Tag | None = None
-        self.met: tuple[str | None, ...] = ()
-        """The last pair of the sentence."""
+        self.last_pair: tuple[str | None, ...] = ()
+        """The last pair of which the sentence stated a relation."""
         self.companions: Names = []
-        """The object after "with" before the relation is named."""
+        """The objects after a "with" that precedes the relation."""
 
     def is_incomplete(self) -> bool:
+        """Return whether the next objects belong to the relation: "a contact between"."""
         return bool(self.relation and self.relation.between and len(self.relation.partners) < 2)
 
-    def both(self) -> Names:
-        """The two objects that "they" refers to, if unambiguous."""
-        named = list(dict.fromkeys(self.mentioned)) or list(self.before)
+    def find_both(self) -> Names:
+        """Return the two objects that "they" refers to, or [None] if it is ambiguous."""
+        named = list(dict.fromkeys(self.mentioned)) or list(self.previous_subjects)
         return named if len(named) == 2 and None not in named else [None]
 
     def on_course(self, tag: Tag) -> None:
@@ -66,30 +72,30 @@ class PairReader(Reader):
     def on_meet(self, tag: Tag) -> None:
         self._start_relation("meeting", tag)
 
-    def on_passed(self, tag: Tag) -> None:
+    def on_no_contact(self, tag: Tag) -> None:
         if tag.words.startswith("no ") and not self._is_ahead({"between", "with"}):
             there = "there" in (self.near(-1).words, self.near(-2).words)
-            if there or self.near(-1).tag in BOUNDARIES:
-                # "No contact awaits the A" is not about the previous pair.
+            if there or self.near(-1).name in BOUNDARIES:
+                # "No contact awaits the red cube" is not about the previous pair.
                 return
         self._start_relation("meeting", tag, denied=True)
 
     def on_contact(self, tag: Tag) -> None:
-        if self.near(1).tag in ("between", "with", "object"):
+        if self.near(1).name in ("between", "with", "object"):
             self._start_relation("meeting", tag)
         elif self.negated or self._is_ahead({"not", "none", "contrast"}):
-            # A denied contact need not be that of the previous pair.
+            # A contact that is denied need not be a contact of the previous pair.
             return
-        elif self.relation is None and self.near(-1).tag not in ("by", "past"):
-            pair = self.met or tuple(self.both())
+        elif self.relation is None and self.near(-1).name not in ("by", "past"):
+            pair = self.last_pair or tuple(self.find_both())
             if len(pair) == 2:
                 self._start_relation("meeting", tag)
                 if self.relation:
                     self.relation.partners, self.relation.between = list(pair), True
 
     def _is_ahead(self, wanted: set[str]) -> bool:
-        """Whether one of the tags follows in the clause."""
-        return self.next_of(BOUNDARIES | wanted).tag in wanted
+        """Return whether a tag with a name in `wanted` follows in the clause."""
+        return self.next_of(BOUNDARIES | wanted).name in wanted
 
     def on_close(self, tag: Tag) -> None:
         if self.relation and not self.relation.partners and self.relation.kind != "close":
@@ -100,39 +106,40 @@ class PairReader(Reader):
         if self.relation and not self.relation.partners:
             self.relation.between = True
 
-    def on_when(self, tag: Tag) -> None:
-        opening = self.near(-1).tag in BOUNDARIES
+    def on_time(self, tag: Tag) -> None:
+        opening = self.near(-1).name in BOUNDARIES
         if self.time is None and not (opening and tag.value == "later"):
             self.time = tag
 
     def _start_relation(self, kind: str, tag: Tag, denied: bool = False) -> None:
         """Begin a relation at `tag`; `denied` if its words deny the event ("misses")."""
         time = self.time
-        self.flush()
+        self.end_relation()
         self.time = time
         partners: Names = []
-        if self.companions and self.near(1).tag not in ("object", "by", "with"):
-            # "Its course with the B ends without contact."
+        if self.companions and self.near(1).name not in ("object", "by", "with"):
+            # "Its course with the blue sphere ends without contact."
             partners, self.companions = self.companions, []
         if self.maybe:
             return
         affirmed = self.negated == denied
         self.relation = Relation(kind, tag, affirmed, self.subjects, self.denied_subject, partners)
-        if tag.tag != "contact":
+        if tag.name != "contact":
             self.record_verb()
 
-    def close_region(self, relation: Relation, tag: Tag) -> None:
-        """The region of a close pair, stated right after it."""
-        pair = self._pairs(relation)
+    def add_close_region(self, relation: Relation, tag: Tag) -> None:
+        """Record the region of a close pair, as in "they are close together near the top"."""
+        pair = self._find_pairs(relation)
         if len(pair) != 1 or self.maybe or self.negated:
             return
-        if relation.partners or self.near(-1).tag in ("close", "ignore"):
+        if relation.partners or self.near(-1).name in ("close", "ignore"):
             when = TARGET if self.moment == TARGET or self.future else EITHER
-            # "Close to the A near the top" may describe only the place of the A.
-            kind = "place of either" if self.near(-1).tag == "object" else "close region"
+            # In "close to the red cube near the top", the region may be that of the cube alone.
+            kind = "place of either" if self.near(-1).name == "object" else "close region"
             self.claims.append(self.claim(kind, pair[0], str(tag.value), True, when, tag))
 
-    def _pairs(self, relation: Relation) -> list[tuple[str | None, ...]]:
+    def _find_pairs(self, relation: Relation) -> list[tuple[str | None, ...]]:
+        """Return the pairs of a relation; a tuple has one object if the other is not named."""
         if relation.between:
             return [tuple(relation.partners)] if len(relation.partners) == 2 else []
         if relation.partners:
@@ -141,7 +148,7 @@ class PairReader(Reader):
             return [(a, b) for a in relation.subjects for b in relation.partners]
         return [tuple(relation.subjects)] if len(relation.subjects) in (1, 2) else []
 
-    def flush(self) -> None:
+    def end_relation(self) -> None:
         """End the current relation and record its claims."""
         relation, time = self.relation, self.time
         self.relation = self.time = None
@@ -154,10 +161,10 @@ class PairReader(Reader):
         elif kind == "close":
             when = EITHER if self.moment == EITHER and not self.future else TARGET
         else:
-            # "They do not touch by then" denies only events up to the target.
+            # "They do not touch by then" denies contacts up to the target, not later ones.
             limited = self.moment == TARGET or any(t.last_word in LIMITS for t in self.sentence)
             when = TARGET if limited and not affirmed else BETWEEN
-        pairs = self._pairs(relation)
+        pairs = self._find_pairs(relation)
         if relation.denied_subject and not pairs and kind == "course":
             pairs = [()]
         for pair in pairs:
@@ -168,7 +175,7 @@ class PairReader(Reader):
             value = str(relation.tag.value)
             self.claims.append(self.claim(kind, pair, value, affirmed, when, relation.tag))
             if len(pair) == 2:
-                self.met = pair
+                self.last_pair = pair
                 if time and affirmed and kind != "close":
-                    value = str(time.value)
-                    self.claims.append(self.claim("time", pair, value, True, BETWEEN, time))
+                    claim = self.claim("time", pair, str(time.value), True, BETWEEN, time)
+                    self.claims.append(claim)

@@ -1,4 +1,4 @@
-"""The vocabulary of the claim extraction, read from phrases.yaml."""
+"""The phrases of phrases.yaml, and the compass directions."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import yaml
 from teacher.predicates import COMPASS
 
 COARSE = "~"
-"""Marks a value that must hold only approximately, such as "leftward" for a motion to the
-northwest."""
+"""Prefix of a value that the text states only roughly. "Leftward" has the value "~west": true for
+west, false for directions more than 90 degrees from it, and unknown for the others."""
 ENDINGS = ("", "ward", "wards", "erly", "bound", "wardly")
-"""Endings of a compass direction: "eastward", "eastbound"."""
+"""Endings of a compass direction, as in "eastward" and "eastbound"."""
 
 Phrase = tuple[tuple[str, ...], str, str]
-"""The words of a phrase, its tag and its value."""
+"""The words of a phrase, the name of its tag, and the value of the tag ("" if it has none)."""
 
 
 def _read_phrases() -> dict[str, list[Phrase]]:
@@ -39,5 +39,5 @@ def _read_phrases() -> dict[str, list[Phrase]]:
     return {first: sorted(found, key=lambda p: -len(p[0])) for first, found in phrases.items()}
 
 
-PHRASES = _read_phrases()
-"""Every phrase of the vocabulary by its first word, the longest first."""
+VOCABULARY = _read_phrases()
+"""All phrases by their first word, the longest first."""

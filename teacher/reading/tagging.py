@@ -1,5 +1,9 @@
-"""Split a section of a rationale into tags: noun phrases of objects, regions, phrases of
-phrases.yaml, candidates' letters and punctuation."""
+"""Split a section of a rationale into tags: pieces of text with a name that says what they are.
+
+The names are "object" ("the red cube"), "region" ("near the left"; "into", "from" or "toward" after
+these prepositions), "candidate" (a letter), "comma", "semicolon", "stop", "word" (a word without a
+meaning here), and the names in phrases.yaml.
+"""
 
 from __future__ import annotations
 
@@ -7,25 +11,9 @@ import re
 from collections.abc import Container, Iterator, Sequence
 from typing import NamedTuple
 
-from data.records import LETTERS
+from data.records import COLORS, LETTERS, MATERIALS, SHAPES
 from teacher.predicates import REGIONS
-from teacher.reading.nouns import (
-    AT,
-    COLOR_WORDS,
-    COLUMNS,
-    IMAGE,
-    MATERIAL_WORDS,
-    MIDDLE,
-    PLACES,
-    PLURALS,
-    RIGHT_ONES,
-    ROWS,
-    SHAPE_WORDS,
-    SIDES,
-    SINGULARS,
-    WAYS,
-)
-from teacher.reading.phrases import COARSE, PHRASES
+from teacher.reading.phrases import COARSE, VOCABULARY
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")
 ARTICLES = {"the", "a", "an", "its", "their", "that", "this", "some", "any", "another", "such"}
@@ -35,43 +23,85 @@ QUALITIES = STILL_WORDS | {
     *("struck", "hidden", "visible", "nearby", "distant", "lone", "only", "same", "remaining"),
     "other",
 }
-"""Adjectives allowed before an object's colour."""
+"""Adjectives that may precede the color of an object, as in "the moving red cube"."""
 CANDIDATES = frozenset(LETTERS)
-EVENTS = {"pair", "collision", "contact", "course", "slight", "short", "layout", "scene", "motion"}
-"""Nouns and adjectives that do not describe objects; an "A" that one of them follows is an
-article."""
-LISTED = {"candidate", "candidates", "image", "images", "option", "options", "layout", "answer"}
-"""Words without a tag. An "A" that follows one of them is a candidate's letter."""
+AFTER_ARTICLE = {
+    *("pair", "collision", "contact", "course", "slight", "short", "layout", "scene", "motion"),
+}
+"""Words that follow the article "A", besides adjectives of objects; else "A" is a candidate."""
+LABELS = {"candidate", "candidates", "image", "images", "option", "options", "layout", "answer"}
+"""Nouns for a candidate, which have no tag. An "A" after one of them is a candidate's letter."""
 PUNCTUATION = {
     **dict.fromkeys(".!?", "stop"),
     **dict.fromkeys(",()—–", "comma"),
     **dict.fromkeys(";:", "semicolon"),
 }
 
+# Words of noun phrases and regions.
+COLOR_WORDS = {**{c: c for c in COLORS}, "grey": "gray"}
+MATERIAL_WORDS = {**{m: m for m in MATERIALS}, "metallic": "metal", "rubbery": "rubber"}
+SHAPE_WORDS = {**{s: s for s in SHAPES}, "ball": "sphere", "block": "cube"}
+SINGULARS = SHAPE_WORDS | dict.fromkeys(("object", "one", "body", "item", "thing", "solid"), "")
+"""The shape that each noun in the singular states; "" if it states none."""
+PLURALS = {**{f"{word}s": shape for word, shape in SHAPE_WORDS.items()}, "objects": ""}
+ROWS = {"top": 0, "upper": 0, "bottom": 2, "lower": 2}
+COLUMNS = {"left": 0, "right": 2}
+"""The row and column of `REGIONS` for each word; without such a word, it is 1."""
+MIDDLE = {"center", "centre", "middle", "central"}
+PLACE_NOUNS = {"corner", "area", "region", "part", "portion", "zone", "section"}
+"""Nouns that may end a region, as in "the top-left corner"."""
+SIDE_NOUNS = {"side", "edge", "border", "boundary"}
+"""Nouns that make a region coarse: "the left side" consists of three regions."""
+NOT_RIGHT_SIDE = {
+    *("place", "places", "spot", "spots", "position", "positions", "location", "locations"),
+    *("object", "objects", "layout", "candidate", "answer", "choice", "way", "order", "time"),
+}
+"""Nouns before which "right" means "correct", as in "in the right place"."""
+PREPOSITIONS = {
+    *("near", "at", "in", "on", "along", "by", "around", "within", "inside", "toward", "towards"),
+    *("to", "into", "from", "onto"),
+}
+"""Prepositions that may begin a region."""
+REGION_TAGS = {"to": "into", "towards": "toward"} | {w: w for w in ("into", "from", "toward")}
+"""The tag of a region after these prepositions; after others, the tag is "region"."""
+IMAGE_NOUNS = {"view", "scene", "image", "frame", "picture", "screen", "field"}
+REGION_FILLERS = {"the", "its", "very", "far", "area", "region", "near", "same", "around", "of"}
+REGION_STARTS = {*PREPOSITIONS, *ROWS, *COLUMNS, *MIDDLE, "the"}
+LOOKS = {*COLOR_WORDS, *MATERIAL_WORDS, *SHAPE_WORDS, *PLURALS}
+NOUN_STARTS = ARTICLES | QUALITIES | LOOKS
+ADJECTIVES = LOOKS | QUALITIES - {"still", "only", "same"}
+
 
 class Noun(NamedTuple):
-    """A noun phrase for an object; attributes that it does not state are ""."""
+    """The attributes that a noun phrase states ("" if it does not state one). `still` is true for
+    "the stationary red cube", `is_other` for "another cube"."""
 
     color: str
     material: str
     shape: str
     plural: bool
     still: bool
-    others: bool
+    is_other: bool
 
     @property
     def phrase(self) -> str:
+        """The stated attributes, such as "red cube" or "red object"."""
         return " ".join(filter(None, (self.color, self.material, self.shape or "object")))
 
     def fits(self, name: str) -> bool:
-        """Whether an object's name has all stated attributes."""
+        """Return whether an object's name, such as "red metal cube", has all stated attributes."""
         return {self.color, self.material, self.shape} - {""} <= set(name.split())
 
 
 class Tag(NamedTuple):
-    """A piece of a sentence: its tag, value, position in the text, and its text in lower case."""
+    """A piece of a sentence, text[start:stop], and its text in lower case, `words`.
 
-    tag: str
+    `name` says what the piece is, and selects the method of a reader that reads it. `value` is its
+    meaning: for "near the top left corner", the name is "region" and the value is "near the
+    top-left". It is a `Noun` if the name is "object", and "" if the name says everything.
+    """
+
+    name: str
     value: str | Noun
     start: int
     stop: int
@@ -83,16 +113,16 @@ class Tag(NamedTuple):
 
 
 BOUNDARIES = {"comma", "semicolon", "and", "break", "stop"}
-"""Tags that may end a clause."""
+"""Names of tags that may end a clause."""
 END = Tag("stop", "", 0, 0, "")
-"""The tag at every index outside a sentence."""
+"""Stands for the tag at any index outside a sentence."""
 
 
 class Sentence:
     """The tags of a sentence; an index outside it returns END."""
 
     def __init__(self, text: str, tags: Sequence[Tag]) -> None:
-        """`text`: the whole text, to which the positions of the tags refer."""
+        """`text`: the text of which `start` and `stop` of the tags are positions."""
         self.text = text
         self.tags = tags
 
@@ -103,31 +133,29 @@ class Sentence:
         return iter(self.tags)
 
     def skip(self, index: int, skipped: Container[str], step: int = 1) -> int:
-        """Return the index of the first tag that is not in `skipped`, from `index` on in the
-        direction of `step`; an index outside the sentence if there is none."""
-        while 0 <= index < len(self.tags) and self.tags[index].tag in skipped:
+        """Return the index of the first tag whose name is not in `skipped`, from `index` on in
+        steps of `step` (1 or -1). If there is none, the index is outside the sentence."""
+        while 0 <= index < len(self.tags) and self.tags[index].name in skipped:
             index += step
         return index
 
     def find(self, index: int, wanted: Container[str], step: int = 1) -> int:
-        """Return the index of the first tag that is in `wanted`, from `index` on in the direction
-        of `step`; an index outside the sentence if there is none."""
-        while 0 <= index < len(self.tags) and self.tags[index].tag not in wanted:
+        """Return the index of the first tag whose name is in `wanted`; see `skip`."""
+        while 0 <= index < len(self.tags) and self.tags[index].name not in wanted:
             index += step
         return index
 
 
 def find_tags(text: str, start: int, stop: int) -> list[Tag]:
-    """Return the tags of text[start:stop] in order. Articles and `LISTED` words are left out; other
-    words without a meaning here get the tag "word"."""
+    """Return the tags of text[start:stop] in order. Articles and `LABELS` are left out."""
     words, raw, spans = _split_words(text, start, stop)
     found: list[Tag] = []
     i = 0
     while i < len(spans):
-        tag, value, end = _tag_at(words, raw, i)
-        if tag:
+        name, value, end = _tag_at(words, raw, i)
+        if name:
             first, last = spans[i][0], spans[end - 1][1]
-            found.append(Tag(tag, value, first, last, text[first:last].lower()))
+            found.append(Tag(name, value, first, last, text[first:last].lower()))
         i = end
     return found
 
@@ -135,8 +163,8 @@ def find_tags(text: str, start: int, stop: int) -> list[Tag]:
 def _split_words(
     text: str, start: int, stop: int
 ) -> tuple[list[str], list[str], list[tuple[int, int]]]:
-    """Return the words in lower case, followed by "", the words as written, and their spans.
-    "Doesn't" becomes "does" and "not"; other suffixes after an apostrophe are dropped."""
+    """Return the words in lower case and a final "", the words as written, and their spans.
+    "Doesn't" becomes "does" and "not"; other endings after an apostrophe are dropped."""
     words, raw, spans = [], [], []
     for match in WORD.finditer(text, start, stop):
         whole = match[0]
@@ -154,11 +182,11 @@ def _split_words(
 
 
 Found = tuple[str, str | Noun, int]
-"""A tag, its value, and the index of the next word."""
+"""The name and value of a tag, and the index of the word after it."""
 
 
 def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
-    """Return the tag that begins at word i."""
+    """Return the tag that begins at word i; its name is "" if the word has no tag."""
     word = words[i]
     if word in PUNCTUATION:
         return PUNCTUATION[word], word, i + 1
@@ -168,27 +196,27 @@ def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
         return found
     if word in REGION_STARTS and (found := _find_region(words, i)):
         return found
-    for phrase, tag, value in PHRASES.get(word, ()):
+    for phrase, name, value in VOCABULARY.get(word, ()):
         if tuple(words[i : i + len(phrase)]) == phrase:
-            return tag, value, i + len(phrase)
-    if word in ARTICLES or word in LISTED:
+            return name, value, i + len(phrase)
+    if word in ARTICLES or word in LABELS:
         return "", "", i + 1
     return "word", word, i + 1
 
 
 def _is_article(words: list[str], letter: str, i: int) -> bool:
-    """Return whether an "A" is an article. An unclear "A" is a candidate's letter: if a letter were
-    taken for an article, the next claims would be about another candidate."""
-    described = words[i + 1] in ADJECTIVES or words[i + 1] in EVENTS
-    return letter == "A" and described and not (i > 0 and words[i - 1] in LISTED)
+    """Return whether an "A" is an article. In doubt it is a candidate's letter: if a letter were
+    taken for an article, the claims after it would be assigned to another candidate."""
+    described = words[i + 1] in ADJECTIVES or words[i + 1] in AFTER_ARTICLE
+    return letter == "A" and described and not (i > 0 and words[i - 1] in LABELS)
 
 
 def _find_noun(words: list[str], i: int) -> Found | None:
-    """Return the noun phrase for an object that begins at word i, as "the stationary red cube"."""
-    still = others = False
+    """Return the noun phrase at word i, such as "the stationary red cube", if there is one."""
+    still = is_other = False
     while words[i] in ARTICLES or words[i] in QUALITIES:
         still |= words[i] in STILL_WORDS
-        others |= words[i] in ("other", "another", "remaining")
+        is_other |= words[i] in ("other", "another", "remaining")
         i += 1
     if words[i] in ("two", "both"):
         i += 1
@@ -199,14 +227,14 @@ def _find_noun(words: list[str], i: int) -> Found | None:
     shape = SINGULARS.get(words[i], PLURALS.get(words[i]))
     if shape is None or not (color or material or shape):
         return None
-    return "object", Noun(color, material, shape, words[i] in PLURALS, still, others), i + 1
+    return "object", Noun(color, material, shape, words[i] in PLURALS, still, is_other), i + 1
 
 
 def _find_region(words: list[str], i: int) -> Found | None:
-    """Return the region that begins at word i: "near the top-left", "to the upper left corner"."""
-    begin, way = i, "region"
-    while words[i] in AT:
-        way = WAYS.get(words[i], way)
+    """Return the region at word i, such as "to the upper left corner", if there is one."""
+    begin, name = i, "region"
+    while words[i] in PREPOSITIONS:
+        name = REGION_TAGS.get(words[i], name)
         i += 1
     has_preposition = i > begin
     begin = i
@@ -228,27 +256,20 @@ def _find_region(words: list[str], i: int) -> Found | None:
         i += 1
     corner = row is not None and column is not None
     noun = words[i]
-    named = noun in PLACES or noun in SIDES
-    if words[i - 1] == "right" and noun in RIGHT_ONES:
+    has_noun = noun in PLACE_NOUNS or noun in SIDE_NOUNS
+    if words[i - 1] == "right" and noun in NOT_RIGHT_SIDE:
         # "In the right place" is not a region.
         return None
-    if i == begin or not (named or corner or (has_preposition and (definite or middle))):
+    if i == begin or not (has_noun or corner or (has_preposition and (definite or middle))):
         return None
-    i += named
+    i += has_noun
     if words[i] == "of":
         end = i + 2 if words[i + 1] == "the" else i + 1
-        if words[end] in IMAGE:
+        if words[end] in IMAGE_NOUNS:
             i = end + 1
-        elif not named:
+        elif not has_noun:
             # "To the left of the cube" is not a region.
             return None
     region = REGIONS[1 if row is None else row][1 if column is None else column]
-    coarse = noun in SIDES and not corner
-    return way, (COARSE if coarse else "") + region, i
-
-
-REGION_FILLERS = {"the", "its", "very", "far", "area", "region", "near", "same", "around", "of"}
-REGION_STARTS = {*AT, *ROWS, *COLUMNS, *MIDDLE, "the"}
-LOOKS = {*COLOR_WORDS, *MATERIAL_WORDS, *SHAPE_WORDS, *PLURALS}
-NOUN_STARTS = ARTICLES | QUALITIES | LOOKS
-ADJECTIVES = LOOKS | QUALITIES - {"still", "only", "same"}
+    coarse = noun in SIDE_NOUNS and not corner
+    return name, (COARSE if coarse else "") + region, i

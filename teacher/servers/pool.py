@@ -1,7 +1,7 @@
 """Load balancing over several servers.
 
-While a server is down, restarting or busy, requests wait or go to another server; an item loses no
-attempt.
+While a server is down, restarting or busy, its requests go to another server or wait. A single
+request fails only if servers that answer other requests do not answer it.
 """
 
 from __future__ import annotations
@@ -23,19 +23,20 @@ from teacher.servers.server import (
     RefusedError,
     RequestError,
     RequestFields,
-    Server,
+    ServerClient,
 )
 
 log = logging.getLogger(__name__)
 Job = TypeVar("Job")
 
 PAUSE, LONGEST_PAUSE = 0.5, 10.0
-"""Upper bounds (seconds) of the first pause before a retry, and of any pause."""
+"""The upper bound (s) of a random pause before a retry is PAUSE, doubled with each failure, and at
+most LONGEST_PAUSE."""
 MAX_FAILURES = 4
-"""Failures of a request, at servers that answer others, after which it is given up."""
+"""Number of failures after which a request is given up, if the servers answer other requests."""
 CANARY: Messages = [{"role": "user", "content": "Say hello."}]
-"""A prompt that any working server answers. If a request fails and the canary succeeds, the fault
-is in the request; if both fail, in the server."""
+"""The canary, a prompt that any working server answers. It is sent after another request failed: if
+the canary succeeds, the fault is in the request; if it fails too, in the server."""
 
 
 class NoResponseError(Exception):
@@ -48,18 +49,18 @@ class ServerPool:
     Use it as a context manager inside one event loop.
 
     Args:
-        cfg: The servers.
+        cfg: Settings of the servers.
         fields: Fields of every request.
-        canary: A prompt that any working server of this kind answers.
+        canary: A prompt that any working server answers; see CANARY.
     """
 
     def __init__(
         self, cfg: ServersConfig, fields: RequestFields, canary: Messages = CANARY
     ) -> None:
         self.cfg, self.fields, self.canary = cfg, fields, canary
-        self.servers = [Server(url, cfg) for url in dict.fromkeys(cfg.urls)]
+        self.servers = [ServerClient(url, cfg) for url in dict.fromkeys(cfg.urls)]
         self.failing_since: float | None = None
-        """Time of the first failure after the last response of any server."""
+        """Time of the first pause of a server since the last response of any server."""
 
     async def __aenter__(self) -> ServerPool:
         return self
@@ -68,16 +69,17 @@ class ServerPool:
         await asyncio.gather(*(server.client.close() for server in self.servers))
 
     async def complete(self, messages: Messages, n: int = 1, **fields: object) -> list[Response]:
-        """Up to `n` responses to a prompt, after waiting for a server if necessary.
+        """Return up to `n` responses to a prompt, after waiting for a server if necessary.
 
         Args:
             fields: Fields of this request only, in addition to those of every request.
 
         Raises:
-            NoResponseError: Servers that answer the canary refuse this prompt or fail at it
-                repeatedly.
+            NoResponseError: A server that answers the canary refuses this prompt, or the prompt
+                failed MAX_FAILURES times at such servers.
             UserError: No server was available for `cfg.unreachable_timeout` seconds, or a server
-                does not serve the model, refuses every request, or does not follow OpenAI's API.
+                does not serve the model, rejects the API key, refuses every request, or does not
+                follow OpenAI's API.
         """
         failures = 0
         while True:
@@ -95,7 +97,7 @@ class ServerPool:
                 await asyncio.sleep(random_pause(failures))
 
     async def _send(
-        self, server: Server, messages: Messages, n: int, fields: RequestFields
+        self, server: ServerClient, messages: Messages, n: int, fields: RequestFields
     ) -> list[Response]:
         server.in_flight += 1
         try:
@@ -105,11 +107,11 @@ class ServerPool:
         server.problem, server.pauses, self.failing_since = None, 0, None
         return responses
 
-    async def _wait_for_server(self) -> Server:
-        """The least busy server that is available.
+    async def _wait_for_server(self) -> ServerClient:
+        """Wait until a server is available, and return the one with the fewest requests in flight.
 
         Raises:
-            UserError: None was available for `cfg.unreachable_timeout` seconds.
+            UserError: No server was available for `cfg.unreachable_timeout` seconds.
         """
         while not (available := [s for s in self.servers if s.available_at <= time.monotonic()]):
             since = self.failing_since or time.monotonic()
@@ -126,26 +128,26 @@ class ServerPool:
             await asyncio.sleep(random.uniform(0, PAUSE))
         return min(available, key=lambda server: server.in_flight)
 
-    def _pause(self, server: Server, error: RequestError) -> None:
-        """Send a server nothing for the time in its rate limit, or for a random time that grows
-        with each pause in a row."""
+    def _pause(self, server: ServerClient, error: RequestError) -> None:
+        """Send no requests to a server for the time that its rate limit gives, or otherwise for a
+        random time whose bound doubles with each consecutive pause."""
         now = time.monotonic()
-        # Requests that were in flight together fail together and count once.
+        # Requests that were in flight together fail together, and count as one pause.
         server.pauses += server.available_at <= now
         pause = random_pause(server.pauses) if error.pause is None else error.pause
         server.available_at = max(server.available_at, now + pause)
         server.problem = str(error)
         self.failing_since = self.failing_since or now
 
-    async def _answers_canary(self, server: Server) -> bool:
-        """Send the canary to a server at which a request failed, and pause the server if that
-        fails too.
+    async def _answers_canary(self, server: ServerClient) -> bool:
+        """Send the canary to a server at which a request failed, and return whether it succeeds. If
+        not, the server is paused.
 
         Raises:
             UserError: The server refuses the canary or does not follow OpenAI's API.
         """
         failed_at = time.monotonic()
-        # One canary serves all requests that failed before it.
+        # One canary is enough for all requests that failed before it was sent.
         async with server.lock:
             if server.checked_at < failed_at:
                 server.checked_at = time.monotonic()
@@ -172,7 +174,7 @@ class ServerPool:
 
 
 def random_pause(failures: int) -> float:
-    """Seconds to wait after a number of failures: exponential backoff with full jitter."""
+    """Return a pause (s) after a number of failures: exponential backoff with full jitter."""
     return random.uniform(0, min(LONGEST_PAUSE, PAUSE * 2**failures))
 
 
@@ -181,8 +183,8 @@ async def run_limited(
 ) -> None:
     """Await `run(job)` for every job, with at most `limit` jobs in progress at a time.
 
-    Jobs start in order. If one raises, no further job starts, the jobs in progress are cancelled,
-    and the error is raised.
+    Jobs start in order. If a job raises an error, no further job starts, the jobs in progress are
+    cancelled, and the error is raised.
     """
     waiting = iter(jobs)
 

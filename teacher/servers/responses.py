@@ -16,11 +16,11 @@ class Response:
 
     Attributes:
         text: The response without surrounding white space.
-        flaw: Why the response is rejected before its text is read; None if it is not.
-        prompt_tokens: Number of prompt tokens. Only the first response to a request counts them;
-            the others have 0. None if the server does not report it.
-        completion_tokens: Number of generated tokens, as an equal share of the request's total.
-            None if the server does not report it.
+        flaw: Why the response cannot be used, whatever its text is; None if it can be.
+        prompt_tokens: Number of tokens of the prompt, in the first response to a request; 0 in its
+            other responses. None if the server does not report it.
+        completion_tokens: Number of generated tokens: an equal share of the request's total. None
+            if the server does not report it.
         finished: Arrival time (Unix time, s).
         reasoning: The text that the server's reasoning parser separated from the response.
     """
@@ -34,7 +34,7 @@ class Response:
 
 
 def parse_completion(completion: Any, n: int) -> list[Response]:
-    """Return the first `n` choices of a chat completion of the openai library.
+    """Convert the first `n` choices of the openai library's chat completion to responses.
 
     Raises:
         ValueError: The completion has no choices.

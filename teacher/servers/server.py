@@ -19,21 +19,21 @@ RequestFields = dict[str, Any]
 """Fields of a chat completion request; those outside OpenAI's API are in `extra_body`."""
 
 MALFORMED_REPLY_ERRORS = (AttributeError, IndexError, TypeError, ValueError)
-"""Errors that a body which does not follow the API raises in the openai client or while it is
-parsed."""
+"""Errors that the openai client or `parse_completion` raises for a reply that does not follow the
+API."""
 RETRYABLE_STATUSES = (408, 409)
-"""Client errors that a retry may resolve: request timeout and conflict."""
+"""HTTP status codes below 500 after which a retry may succeed: request timeout and conflict."""
 API_KEY_VARIABLE = "OPENAI_API_KEY"
-"""An environment variable and not a setting, because settings are saved with the run."""
+"""The API key is in an environment variable because settings are saved with the run."""
 
 
 def get_api_key() -> str:
-    """The API key from the environment; a placeholder if unset, since the client requires one."""
+    """Return the API key of the environment, or a placeholder: the openai client requires a key."""
     return os.environ.get(API_KEY_VARIABLE) or "none"
 
 
 def authentication_error(url: str, error: openai.APIStatusError) -> UserError:
-    """The error for a server that rejects the API key."""
+    """Return the error for a server that rejects the API key."""
     return UserError(
         f"{url} rejects the API key ({error.message}): set the environment variable "
         f"{API_KEY_VARIABLE} to a key of that server",
@@ -42,7 +42,7 @@ def authentication_error(url: str, error: openai.APIStatusError) -> UserError:
 
 
 class RequestError(Exception):
-    """A request that got no response; `pause` is the wait (s) that the server asks for, if any."""
+    """A request failed. `pause` is the time (s) to wait that the server gives, if any."""
 
     def __init__(self, problem: str, pause: float | None = None) -> None:
         super().__init__(problem)
@@ -50,26 +50,26 @@ class RequestError(Exception):
 
 
 class MalformedReplyError(RequestError):
-    """A body that does not follow the API."""
+    """The server's reply does not follow the API."""
 
 
 class RefusedError(RequestError):
-    """The server refuses this request; a retry gets the same result."""
+    """The server refuses this request, and would refuse it again."""
 
 
 class RateLimitedError(RequestError):
     """The server limits the request rate."""
 
 
-class Server:
+class ServerClient:
     """Sends requests to `cfg.model` at `url`. Use it inside one event loop.
 
     Attributes:
-        in_flight: Number of requests without a response yet.
-        problem: Why the last request failed; None if it did not.
-        pauses: Number of pauses in a row.
+        in_flight: Number of requests that have no response yet.
+        problem: Why `ServerPool` paused the server; None if the server has responded since.
+        pauses: Number of consecutive pauses.
         available_at: Earliest time of the next request, on the clock of time.monotonic().
-        checked_at: Time of the last canary.
+        checked_at: Time of the last canary, on the same clock.
         lock: Held while a canary is in flight.
     """
 
@@ -85,15 +85,15 @@ class Server:
         self.lock = asyncio.Lock()
 
     async def complete(self, messages: Messages, n: int, fields: RequestFields) -> list[Response]:
-        """Up to `n` responses to a prompt.
+        """Send a request, and return up to `n` responses.
 
         Raises:
-            RequestError: No response this time.
+            RequestError: The request failed.
             UserError: The server does not serve the model, or rejects the API key.
         """
         cfg = self.cfg
         try:
-            # The openai client's own timeout restarts with every byte that arrives.
+            # The openai client's own timeout starts again with every byte that arrives.
             async with asyncio.timeout(cfg.timeout):
                 completion = await self.client.chat.completions.create(
                     model=cfg.model, messages=messages, n=n, **fields
@@ -125,13 +125,13 @@ class Server:
             served = "an unknown set of models"
         return UserError(
             f"{self.url} does not serve {self.cfg.GROUP}.model={self.cfg.model}; it serves "
-            f"{served}. Check that the URL is that of an OpenAI-compatible server and ends in /v1",
+            f"{served}. Check that the URL belongs to an OpenAI-compatible server and ends in /v1",
             code="unknown-model",
         )
 
 
 def _retry_after(error: openai.APIStatusError) -> float | None:
-    """Seconds to wait by the Retry-After header; None without one, or if it is a date."""
+    """Return the seconds of the Retry-After header; None if it is missing or a date."""
     try:
         return max(0.0, float(error.response.headers.get("retry-after", "")))
     except ValueError:

@@ -1,13 +1,15 @@
-"""Extracts the claims of a rationale with a closed vocabulary, and checks them.
+"""Extracts the claims of a rationale, and compares each with the predicates.
 
-An ambiguous claim is contradicted only if the predicates contradict every reading of it.
+A claim is a statement that predicates can confirm or refute, such as the region of an object. If
+the text is ambiguous, the predicates must contradict every interpretation to contradict the claim.
+The package `teacher.reading` describes the steps.
 """
 
 from __future__ import annotations
 
 from teacher.predicates import Predicates
 from teacher.reading.candidates import CandidateReader
-from teacher.reading.grounding import CUT, EITHER, TARGET, Claim, Ground
+from teacher.reading.grounding import CUT, EITHER, TARGET, Claim, IndexedPredicates
 from teacher.reading.scenes import SceneReader
 from teacher.reading.tagging import Sentence, Tag, find_tags
 from teacher.sections import split_sections
@@ -18,30 +20,30 @@ MOMENTS = {
     "Prediction": TARGET,
     "Outcome": TARGET,
 }
-"""The moment that a section's present tense refers to."""
+"""The moment that the present tense of a section refers to."""
 
 MAX_SENTENCE_TAGS = 250
-"""Tags after which a sentence is split."""
+"""Maximum number of tags of a sentence (see `teacher.reading.tagging`); a longer one is split."""
 
 
 def extract_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
-    """The claims of a rationale in order, each with its verdict; never raises."""
-    ground = Ground(predicates)
+    """Return the claims of a rationale in text order, each with its verdict; never raises."""
+    indexed = IndexedPredicates(predicates)
     claims: list[Claim] = []
     for name, start, stop in split_sections(text):
         if name == "Answer":
             claims += _extract_answer(text, start, stop)
             continue
-        scene = SceneReader(ground, MOMENTS.get(name, EITHER))
-        candidates = CandidateReader(ground, lasting=name == "Candidate analysis")
+        scene = SceneReader(indexed, MOMENTS.get(name, EITHER))
+        candidates = CandidateReader(indexed, keeps_topic=name == "Candidate analysis")
         for tags in _split_sentences(find_tags(text, start, stop)):
-            names_candidate = any(tag.tag == "candidate" for tag in tags)
+            names_candidate = any(tag.name == "candidate" for tag in tags)
             if name == "Candidate analysis" or (name == "Outcome" and names_candidate):
                 claims += candidates.read(Sentence(text, tags))
             else:
                 claims += scene.read(Sentence(text, tags))
     claims.sort(key=lambda claim: claim.span)
-    return tuple(claim._replace(verdict=ground.verdict(claim)) for claim in claims)
+    return tuple(claim._replace(verdict=indexed.verdict(claim)) for claim in claims)
 
 
 def _extract_answer(text: str, start: int, stop: int) -> list[Claim]:
@@ -53,11 +55,11 @@ def _extract_answer(text: str, start: int, stop: int) -> list[Claim]:
 
 
 def _split_sentences(section: list[Tag]) -> list[list[Tag]]:
-    """Sentences of at most MAX_SENTENCE_TAGS tags. Readers look ahead to the end of a sentence, so
-    this bound keeps their time linear in the length of the text."""
+    """Split a section into sentences of at most MAX_SENTENCE_TAGS tags. Readers look ahead to the
+    end of a sentence, so this bound keeps their time linear in the length of the text."""
     sentences: list[list[Tag]] = [[]]
     for tag in section:
         sentences[-1].append(tag)
-        if tag.tag == "stop" or len(sentences[-1]) >= MAX_SENTENCE_TAGS:
+        if tag.name == "stop" or len(sentences[-1]) >= MAX_SENTENCE_TAGS:
             sentences.append([])
     return [s for s in sentences if s]

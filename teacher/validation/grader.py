@@ -1,4 +1,4 @@
-"""Validate the teacher's responses, and record each with its verdict and its settings."""
+"""Validate the teacher's responses, and record each with its result and its settings."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from teacher.prompts import PROMPT_VERSION
 from teacher.reading.grounding import VERDICTS
 from teacher.sections import GRAMMAR_VERSION
 from teacher.servers.responses import Response
-from teacher.validation.validator import VALIDATOR_VERSION, Verdict, validate_rationale
+from teacher.validation.validator import VALIDATOR_VERSION, Validation, validate_rationale
 
 MAX_CHARACTERS = 20_000
-"""Maximum length of a response. A longer one is rejected, and its text is recorded up to here."""
+"""Maximum length of a response. A longer one is rejected, and the record has its beginning only."""
 
 
 class RationaleGrader:
-    """Converts responses to `Rationale` records, for one configuration of the teacher."""
+    """Validates responses and converts them to `Rationale` records, for given settings."""
 
     def __init__(self, cfg: TeacherConfig) -> None:
         self.cfg = cfg
@@ -33,28 +33,28 @@ class RationaleGrader:
             "settings": self._hash_settings(),
             "seed": cfg.seed,
         }
-        """Fields of a record. If one has another value in an earlier record, a new response is
-        requested."""
+        """Fields that every new record has. An earlier record with another value in one of them is
+        ignored, and a new response is requested."""
 
     def grade(
         self, response: Response, predicates: Predicates, item: SelectionItem, attempt: int
     ) -> Rationale:
-        """Validate a response, and return its record with the reasons for any rejection."""
+        """Validate a response, and return its record; it has the reasons if it is rejected."""
         if len(response.text) > MAX_CHARACTERS:
-            verdict = Verdict(("too long",))
+            result = Validation(("too long",))
         elif response.flaw is not None:
-            verdict = Verdict((response.flaw,))
+            result = Validation((response.flaw,))
         else:
-            verdict = validate_rationale(response.text, predicates, item, self.cfg)
-        counts = Counter((claim.kind, claim.verdict) for claim in verdict.claims)
+            result = validate_rationale(response.text, predicates, item, self.cfg)
+        counts = Counter((claim.kind, claim.verdict) for claim in result.claims)
         return Rationale(
             item_id=item.item_id,
             attempt=attempt,
-            accepted=verdict.accepted,
+            accepted=result.accepted,
             text=response.text[:MAX_CHARACTERS],
-            answer=verdict.answer,
-            reasons=verdict.reasons,
-            sections=verdict.sections,
+            answer=result.answer,
+            reasons=result.reasons,
+            sections=result.sections,
             prompt_tokens=response.prompt_tokens,
             completion_tokens=response.completion_tokens,
             grammar=self.grammar_version,
@@ -67,11 +67,11 @@ class RationaleGrader:
         )
 
     def is_current(self, rationale: Rationale) -> bool:
-        """Whether a rationale was recorded with the current teacher, versions and settings."""
+        """Return whether a rationale was recorded with the current versions, settings and seed."""
         return all(getattr(rationale, name) == value for name, value in self.origin.items())
 
     def _hash_settings(self) -> str:
-        """A short hash of the settings that affect a response or its verdict."""
+        """Return a short hash of the settings that affect a response or its validation."""
         cfg = self.cfg
         settings = [cfg.min_words, cfg.max_words]
         if cfg.url is not None:

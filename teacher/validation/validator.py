@@ -17,18 +17,18 @@ from teacher.validation.claim_extraction import extract_claims
 VALIDATOR_VERSION = "4"
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
 WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")
-"""A word; "top-left" is one word."""
+"""A word; hyphens and apostrophes join words, so "top-left" counts as one."""
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Result of a validation.
+class Validation:
+    """The result of `validate_rationale`.
 
     Attributes:
         reasons: Why the rationale is rejected, each "kind" or "kind: detail"; empty if accepted.
-        sections: The text below each heading.
-        answer: The candidate's letter; None without a clear answer.
-        claims: The claims of the rationale, each with its own verdict.
+        sections: The text of each section, by heading.
+        answer: The letter of the chosen candidate; None if the answer is missing or unclear.
+        claims: The claims of the rationale, each with its verdict.
     """
 
     reasons: tuple[str, ...]
@@ -43,7 +43,7 @@ class Verdict:
 
 def validate_rationale(
     text: str, predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
-) -> Verdict:
+) -> Validation:
     """Check a rationale against its item, and collect every reason to reject it."""
     reasons = [f"number: {text[start:stop]!r}" for start, stop in find_numbers(text)]
     words = len(WORD.findall(text))
@@ -58,7 +58,7 @@ def validate_rationale(
         reasons.append(f"wrong answer: {answer}")
     claims = extract_claims(text, predicates)
     reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
-    return Verdict(tuple(reasons), sections, answer, claims)
+    return Validation(tuple(reasons), sections, answer, claims)
 
 
 def _check_candidate_analysis(analysis: str) -> list[str]:
@@ -66,12 +66,12 @@ def _check_candidate_analysis(analysis: str) -> list[str]:
         return []
     named = {analysis[start:stop] for start, stop in find_letters(analysis)}
     reasons = [f"candidate not analysed: {letter}" for letter in LETTERS if letter not in named]
-    # A small "a" looks like the article, so it would keep its letter when candidates are permuted.
+    # `relabel_text` does not change small letters, which may be the article "a".
     return reasons + [f"small letter: {m[0]}" for m in SMALL_LETTER.finditer(analysis)]
 
 
 def _parse_sections(text: str) -> tuple[dict[str, str], str | None, list[str]]:
-    """The sections, the answer if it is clear, and the problems of the form."""
+    """Return the text of each section, the answer if it is clear, and the errors of the form."""
     bodies = [(name, text[start:stop].strip()) for name, start, stop in split_sections(text)]
     sections = {name: body for name, body in bodies if name != "Answer"}
     answers = [body for name, body in bodies if name == "Answer"]
@@ -87,7 +87,7 @@ def _parse_sections(text: str) -> tuple[dict[str, str], str | None, list[str]]:
     if not answers:
         return sections, None, [*problems, "no answer"]
     answer = answers[-1]
-    # Students are trained on the letter as the token that follows exactly this line.
+    # Students are trained to end their text with exactly this line.
     if answer not in tuple(LETTERS) or not text.rstrip().endswith(f"\nAnswer: {answer}"):
         return sections, None, [*problems, "unclear answer"]
     return sections, answer, problems

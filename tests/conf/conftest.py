@@ -1,3 +1,5 @@
+"""The folder in which tests run the toy command."""
+
 import shutil
 from pathlib import Path
 

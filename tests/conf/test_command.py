@@ -1,4 +1,4 @@
-"""A command as a process, with a toy as `main`."""
+"""The toy command as a process: the files of its run, its exit status and its error messages."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ def test_run_writes_its_record_and_can_be_repeated(folder):
     assert "[other-settings]" in refused.stderr
 
 
-def test_run_without_results_takes_other_settings(folder):
+def test_unfinished_run_without_results_accepts_other_settings(folder):
     assert run_toy(folder, "end=mistake", "run=one").returncode == 1
     assert run_toy(folder, "x=3", "run=one").returncode == 0
     run = folder / "checkpoints/toy/one"
@@ -48,7 +48,7 @@ def test_run_without_results_takes_other_settings(folder):
         (["checkpoints=toy.py"], 1, f"error: toy.py/toy/default: Not a directory; {RESUME}"),
     ],
 )
-def test_mistake_ends_in_one_sentence(folder, arguments, status, end):
+def test_failed_command_prints_no_traceback(folder, arguments, status, end):
     done = run_toy(folder, *arguments)
     assert done.returncode == status
     assert done.stderr.endswith(end)

@@ -1,4 +1,4 @@
-"""Mistakes in the settings are SettingsErrors of one sentence that names the key."""
+"""Invalid settings raise a SettingsError whose message names the key."""
 
 import pytest
 
@@ -88,7 +88,7 @@ def test_server_address_must_be_a_url(url):
         compose("train.sft", SftCommand, [f"teacher.url='{url}'", "teacher=qwen3_32b"])
 
 
-def test_check_across_groups():
+def test_values_of_two_groups_are_checked_together():
     with raises_user_error("invalid-setting", contains="benchmark.retrieval.hard_negatives"):
         compose("train.contrastive", ContrastiveCommand, ["train.hard_negatives=9"])
 
@@ -105,7 +105,7 @@ def test_dict_setting_takes_new_names():
     assert compose("data.build", BuildCommand, new).benchmark.selection.event["new"] == Quota(3)
 
 
-def test_hydra_keys_pass():
+def test_keys_of_hydra_are_accepted():
     compose("train.sft", SftCommand, ["hydra.verbose=true", "hydra/launcher=basic"])
 
 
@@ -127,7 +127,7 @@ def test_each_job_of_a_sweep_is_checked(overrides, code, contains):
         Sweep("train.sft", SftCommand, overrides)
 
 
-def test_valid_sweep_passes():
+def test_valid_sweep_is_accepted():
     sweep = ["student=tiny,qwen3_vl_8b", "+exp=cot,answer_only", "seed=range(0,2)"]
     jobs = Sweep("train.sft", SftCommand, sweep).jobs
     assert len(jobs) == 8

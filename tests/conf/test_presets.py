@@ -1,4 +1,4 @@
-"""Every yaml file composes with the command in its first comment."""
+"""Every YAML file of conf/ composes with the command in its first comment; values of presets."""
 
 import shlex
 from dataclasses import fields, is_dataclass
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from conf import schema
-from conf.compose import compose, config_name, options
+from conf.compose import compose, config_name, list_presets
 from conf.errors import SettingsError
 from conf.help import description
 from data.tracks.selection.window import CELLS
@@ -34,7 +34,8 @@ SCHEMAS = {
 }
 
 
-def settings(line: str):
+def compose_line(line: str):
+    """Compose the settings of a command line. For a sweep, its preset is composed as one run."""
     python, m, command, *overrides = shlex.split(line)
     assert (python, m) == ("python", "-m")
     # Each job of a sweep is composed in test_sweep.py.
@@ -49,7 +50,7 @@ def test_first_comment_is_a_command_that_composes_the_file(path):
     lines = path.read_text().splitlines()
     line = lines[1] if lines[0].startswith("# @package") else lines[0]
     assert line.startswith("# python -m ")
-    settings(line.removeprefix("# "))
+    compose_line(line.removeprefix("# "))
     group = path.parent.name
     if group in ("exp", "sweep"):
         assert f"+{group}={path.stem}" in line
@@ -68,7 +69,7 @@ def test_help_lists_the_overlays_that_compose(command):
         return True
 
     overlays = [path.stem for path in sorted((CONF / "exp").iterdir())]
-    assert options(command, SCHEMAS[command])["exp"] == list(filter(composes, overlays))
+    assert list_presets(command, SCHEMAS[command])["exp"] == list(filter(composes, overlays))
 
 
 @pytest.mark.parametrize("command", SCHEMAS)
@@ -85,8 +86,8 @@ def test_help_describes_every_setting(command):
 
 
 def test_student_preset_sets_its_training_recipe():
-    tiny = settings("python -m train.sft")
-    paper = settings("python -m train.sft student=qwen3_vl_8b")
+    tiny = compose_line("python -m train.sft")
+    paper = compose_line("python -m train.sft student=qwen3_vl_8b")
     assert (tiny.train.lr, tiny.train.batch, tiny.train.regime) == (2e-3, 16, "cot")
     train, student = paper.train, paper.student
     assert (train.lr, train.epochs, train.precision) == (2e-5, 3, "bf16")
@@ -97,16 +98,16 @@ def test_student_preset_sets_its_training_recipe():
 
 def test_teacher_takes_one_server_or_several():
     command = "python -m teacher.narrate teacher=qwen3_32b"
-    one = settings(command).teacher
-    several = settings(f"{command} teacher.url=[http://a:8000/v1,https://b/v1]").teacher
+    one = compose_line(command).teacher
+    several = compose_line(f"{command} teacher.url=[http://a:8000/v1,https://b/v1]").teacher
     assert one.urls == ["http://127.0.0.1:8000/v1"]
     assert several.urls == ["http://a:8000/v1", "https://b/v1"]
-    assert settings("python -m teacher.narrate").teacher.urls == []
+    assert compose_line("python -m teacher.narrate").teacher.urls == []
 
 
 def test_overrides_and_overlays_replace_the_recipe():
-    assert settings("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
-    base = settings("python -m train.sft +exp=base")
+    assert compose_line("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
+    base = compose_line("python -m train.sft +exp=base")
     assert base.student.name == "tiny_scratch"
     assert base.student.architecture.vision_layers == 4
     assert base.benchmark.name == "tiny_base"
@@ -114,15 +115,15 @@ def test_overrides_and_overlays_replace_the_recipe():
 
 
 def test_retriever_preset_sets_its_training_recipe():
-    tiny = settings("python -m train.contrastive")
-    paper = settings("python -m train.contrastive retriever=qwen3_vl_emb_8b")
+    tiny = compose_line("python -m train.contrastive")
+    paper = compose_line("python -m train.contrastive retriever=qwen3_vl_emb_8b")
     assert (tiny.train.batch, tiny.train.lr, tiny.retriever.widths[0]) == (64, 1.5e-3, 128)
     assert tiny.retriever.architecture.vocabulary == 1024
     assert (paper.train.batch, paper.train.mini_batch, paper.train.lr) == (512, 8, 2e-5)
 
 
 def test_a_window_group_quota_is_divided_among_its_cells():
-    window = settings(
+    window = compose_line(
         "python -m data.build benchmark=tiny benchmark.selection.window.G2_B.train=20 "
         "+benchmark.selection.window={G1_A_h16_easy:{train:7}}"
     ).benchmark.selection.window
@@ -139,7 +140,7 @@ def totals(quotas: dict[str, schema.Quota], prefix: str = "") -> tuple[int, int]
 
 
 def test_quotas_add_up_to_the_papers_totals():
-    benchmark = settings("python -m data.build benchmark=dynapix").benchmark
+    benchmark = compose_line("python -m data.build benchmark=dynapix").benchmark
     track, retrieval = benchmark.selection, benchmark.retrieval
     assert (len(track.event), *totals(track.event)) == (7, 1151, 249)
     assert (len(track.time), *totals(track.time)) == (2, 1619, 374)
@@ -156,8 +157,8 @@ def test_quotas_add_up_to_the_papers_totals():
     assert sorted(retrieval.builders) == ["1", "2", "3", "4", "5", "6"]
     assert sum(totals(retrieval.builders)) == 22_500
     assert (retrieval.standard, retrieval.database, retrieval.source) == (2_002, 10_000, 30_000)
-    absent = retrieval.counterfactual
-    assert (absent.train + absent.test, retrieval.counterfactual_source) == (18_225, 26_995)
-    # Queries are divided 80/20, as the scenes are.
-    for quota in (*retrieval.builders.values(), absent):
+    without = retrieval.counterfactual
+    assert (without.train + without.test, retrieval.counterfactual_source) == (18_225, 26_995)
+    # Queries are divided 80/20 into training and test queries, as the scenes are.
+    for quota in (*retrieval.builders.values(), without):
         assert quota.train == 4 * quota.test

@@ -27,8 +27,8 @@ def test_run_name_comes_from_the_overrides(overrides, name):
 
 
 def test_run_name_is_independent_of_the_order_of_overrides():
-    typed = ["x=1", "+exp=cot", "train.lr=1e-3"]
-    assert len({run_name(None, list(order)) for order in permutations(typed)}) == 1
+    overrides = ["x=1", "+exp=cot", "train.lr=1e-3"]
+    assert len({run_name(None, list(order)) for order in permutations(overrides)}) == 1
     assert run_name(None, ["x=1", "x=2"]) != run_name(None, ["x=2", "x=1"])
 
 
@@ -40,12 +40,12 @@ def test_long_run_name_is_shortened_and_unique():
 
 def test_record_lists_every_start(tmp_path):
     run = Run("r", tmp_path / "r")
-    open_run(run, SETTINGS, "train.sft", ["x=1"])
+    open_run(run, SETTINGS, "train.sft")
     first = json.loads((run.folder / "run.json").read_text())
     assert first["earlier_starts"] == []
     assert first["seeds"] == {"seed": 0}
     assert first["packages"]["hydra-core"].startswith("1.3")
-    open_run(run, SETTINGS | {"workers": 8, "store": "/big"}, "train.sft", ["x=1"])
+    open_run(run, SETTINGS | {"workers": 8, "store": "/big"}, "train.sft")
     again = json.loads((run.folder / "run.json").read_text())
     assert again["earlier_starts"] == [first["started"]]
     assert not list(run.folder.glob("*.tmp"))
@@ -53,7 +53,7 @@ def test_record_lists_every_start(tmp_path):
 
 def test_other_settings_are_refused_with_both_values(tmp_path):
     run = Run("r", tmp_path / "r")
-    open_run(run, SETTINGS | {"train": {"lr": 1.0}}, "train.sft", [])
+    open_run(run, SETTINGS | {"train": {"lr": 1.0}}, "train.sft")
     (run.folder / "metrics.jsonl").touch()
     with raises_user_error("other-settings", contains="train.lr was 1.0 and is now 2.0"):
-        open_run(run, SETTINGS | {"train": {"lr": 2.0}}, "train.sft", [])
+        open_run(run, SETTINGS | {"train": {"lr": 2.0}}, "train.sft")

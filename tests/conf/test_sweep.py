@@ -1,4 +1,4 @@
-"""Sweeps from the command line: processes of a toy command, and the sweep presets."""
+"""Sweeps of the toy command, run as processes, and the sweep presets."""
 
 import csv
 import json
@@ -44,7 +44,7 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory) -> Path:
-    """A working folder with a finished search by loss."""
+    """A working folder with the finished search `s`, which minimises the loss."""
     folder = tmp_path_factory.mktemp("searched")
     shutil.copy(Path(__file__).with_name("toy.py"), folder)
     done = run_toy(folder, *SEARCH, BY_LOSS, "run=s")
@@ -105,7 +105,7 @@ def test_killed_sweep_ends_its_children(folder, env, concurrent):
 def test_one_job_runs_on_each_gpu(folder):
     done = run_toy(folder, "-m", "x=1,2", "end=meet", env=TWO_GPUS)
     assert done.returncode == 0, done.stderr
-    # Without run=, the name of a sweep comes from its overrides.
+    # Without run=, the name of the sweep's folder is made from its overrides.
     runs = folder / "checkpoints/toy/end-meet+x-1-2"
     logs = [(runs / f"{number}/run.log").read_text() for number in range(2)]
     gpus = [line for log in logs for line in log.splitlines() if "sees GPU" in line]
@@ -160,7 +160,7 @@ def test_cluster_that_cannot_be_used_is_a_user_error(folder, options):
 
 
 @pytest.mark.slow
-def test_killed_search_repeats_its_trials_and_finished_search_adds_none(searched):
+def test_killed_search_resumes_with_its_trials_and_finished_search_adds_none(searched):
     search = (*SEARCH, BY_LOSS, "run=k")
     runs = searched / "checkpoints/toy/k"
     killed = start_toy(searched, *search)
@@ -222,7 +222,7 @@ def test_other_search_in_the_same_folder_is_refused(searched, changed):
         ([*SEARCH[2:], "x=interval(3,1)", BY_LOSS], "invalid-interval"),
     ],
 )
-def test_invalid_search_is_one_sentence(folder, arguments, code):
+def test_invalid_search_is_refused_in_one_line(folder, arguments, code):
     done = run_toy(folder, "-m", *arguments)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
@@ -248,12 +248,12 @@ def test_extra_that_is_not_installed_is_a_user_error(monkeypatch):
         ("x={a:1},{a:2}", CategoricalDistribution(["{a:1}", "{a:2}"])),
     ],
 )
-def test_sweep_syntax_becomes_a_distribution(override, expected):
+def test_swept_override_becomes_a_distribution(override, expected):
     [parsed] = OverridesParser.create().parse_overrides([override])
     assert distribution(parsed) == expected
 
 
-def test_direction_follows_from_the_metric():
+def test_metric_determines_the_direction_of_a_search():
     lower = {"eval_loss", "median_rank", "set_aside"}
     assert {m for m in (*lower, "mrr", "accuracy") if is_lower_better(m)} == lower
 

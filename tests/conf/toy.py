@@ -19,6 +19,7 @@ class ToyCommand(CommandConfig):
     x: float = 1.0
     """Number to square."""
     end: str = "well"
+    """How the run ends, such as well or bug."""
     teacher: TeacherConfig = field(default_factory=TeacherConfig)
 
 
@@ -49,7 +50,11 @@ def main(cfg: ToyCommand, run: Run) -> dict[str, float]:
 
 
 def _meet(run: Run) -> None:
-    """Wait for another job of the sweep that runs at the same time, in vain if none does."""
+    """Wait until another job of the sweep runs at the same time.
+
+    Raises:
+        RuntimeError: None does within a minute.
+    """
     (run.folder / "ready").touch()
     deadline = time.monotonic() + 60
     while len(list(run.folder.parent.glob("*/ready"))) < 2:

@@ -1,4 +1,4 @@
-"""Simulated scenes with the default numbers of objects and collisions."""
+"""Scenes that tests simulate, within the default limits on objects and collisions."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ LIMITS = BenchmarkConfig(name="limits")
 
 
 def simulate_scene(seed: int, index: int) -> Scene:
-    """Simulate scene `index` of a seed."""
+    """Simulate scene `index` of a seed; it is a training scene."""
     bodies, motion = sample_bodies(seed, index, LIMITS)
     return record_scene(format_scene_id(seed, index), "train", bodies, motion)

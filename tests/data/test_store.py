@@ -1,4 +1,4 @@
-"""Laws of stores: builds are deterministic and resume when killed; damage is detected."""
+"""Builds are deterministic and resume after a kill; opening a store detects damaged files."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def copy(built: Path, tmp_path: Path) -> Path:
     return tmp_path / "small"
 
 
-def file_contents(folder: Path) -> dict[str, str]:
+def content_hashes(folder: Path) -> dict[str, str]:
+    """Hashes of all files of a store by name, and the text of its manifest."""
     frames = {p.name: hash_file(p) for p in (folder / "frames").glob("*.zip")}
     return {**hash_files(folder), **frames, MANIFEST: (folder / MANIFEST).read_text()}
 
@@ -54,7 +55,7 @@ def file_contents(folder: Path) -> dict[str, str]:
 @pytest.mark.slow
 def test_builds_are_byte_identical_with_any_number_of_workers(built, tmp_path) -> None:
     ensure_benchmark(small(), tmp_path, workers=2)
-    assert file_contents(tmp_path / "small") == file_contents(built)
+    assert content_hashes(tmp_path / "small") == content_hashes(built)
 
 
 @pytest.mark.slow
@@ -79,9 +80,9 @@ def test_killed_build_resumes_to_identical_bytes(built, tmp_path, part) -> None:
     assert not psutil.wait_procs(workers, timeout=30)[1]
     first = {p.name: p.stat().st_mtime_ns for p in parts.glob("[!.]*")}
     ensure_benchmark(small(), tmp_path, workers=1)
-    assert file_contents(tmp_path / "small") == file_contents(built)
+    assert content_hashes(tmp_path / "small") == content_hashes(built)
     kept = tmp_path / "small" / parts.name
-    assert all((kept / name).stat().st_mtime_ns == when for name, when in first.items())
+    assert all((kept / name).stat().st_mtime_ns == modified for name, modified in first.items())
 
 
 @pytest.mark.slow
@@ -103,7 +104,7 @@ def test_partial_build_with_other_scenes_is_kept(tmp_path) -> None:
 
 @pytest.mark.slow
 def test_concurrent_builds_make_one_store(tmp_path, built) -> None:
-    """One process builds, and the others wait for it, as in the jobs of a sweep."""
+    """While one builder holds the lock, others wait for it, as jobs of a sweep do."""
     stores = []
     others = [
         threading.Thread(
@@ -158,20 +159,20 @@ VERSION_KEYS = {name: f'"{name}": "'.encode() for name in ("generator", "rendere
 @pytest.mark.parametrize(
     ("damage", "code", "name"),
     [
-        (lambda whole: whole[:100], "damaged-file", MANIFEST),
-        (lambda whole: b"[]", "damaged-file", MANIFEST),
-        (lambda whole: b"\xff" + whole, "damaged-file", MANIFEST),
-        (lambda whole: whole.replace(b'"scenes": 6', b'"scenes": 7'), "damaged-file", MANIFEST),
-        # The first key of this name is the version; the settings follow.
+        (lambda text: text[:100], "damaged-file", MANIFEST),
+        (lambda text: b"[]", "damaged-file", MANIFEST),
+        (lambda text: b"\xff" + text, "damaged-file", MANIFEST),
+        (lambda text: text.replace(b'"scenes": 6', b'"scenes": 7'), "damaged-file", MANIFEST),
+        # The version is the first key of this name; the settings, which follow, have it too.
         *(
-            (lambda whole, key=key: whole.replace(key, key + b"0", 1), "different-version", name)
+            (lambda text, key=key: text.replace(key, key + b"0", 1), "different-version", name)
             for name, key in VERSION_KEYS.items()
         ),
     ],
 )
 def test_damaged_or_old_manifest_is_refused(copy, damage, code, name) -> None:
-    whole = (copy / MANIFEST).read_bytes()
-    (copy / MANIFEST).write_bytes(damage(whole))
+    text = (copy / MANIFEST).read_bytes()
+    (copy / MANIFEST).write_bytes(damage(text))
     with raises_user_error(code, contains=name):
         open_store(copy)
 

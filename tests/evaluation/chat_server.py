@@ -1,4 +1,4 @@
-"""A small real server that speaks the chat protocol and sends the responses that a test gives."""
+"""A small HTTP server with the protocol of chat completions, whose responses a test determines."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from typing import Any
 from tests.local import JsonHandler, LocalServer
 
 Reply = str | int | dict[str, Any]
-"""A text; a status; or a response's `content`, `reasoning`, `finish_reason` or `message`."""
+"""The text of a response; an HTTP status; or a dictionary with some of the keys `status`, `message`
+(of an error), `content`, `reasoning` and `finish_reason`."""
 
 
 class ChatServer(LocalServer):
-    """`reply` responds to each request, and `requests` records them. With a `key`, requests that
-    lack it are refused."""
+    """Responds to each request with `reply(request)`, and records it in `requests`.
+
+    If `key` is set, requests without this API key are refused.
+    """
 
     def __init__(self, reply: Callable[[dict[str, Any]], Reply], port: int = 0) -> None:
         self.reply = reply
@@ -54,7 +57,7 @@ class Handler(JsonHandler):
         self.respond(200, {**body, "choices": [choice]})
 
     def refused(self) -> bool:
-        """Refuse a request with another key."""
+        """Refuse the request if it lacks the server's key; return whether it was refused."""
         key = self.server.key
         if wrong := key is not None and self.headers["Authorization"] != f"Bearer {key}":
             self.respond(401, {"error": {"message": "no such key"}})

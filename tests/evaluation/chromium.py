@@ -1,4 +1,4 @@
-"""A headless Chromium that opens pages."""
+"""A headless Chromium in which tests open pages."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
 )
-OVERFLOW = "return document.documentElement.scrollWidth > document.documentElement.clientWidth"
+IS_TOO_WIDE = "return document.documentElement.scrollWidth > document.documentElement.clientWidth"
 
 
 def chromium_in(profile: Path) -> Iterator[webdriver.Chrome]:
-    """A browser with its profile in a folder, which records its console; closed at the end."""
+    """Yield a browser that has its profile in a folder and records its console; then close it."""
     browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
     assert browser, "pages are tested in Chromium: apt-get install chromium"
     assert driver, "pages are tested in Chromium: apt-get install chromium-driver"

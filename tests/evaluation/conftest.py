@@ -1,4 +1,4 @@
-"""Servers that tests start."""
+"""A fixture that starts chat servers."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from tests.evaluation.chat_server import ChatServer
 
 @pytest.fixture
 def start_server(monkeypatch):
+    """Return a function that starts a server, which is stopped at the end of the test."""
     monkeypatch.setattr("teacher.servers.pool.PAUSE", 0.01)
     monkeypatch.setattr("teacher.servers.pool.LONGEST_PAUSE", 0.05)
     servers = []

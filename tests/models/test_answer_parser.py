@@ -1,3 +1,7 @@
+"""The parser of responses returns the chosen letter, or the reason why there is none."""
+
+from __future__ import annotations
+
 import json
 import random
 import time
@@ -59,7 +63,7 @@ CASES = [
     ('{"confidence": 1}\nAnswer: B', "B", None),
     ("<think>x</think><think>y</think>\nAnswer: C", "C", None),
     ("Answer: A</think>Answer: C", "C", None),
-    # records that are invalid, with a choice that stands
+    # invalid records whose choice is complete
     (FULL[:40], "B", CUT),
     ('{"choice": "B"', "B", CUT),
     ("{'choice': 'B', 'why': \"it's so\"}", "B", MAL),
@@ -84,7 +88,7 @@ CASES = [
     ("Answer: B\nWe wait for A to pass; candidate C is later.", "B", None),
     ("Answer: B; it cannot be determined", None, REF),
     ("Answer: B, or none", None, REF),
-    # several
+    # several letters
     ("Answer: B\nWait, actually it is C.", None, SEV),
     ("a, b", None, SEV),
     ("Answer: either B or C", None, SEV),
@@ -102,7 +106,7 @@ CASES = [
     ("Answer: none of the candidates", None, REF),
     ("Answer: N/A", None, SEV),
     ('{"choice": "none"}', None, REF),
-    # other letters
+    # letters that are not offered
     ("E", None, BAD),
     ("Answer: 2", None, BAD),
     ('{"choice": "Image 3"}', None, BAD),
@@ -122,7 +126,7 @@ CASES = [
     ('{"choice": {"letter": "B"}}', None, NO),
     ('{"second_choice": "B"}', None, NO),
     ('{\n  "answer": "B"\n}', None, NO),
-    # a record one of whose keys looks like a choice, or that is broken around it
+    # records with a key that resembles a choice, or with errors around the choice
     ('{"forced_choice": " (a) "}', "A", None),
     (FULL.replace('"B",', '"B"', 1), "B", MAL),
     (FULL.replace("}", ",}", 1), "B", MAL),
@@ -134,21 +138,21 @@ CASES = [
     ('{"forced_choice": "B, but impossible to determine"}', None, REF),
     ('{"forced_choice": "A, no other one fits"}', "A", None),
     ('{"forced_choice": "blue cube"}', None, NO),
-    # letters in passing, and inside words
+    # letters that are only mentioned, and letters in words
     ("Answer: Blue", None, NO),
     ("The answer depends on A.", None, NO),
     ("Candidate A:", None, NO),
-    # a letter that its own line withdraws, and one that is explained by what is absent
+    # letters that the same line takes back, and letters with a reason that only contains a negation
     ("Answer: A? No.", None, REF),
     ("Answer: A, which is wrong", None, REF),
     ("Answer: B. I'm sorry, but I cannot determine it.", None, REF),
     ("Answer: B. No cube has moved.", "B", None),
     ("Answer: B, since the sphere cannot be seen any more.", "B", None),
     ("Answer: B. There is not enough time to reach the corner.", "B", None),
-    # thoughts of other templates
+    # reasoning in the tags of other chat templates
     ("<thinking>\nAnswer: B", None, CUT),
     ("◁think▷Answer: B◁/think▷Answer: C", "C", None),
-    # look-alikes of other scripts are other letters; forms of the same letter are not
+    # letters of other scripts that look like A to D are other letters
     ("Answer: В", None, BAD),
     ('{"forced_choice": "С"}', None, BAD),
     # damaged text in which the letter may belong to something else
@@ -179,20 +183,20 @@ def test_parse_choice(raw, letter, reason):
         assert parse_choice(padded).letter == letter
 
 
-def test_only_offered_letters_count():
+def test_only_letters_of_the_item_are_accepted():
     assert parse_choice("Answer: D", letters="ABC") == ParsedAnswer(None, BAD)
     assert parse_choice("Answer: C", letters="ABC").letter == "C"
 
 
 @pytest.mark.parametrize("stop", range(len(FULL)))
-def test_a_record_cut_anywhere_gives_its_choice_or_none(stop):
+def test_a_record_that_is_cut_off_gives_its_choice_or_none(stop):
     choice = parse_choice(FULL[:stop])
-    stands = stop >= FULL.index(",")
-    assert choice.letter == ("B" if stands else None)
-    assert choice.reason in ((CUT,) if stands else (CUT, NO))
+    complete = stop >= FULL.index(",")
+    assert choice.letter == ("B" if complete else None)
+    assert choice.reason in ((CUT,) if complete else (CUT, NO))
 
 
-def test_any_text_gives_an_offered_letter_or_a_reason():
+def test_any_text_gives_a_letter_of_the_item_or_a_reason():
     rng = random.Random(0)
     seeds = [raw for raw, _, _ in CASES]
     pieces = [
@@ -227,7 +231,7 @@ def test_an_incomplete_last_word_is_not_a_choice(raw, letter):
 
 
 def test_texts_that_state_no_choice_have_no_letter():
-    """Prose and JSON of words that name letters, candidates and colours, but choose none."""
+    """Random prose and JSON mention letters and candidates, but choose none."""
     rng = random.Random(0)
     words = ["A", "B", "Candidate C", "D", "cube", "a", "the", "best", "option", "choice", "late"]
     keys = ["confidence", "second_choice", "distribution", "rationales", "answer", "my choices"]

@@ -10,10 +10,10 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import eager_attention_forwa
 
 from models.attention import (
     BY_FRAME,
-    PRODUCTS,
-    SHORT,
+    MATMUL,
+    MATMUL_MAX_TOKENS,
     attend_by_frame,
-    attend_by_products,
+    attend_by_matmul,
     choose_attention,
 )
 from models.student.collator import Collator
@@ -34,7 +34,7 @@ def samples(micro_store, frames, student_cfg) -> list[Sample]:
 
 
 def heads(*shape: int, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
-    """A query, a key and a value with gradients."""
+    """Return a random query, key and value that require gradients."""
     generator = torch.Generator().manual_seed(0)
     made = (torch.randn(shape, generator=generator).to(dtype) for _ in range(3))
     return [one.requires_grad_() for one in made]
@@ -44,7 +44,7 @@ class Layer(nn.Module):
     num_key_value_groups = 1
 
 
-def grid(lengths: list[int]) -> torch.Tensor:
+def frame_bounds(lengths: list[int]) -> torch.Tensor:
     return torch.tensor([0, *lengths]).cumsum(0)
 
 
@@ -53,7 +53,7 @@ def test_all_frames_at_once_equal_frames_one_by_one(lengths) -> None:
     query, key, value = heads(1, 2, sum(lengths), 8)
     found, _ = attend_by_frame(
         Layer(), query, key, value, None,
-        scaling=0.3, cu_seq_lens_q=grid(lengths), max_length_q=max(lengths),
+        scaling=0.3, cu_seq_lens_q=frame_bounds(lengths), max_length_q=max(lengths),
     )  # fmt: skip
     expected = torch.cat(
         [
@@ -87,7 +87,7 @@ def test_products_equal_the_librarys_eager_attention() -> None:
     inputs, mask = (query, key, value), causal(33, torch.float32)
     ours, theirs = (
         attend(layer, *inputs, mask, scaling=0.25)[0]
-        for attend in (attend_by_products, eager_attention_forward)
+        for attend in (attend_by_matmul, eager_attention_forward)
     )
     check_equal(ours, theirs, inputs)
 
@@ -107,7 +107,7 @@ def test_products_in_bf16_err_no_more_than_fused_attention() -> None:
 
     def products(query, key, value) -> torch.Tensor:
         mask = causal(129, torch.bfloat16)
-        found, _ = attend_by_products(Layer(), query, key, value, mask, scaling=32**-0.5)
+        found, _ = attend_by_matmul(Layer(), query, key, value, mask, scaling=32**-0.5)
         return found.transpose(1, 2)
 
     true, library, ours = passes(fused, wide), passes(fused, exact), passes(products, exact)
@@ -127,9 +127,9 @@ def test_every_pass_over_the_frames_is_one_call(samples, processor, model, monke
 
     def counted(module, query, *args, **settings):
         shapes.append(query.shape)
-        return attend_by_products(module, query, *args, **settings)
+        return attend_by_matmul(module, query, *args, **settings)
 
-    monkeypatch.setattr(attention, "attend_by_products", counted)
+    monkeypatch.setattr(attention, "attend_by_matmul", counted)
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
         loss_of(model, Collator(processor, LENGTH)(samples))
     layers = len(model.model.visual.blocks)
@@ -140,17 +140,17 @@ def test_every_pass_over_the_frames_is_one_call(samples, processor, model, monke
 def test_attention_depends_on_precision_and_length(model) -> None:
     text, vision = model.config.text_config, model.config.vision_config
     for precision, length, expected in (
-        ("bf16", SHORT, PRODUCTS),
-        ("bf16", SHORT + 1, "sdpa"),
-        ("fp32", SHORT, "sdpa"),
+        ("bf16", MATMUL_MAX_TOKENS, MATMUL),
+        ("bf16", MATMUL_MAX_TOKENS + 1, "sdpa"),
+        ("fp32", MATMUL_MAX_TOKENS, "sdpa"),
     ):
         choose_attention(model, precision, length)
         assert (text._attn_implementation, vision._attn_implementation) == (expected, BY_FRAME)
 
 
 @pytest.mark.parametrize("precision", ["bf16", "fp32"])
-def test_padding_and_a_cache_change_nothing(samples, processor, model, precision) -> None:
-    """Rows of padding stay finite, and a cache does not change the generated tokens."""
+def test_padding_and_a_cache_change_no_results(samples, processor, model, precision) -> None:
+    """Padding makes no value infinite, and a key-value cache does not change the logits."""
     choose_attention(model, precision, LENGTH)
     collate, reduced = Collator(processor, LENGTH), precision == "bf16"
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=reduced):

@@ -1,4 +1,4 @@
-"""One test per hook of models.compat: each fails with a sentence if a library has changed it."""
+"""One test per hook of models.compat. It fails with an explanation if a library changed it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch import nn
 from transformers import AttentionInterface, AttentionMaskInterface, Trainer, TrainingArguments
 
 from models import attention, compat
-from models.lora_kernels import fuse
+from models.lora_kernels import use_fast_layers
 
 CHANGED = "a library changed this hook; correct models/compat.py or the version bounds:"
 
@@ -54,7 +54,7 @@ def test_4_bit_weights_count_as_the_entries_that_they_stand_for() -> None:
 
 def test_a_vision_tower_passes_all_frames_to_a_function_named_flash(model) -> None:
     assert attention.BY_FRAME in AttentionInterface().valid_keys()
-    assert attention.PRODUCTS in AttentionMaskInterface().valid_keys()
+    assert attention.MATMUL in AttentionMaskInterface().valid_keys()
     model.set_attn_implementation({"vision_config": attention.BY_FRAME})
     calls = []
 
@@ -79,7 +79,7 @@ def test_peft_layers_use_a_lora_variant(model) -> None:
     assert issubclass(Linear4bit, LoraLayer)
     assert hasattr(LoraVariant, "forward"), f"{CHANGED} peft's LoraVariant has no forward"
     adapted = peft.get_peft_model(model, peft.LoraConfig(target_modules=["q_proj"], r=2))
-    fuse(adapted)
+    use_fast_layers(adapted)
     layers = [m for m in adapted.modules() if isinstance(m, LoraLayer)]
     assert layers
     assert all(m.lora_variant for m in layers), f"{CHANGED} peft's layers have no lora_variant"

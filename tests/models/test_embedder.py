@@ -1,4 +1,4 @@
-"""The retriever's inputs, and that a saved one is a plain SentenceTransformer."""
+"""The inputs and embeddings of a retriever, and its evaluation during training."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from conf.schema import LateConfig, LoraConfig
 from data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
 from data.tracks.retrieval.database import UniqueFrames
 from models.compat import keep_differentiable
-from models.parameter_counts import count_towers
+from models.parameter_counts import count_parameters
 from models.retriever import embedder
 from models.retriever.embedder import frame_input, query_input
 from train.common.audit import audit_retriever
@@ -51,7 +51,7 @@ def test_a_query_is_instruction_then_video_then_text_and_a_generation_prompt(
 def test_timestamps_follow_the_clips_frame_rate(
     micro_store, frames, retriever_cfg, tmp_path, monkeypatch
 ) -> None:
-    """Suites of other simulators have 12 or 30 frames a second."""
+    """Scenes of other simulators have 12 or 30 frames per second."""
     query = micro_store.retrieval("train")[0]
     slow = replace(frames.scene(query.scene_id), fps=12)
     monkeypatch.setattr(frames, "scene", lambda _: slow)
@@ -73,7 +73,7 @@ def test_a_long_query_is_refused_instead_of_truncated(
         audit_retriever(model, retriever_cfg, long, frames)
 
 
-def test_the_embedding_is_the_last_tokens_state_normalised(
+def test_the_embedding_is_the_normalised_state_of_the_last_token(
     micro_store, frames, retriever_cfg, tmp_path
 ) -> None:
     model = load(micro_store, retriever_cfg, tmp_path)
@@ -87,7 +87,7 @@ def test_the_embedding_is_the_last_tokens_state_normalised(
 
 
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one", "many"])
-def test_adapters_are_loaded_over_the_4_bit_weights_they_were_trained_on(
+def test_adapters_are_loaded_over_a_4_bit_base_if_trained_so(
     micro_store, frames, retriever_cfg, saved_base, tmp_path, late
 ) -> None:
     over = {"architecture": None, "model": saved_base, "quantization": "nf4", "late": late}
@@ -97,12 +97,12 @@ def test_adapters_are_loaded_over_the_4_bit_weights_they_were_trained_on(
         for name, weight in model.named_parameters():
             if "lora_B" in name:
                 weight.normal_(std=0.1, generator=torch.Generator().manual_seed(0))
-    towers = count_towers(model)
+    towers = count_parameters(model)
     assert towers.loc["language", "4-bit"] > 0
     assert ("projection" in towers.index) == (late is not None)
     model.save_pretrained(str(tmp_path / "saved"), create_model_card=False)
     again = embedder.load_trained(cfg, "fp32", tmp_path / "saved")
-    assert count_towers(again).loc["language", "4-bit"] > 0
+    assert count_parameters(again).loc["language", "4-bit"] > 0
     keep_differentiable(again)
     query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
     one, two = (torch.as_tensor(m.encode_query(query)[0]) for m in (model, again))
@@ -126,7 +126,7 @@ def test_adapters_and_projection_are_trained_in_fp32_over_a_bf16_base(
 
 
 def test_frames_of_the_database_look_different(micro_store) -> None:
-    """Except targets, which are always in it."""
+    """The exception are targets, which are always in the database."""
     queries = micro_store.retrieval("train")
     targets = {q.target for q in queries}
     database = build_database(queries, micro_store)
@@ -145,7 +145,7 @@ def test_frames_of_the_database_look_different(micro_store) -> None:
 def test_the_evaluator_ranks_as_the_library_with_all_pixels_in_memory(
     micro_store, frames, retriever_cfg, tmp_path, late
 ) -> None:
-    """It loads them by mini-batches."""
+    """The evaluator loads the pixels by mini-batches."""
     cfg = replace(retriever_cfg, late=late)
     model = load(micro_store, cfg, tmp_path).eval()
     queries = micro_store.retrieval("train")[:7]

@@ -16,7 +16,7 @@ SHAPES = {"first": (300, 200), "middle": (7,), "visual": (2000, 300)}
 
 @pytest.mark.parametrize("changed", SHAPES)
 def test_the_digest_covers_every_tensor(tmp_path, changed) -> None:
-    """A merged student differs from its base in some of the tensors."""
+    """A merged student differs from its base in only some of the tensors."""
     one, other = tmp_path / "one", tmp_path / "other"
     one.mkdir()
     save_file({n: torch.randn(s) for n, s in SHAPES.items()}, one / "model.safetensors")
@@ -29,7 +29,7 @@ def test_the_digest_covers_every_tensor(tmp_path, changed) -> None:
 
 
 def with_offsets(offsets: object) -> bytes:
-    """A safetensors file with one tensor at these offsets."""
+    """Return a safetensors file with one tensor at these offsets."""
     head = json.dumps({"weight": {"dtype": "F32", "shape": [1], "data_offsets": offsets}}).encode()
     return len(head).to_bytes(8, "little") + head
 

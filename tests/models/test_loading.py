@@ -1,4 +1,4 @@
-"""Loading a student gives the model of its preset, or an error that says what is wrong."""
+"""Loading a student returns the model of its preset, or raises an error that names the problem."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from transformers import AutoModelForImageTextToText, AutoProcessor
 from conf.compose import compose
 from conf.schema import SftCommand
 from models import compat, loading
-from models.parameter_counts import check_towers, count_towers
+from models.parameter_counts import check_parameter_counts, count_parameters
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
 from tests.tiny_models import randomize_adapters
@@ -32,8 +32,8 @@ def test_a_built_model_is_read_back_bit_for_bit(model, processor, tmp_path) -> N
 
 def test_only_the_language_tower_is_quantised_and_adapted(nf4_cfg) -> None:
     model, _ = loading.load_student(nf4_cfg, "fp32", list)
-    counts = count_towers(model)
-    check_towers(counts, "nf4", "nf4", nf4_cfg.lora.rank)
+    counts = count_parameters(model)
+    check_parameter_counts(counts, "nf4", "nf4", nf4_cfg.lora.rank)
     hidden, forward, rank = 64, 128, 4
     layer = 4 * hidden * hidden + 3 * hidden * forward
     lora = rank * (4 * 2 * hidden + 3 * (hidden + forward))
@@ -45,8 +45,8 @@ def test_only_the_language_tower_is_quantised_and_adapted(nf4_cfg) -> None:
 
 
 def test_gradients_are_unchanged_after_an_evaluation(nf4_cfg, micro_store, frames) -> None:
-    """On some CPUs bitsandbytes repacks 4-bit weights when it evaluates, and then passes no
-    gradient on."""
+    """On some CPUs, bitsandbytes repacks 4-bit weights for an evaluation, after which no gradients
+    pass through them."""
     model, processor = loading.load_student(nf4_cfg, "bf16", list)
     item = micro_store.selection("train")[0]
     batch = Collator(processor, 1500)(

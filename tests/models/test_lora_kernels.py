@@ -12,7 +12,7 @@ from torch import nn
 
 from conf.schema import LoraConfig
 from models import loading
-from models.lora_kernels import AddedInPlace, PatchProduct, fuse
+from models.lora_kernels import AddedInPlace, PatchProduct, use_fast_layers
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
 from tests.tiny_models import randomize_adapters
@@ -41,7 +41,7 @@ def student(request, nf4_cfg, micro_store, frames):
 def loss_and_gradients(
     model: nn.Module, batch: dict
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """The loss, and every gradient, of the same dropout."""
+    """Return the loss and all gradients, with the same dropout in each call."""
     model.zero_grad()
     torch.manual_seed(1)
     inputs = {name: value for name, value in batch.items() if name not in ("labels", "sample_ids")}
@@ -54,7 +54,7 @@ def loss_and_gradients(
 def test_loss_and_every_gradient_are_the_same(student) -> None:
     model, batch, adapted = student
     plain, gradients = loss_and_gradients(model, batch)
-    fuse(model)
+    use_fast_layers(model)
     fused, computed = loss_and_gradients(model, batch)
     assert any(isinstance(module, PatchProduct) for module in model.modules())
     variants = [v for m in model.modules() for v in getattr(m, "lora_variant", {}).values()]
@@ -75,7 +75,7 @@ def test_fused_operations_round_no_more_in_bf16(student) -> None:
             return abs(loss_and_gradients(model, batch)[0] - exact).item()
 
     plain = difference()
-    fuse(model)
+    use_fast_layers(model)
     assert difference() <= max(2 * plain, 2e-2 * exact.item())
 
 
@@ -83,7 +83,7 @@ def test_saved_weights_are_unchanged_and_give_the_same_logits(student, tmp_path)
     model, batch, adapted = student
     before = {name: value.clone() for name, value in model.state_dict().items()}
     plain = copy.deepcopy(model)
-    fuse(model)
+    use_fast_layers(model)
     after = model.state_dict()
     assert after.keys() == before.keys()
     assert all(torch.equal(after[name], value) for name, value in before.items())

@@ -1,5 +1,5 @@
-"""The multi-vector retriever: which tokens are scored, and that a saved one is a plain
-MultiVectorEncoder."""
+"""The multi-vector retriever: the tokens whose vectors are scored, and that sentence-transformers
+loads a saved retriever without this project."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FRAME_TOKENS = 9
 
 
 def load(cfg, micro_store, folder, noise: float = 0.0) -> MultiVectorEncoder:
-    """A retriever whose adapters, if any, have an effect."""
+    """Return a retriever whose adapters, if it has any, change its outputs if `noise` is not 0."""
     torch.manual_seed(0)
     model = load_retriever(
         cfg, "fp32", tokenizer_texts(micro_store.retrieval("train"), cfg), folder
@@ -50,7 +50,7 @@ def model(late_cfg, micro_store, tmp_path_factory) -> MultiVectorEncoder:
 
 
 def test_only_the_question_and_the_pixels_are_scored(model, late_cfg, queries, frames) -> None:
-    """Also in padded rows, and if the question contains words of a timestamp and of the
+    """This also holds in padded rows, and if the question contains words of a timestamp and of the
     instruction."""
     similar = replace(
         queries[0], question="<0.1 seconds> Retrieve images: user's query, 0.5 seconds"
@@ -83,7 +83,8 @@ def test_an_input_without_pixels_is_refused(model) -> None:
 def test_vectors_are_the_scored_tokens_projected_and_normalised(
     model, late_cfg, queries, frames
 ) -> None:
-    """In a batch as alone, and independent of the states of other tokens."""
+    """They depend neither on other inputs of a batch nor on the states of tokens that are not
+    scored."""
     inputs = [query_input(q, frames, late_cfg) for q in (queries[0], queries[-1])]
     together = model.encode_query(inputs)
     assert len(together[0]) != len(together[1])

@@ -1,5 +1,5 @@
-"""The paper's presets on the released models' module trees: names and shapes from their own
-config.json, on the meta device, so that no weight and no GPU is needed."""
+"""The paper's presets, checked on models that are built from the released config.json on the meta
+device, so that neither weights nor a GPU are needed."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ from conf.schema import LoraConfig, SftCommand, StudentConfig, TeacherConfig
 from data.records import FPS, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from models import loading
-from models.parameter_counts import check_towers, count_towers
+from models.parameter_counts import check_parameter_counts, count_parameters
 from models.student.collator import Collator, encode
 from models.student.prompts import Clip, Sample, conversation, response, selection_sample
 from teacher.narrate import ensure_rationales
 from teacher.validation.claim_extraction import MAX_SENTENCE_TAGS
 from tests.user_errors import raises_user_error
-from train.common.audit import audit
+from train.common.audit import audit_student
 from train.student.dataset import supervised_items
 
 RELEASED = {"qwen3_vl_8b": 8_767_123_696, "qwen3_vl_2b": 2_127_532_032}
 """Parameters in the safetensors of Qwen/Qwen3-VL-8B-Instruct and Qwen/Qwen3-VL-2B-Instruct."""
 RANK = 16
-# Sizes in the released processors' own files, and those of the classes.
 RELEASED_PIXELS = {
     "image": {"shortest_edge": 65536, "longest_edge": 16777216},
     "video": {"shortest_edge": 4096, "longest_edge": 25165824},
 }
+"""Numbers of pixels in the files of the released processors; the defaults of the classes differ."""
 
 presets = pytest.mark.parametrize("preset", RELEASED)
 
@@ -66,8 +66,8 @@ def config_of(preset: str) -> dict[str, Any]:
 def base_of(
     preset: str, quantization: BitsAndBytesConfig | None, kind: Any = AutoModelForImageTextToText
 ) -> PreTrainedModel:
-    """A preset's base as `from_pretrained` builds it before it loads weights: in bf16, its linear
-    layers replaced by the library's own quantizer."""
+    """Return a preset's base as `from_pretrained` builds it before it loads weights: in bf16, with
+    quantised layers in place of linear layers."""
     # from_dict modifies the dictionary, so each base gets its own copy.
     config = Qwen3VLConfig.from_dict(config_of(preset))
     with torch.device("meta"):
@@ -85,12 +85,12 @@ def nf4() -> BitsAndBytesConfig:
 
 @cache
 def adapted(preset: str) -> nn.Module:
-    """A preset's student as it is trained; no test changes it."""
+    """Return a preset's student with its adapters; tests must not change it."""
     return loading.add_adapters(base_of(preset, nf4()), student(preset).lora)
 
 
 def projections(text: dict[str, Any]) -> dict[str, tuple[int, int]]:
-    """The input and output sizes of each projection of a language layer."""
+    """Return the input and output sizes of each projection of a language layer."""
     hidden, forward = text["hidden_size"], text["intermediate_size"]
     queries = text["num_attention_heads"] * text["head_dim"]
     keys = text["num_key_value_heads"] * text["head_dim"]
@@ -106,7 +106,7 @@ def projections(text: dict[str, Any]) -> dict[str, tuple[int, int]]:
 
 
 def expected_towers(preset: str, rank: int) -> dict[str, list[int]]:
-    """The counts from the modules of the released tree and the sizes of its projections."""
+    """Return the counts, computed from the released modules and the sizes of the projections."""
     base = base_of(preset, None)
     text = config_of(preset)["text_config"]
     layers, sides = text["num_hidden_layers"], projections(text).values()
@@ -148,21 +148,21 @@ def test_settings_are_those_of_the_paper(preset) -> None:
 
 
 @presets
-def test_the_tree_has_the_size_of_the_released_model(preset) -> None:
+def test_the_base_has_as_many_parameters_as_the_released_model(preset) -> None:
     base = base_of(preset, None)
     assert sum(p.numel() for p in base.parameters()) == RELEASED[preset]
 
 
 @presets
-def test_counts_equal_those_from_the_sizes(preset) -> None:
-    towers = count_towers(adapted(preset))
+def test_counts_equal_those_computed_from_the_sizes(preset) -> None:
+    towers = count_parameters(adapted(preset))
     assert towers.T.to_dict("list") == expected_towers(preset, RANK)
     cfg = student(preset)
-    check_towers(towers, cfg.name, cfg.quantization, cfg.lora.rank)
+    check_parameter_counts(towers, cfg.name, cfg.quantization, cfg.lora.rank)
 
 
 @presets
-def test_the_language_towers_projections_alone_are_quantised_and_adapted(preset) -> None:
+def test_only_projections_of_the_language_tower_are_quantised_and_adapted(preset) -> None:
     model = adapted(preset)
     wanted = projection_names(preset, "base_model.model.model.language_model.")
     assert names_of(model, LoraLayer) == wanted
@@ -170,7 +170,7 @@ def test_the_language_towers_projections_alone_are_quantised_and_adapted(preset)
 
 
 @presets
-def test_the_head_is_not_quantised_and_tied_as_released(preset) -> None:
+def test_the_head_is_not_quantised_and_is_tied_as_released(preset) -> None:
     base = base_of(preset, nf4())
     assert type(base.lm_head) is nn.Linear
     tied = base.lm_head.weight is base.model.language_model.embed_tokens.weight
@@ -211,7 +211,7 @@ def test_a_wrong_skip_list_is_refused(skipped, message) -> None:
     cfg = student("qwen3_vl_2b")
     model = loading.add_adapters(base_of(cfg.name, quantization), cfg.lora)
     with raises_user_error("other-parameters", contains=message):
-        check_towers(count_towers(model), cfg.name, cfg.quantization, cfg.lora.rank)
+        check_parameter_counts(count_parameters(model), cfg.name, cfg.quantization, cfg.lora.rank)
 
 
 @pytest.mark.parametrize(
@@ -226,7 +226,7 @@ def test_adapters_outside_the_language_tower_are_refused(targets, message) -> No
     cfg = student("qwen3_vl_2b")
     model = loading.add_adapters(base_of(cfg.name, nf4()), replace(cfg.lora, targets=targets))
     with raises_user_error("other-parameters", contains=message):
-        check_towers(count_towers(model), cfg.name, cfg.quantization, cfg.lora.rank)
+        check_parameter_counts(count_parameters(model), cfg.name, cfg.quantization, cfg.lora.rank)
 
 
 @pytest.mark.parametrize("targets", ["q_proj", "model.(language_model", r".*\.input_layernorm"])
@@ -238,8 +238,8 @@ def test_a_pattern_that_adapts_nothing_is_named(targets) -> None:
 def released_processor(
     source: ProcessorMixin, pixels: dict[str, dict[str, int]]
 ) -> Qwen3VLProcessor:
-    """The released models' processor with sizes of `pixels` and the tokenizer of `source`, which
-    was not trained on rationales and splits them into more tokens."""
+    """Return the released models' processor with the sizes `pixels` and the tokenizer of `source`,
+    which splits rationales into more tokens than the released one."""
 
     def sized(name: str) -> dict[str, Any]:
         return {"size": pixels[name]} if name in pixels else {}
@@ -254,7 +254,7 @@ def released_processor(
 
 @pytest.mark.parametrize("pixels", [RELEASED_PIXELS, {}], ids=["released", "class defaults"])
 @presets
-def test_frames_come_at_320_px_and_at_their_true_times(
+def test_frames_are_resized_to_320_px_and_have_their_true_times(
     preset, pixels, micro_store, processor
 ) -> None:
     cfg = student(preset)
@@ -280,13 +280,13 @@ def test_frames_come_at_320_px_and_at_their_true_times(
 
 
 def media(size: int, count: int) -> Sample:
-    """A video of `count` black frames and one image of them."""
+    """Return a sample with a video of `count` black frames and an image that is one of them."""
     video = np.zeros((count, size, size, 3), np.uint8)
     return conversation("black", [video[0]], None, Clip(video, list(range(count))))
 
 
 def test_a_video_of_default_size_is_shrunk_where_an_image_is_not(processor) -> None:
-    """The reason for `pin_sizes`; check it again if the library's default changes."""
+    """This is why `pin_sizes` exists; if the test fails, check whether it is still needed."""
     encoded = encode(media(336, 12), released_processor(processor, {}), 3072)
     assert encoded.media["video_grid_thw"].tolist() == [[6, 16, 16]]
     assert encoded.media["image_grid_thw"].tolist() == [[1, 20, 20]]
@@ -304,7 +304,7 @@ def test_a_frame_has_one_size_in_every_video_and_image(size, count, processor) -
 
 
 @presets
-def test_the_longest_rationale_fits_and_the_whole_audit_needs_no_weights(
+def test_the_longest_rationale_fits_and_the_audit_needs_no_weights(
     preset, micro_store, processor
 ) -> None:
     cfg = student(preset)
@@ -324,7 +324,7 @@ def test_the_longest_rationale_fits_and_the_whole_audit_needs_no_weights(
     target = response(rationale, longest.matches, longest.item.letter, "reasoning", regime)
     frames = FrameReader(micro_store, cfg.image_size)
     sample = selection_sample(longest.item, "reasoning", regime, frames, cfg.frames, target)
-    text = audit(adapted(preset), released, cfg, sample, Collator(released, cfg.max_length))
+    text = audit_student(adapted(preset), released, cfg, sample, Collator(released, cfg.max_length))
     assert "336 x 336 px become a video of 6 x 10 x 10 tokens and an image of 1 x 10 x 10" in text
     for parameters, *_ in expected_towers(preset, RANK).values():
         assert f"{parameters:,}" in text

@@ -16,9 +16,9 @@ from models.resolved import (
     RESOLVED,
     check_base,
     data_digest,
-    pin_base,
     read_resolved,
     resolve_run,
+    with_resolved_commit,
 )
 from tests.user_errors import raises_user_error
 
@@ -32,7 +32,8 @@ def base(saved_base, tmp_path) -> StudentConfig:
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    """An offline cache of lab/base with two commits; returns the file that names the current."""
+    """Create an offline cache of lab/base with two commits; return the file that names the current
+    commit."""
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     cached = tmp_path / "models--lab--base"
@@ -56,7 +57,9 @@ def test_a_resumed_run_keeps_its_precision(base, tmp_path, monkeypatch) -> None:
     ("instructions", "expected"),
     [({"avx512_bf16": True, "avx2": True}, "bf16"), ({"amx_bf16": False, "avx2": True}, "fp32")],
 )
-def test_auto_is_what_the_cpu_has_instructions_for(monkeypatch, instructions, expected) -> None:
+def test_auto_is_bf16_if_the_cpu_has_instructions_for_it(
+    monkeypatch, instructions, expected
+) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: instructions)
     assert resolve_precision("auto") == expected
@@ -88,17 +91,19 @@ def test_a_run_keeps_the_commit_of_a_hub_base(tmp_path, hub) -> None:
     assert model_id(first.model, first.revision) == f"lab/base@{'a' * 40}"
     hub.write_text("b" * 40)
     assert pin_revisions(cfg).revision == "b" * 40
-    assert resolve_run(tmp_path, "fp32", cfg, "x")[1] == first == pin_base(tmp_path, cfg)
+    assert (
+        resolve_run(tmp_path, "fp32", cfg, "x")[1] == first == with_resolved_commit(tmp_path, cfg)
+    )
     # A revision in the preset takes precedence over the current commit.
     assert pin_revisions(replace(cfg, revision="a" * 40)) == first
     two = pin_revisions(replace(cfg, image_model="lab/base", image_revision="a" * 40))
     assert (two.revision, two.image_revision) == ("b" * 40, "a" * 40)
     other = replace(cfg, model="lab/other")
-    assert pin_base(tmp_path, other) == other
+    assert with_resolved_commit(tmp_path, other) == other
 
 
-def test_a_missing_base_leaves_the_resolved_values(base, tmp_path, hub) -> None:
-    """Loading the base reports that it is missing."""
+def test_a_missing_base_does_not_change_the_resolved_values(base, tmp_path, hub) -> None:
+    """The error for a missing base is raised when it is loaded."""
     folder = tmp_path / "run"
     folder.mkdir()
     (tmp_path / "base").rename(tmp_path / "away")

@@ -1,4 +1,4 @@
-"""Sampled responses: by temperature, from the most likely tokens, each with its own seed."""
+"""Sampling of responses: temperature, restriction to the most likely tokens, and seeds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def sampling_cfg(**changes: object) -> StudentConfig:
 
 
 def frequencies(cfg: StudentConfig, count: int = 20_000) -> np.ndarray:
-    """How often each token is sampled, with `count` seeds."""
+    """Return the relative frequency of each token among samples with `count` seeds."""
     steps = sampling_processors(cfg, range(count))
     scores = LOGITS.expand(count, -1).clone()
     tokens = steps(torch.zeros(count, 1, dtype=torch.long), scores).argmax(1)
@@ -37,7 +37,7 @@ def test_tokens_are_sampled_from_the_softmax(temperature) -> None:
 def test_only_the_most_likely_tokens_are_sampled() -> None:
     share = torch.softmax(LOGITS[:3], 0).tolist()
     assert frequencies(sampling_cfg(top_k=3)) == pytest.approx([*share, 0, 0, 0], abs=0.015)
-    # The first two hold 0.77 of all, the third brings that above 0.8.
+    # The first two tokens have a probability of 0.77, and the first three of more than 0.8.
     assert frequencies(sampling_cfg(top_p=0.8)) == pytest.approx([*share, 0, 0, 0], abs=0.015)
 
 
@@ -78,7 +78,7 @@ def test_a_response_is_independent_of_its_batch(
 
 
 @pytest.mark.parametrize("thinking", [True, False])
-def test_a_thought_that_the_prompt_opens_begins_the_text(
+def test_a_think_tag_that_the_prompt_opens_begins_the_text(
     thinking, model, processor, micro_store, frames, student_cfg
 ) -> None:
     thinker = deepcopy(processor)

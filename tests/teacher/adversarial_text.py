@@ -1,4 +1,4 @@
-"""Adversarial text that makes a careless search slow."""
+"""Text that makes a search for numbers slow if the search takes quadratic time."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ PIECES = (
     *("\u0915\u093e", "\u093f", "三", "二球", "ふた", "ส", "\ufdfa", "\u3300", "\U0001d7d8", "🕒"),
     *("\ud800", "\U0010ffff", "\x00", "é", "ß", "İ", "т", "🇹🇼"),
 )
-"""Repeated pieces: openings that never close, disguises, and words with contextual rules."""
+"""Pieces to repeat: markup that is never closed, disguised numbers, and words that are numbers only
+in some contexts."""
 
 
 def repeat_piece(piece: str, size: int) -> str:
-    """The piece repeated to about `size` bytes of UTF-8."""
+    """Return the piece, repeated to about `size` bytes of UTF-8."""
     return piece * (size // len(piece.encode("utf-8", "surrogatepass")))

@@ -13,6 +13,7 @@ from tests.teacher.memory_store import MemoryStore, make_store
 
 @pytest.fixture
 def store(tmp_path: Path) -> MemoryStore:
+    """A store with 14 items, of which 12 are training items that get a rationale."""
     return make_store(tmp_path, 14)
 
 
@@ -20,7 +21,8 @@ def store(tmp_path: Path) -> MemoryStore:
 def start_server(
     store: MemoryStore, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[..., FaultyServer]]:
-    """Starts servers with the faults of their first responses; the pool's pauses are short."""
+    """A function that starts a server. Its arguments are the faults of the first responses, in
+    order. The pauses of the server pool are short."""
     monkeypatch.setattr("teacher.servers.pool.PAUSE", 0.01)
     monkeypatch.setattr("teacher.servers.pool.LONGEST_PAUSE", 0.05)
     servers = []

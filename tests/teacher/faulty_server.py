@@ -1,4 +1,4 @@
-"""A local chat server that answers with the built-in narrator's rationales, or with a fault."""
+"""A local chat server that answers with rationales of the built-in narrator, or with a fault."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from tests.local import JsonHandler, LocalServer
 from tests.teacher.memory_store import MemoryStore, prompts_and_rationales
 
 Fault = int | bytes | str | dict[str, str]
-"""A status, the bytes of a body, the headers of a rate limit (429), or a word of `spoil_text`,
-"hang" or "reset"."""
+"""How a response is faulty: its status (int), its body (bytes), the headers of a rate limit with
+status 429 (dict), or a word: "hang", "reset", or a fault of `spoil_text`."""
 
 
-def served(*servers: FaultyServer, **changes: Any) -> TeacherConfig:
-    """A teacher on these servers."""
+def teacher_at(*servers: FaultyServer, **changes: Any) -> TeacherConfig:
+    """Return the settings of a teacher at these servers."""
     settings = {"concurrency": 2, "unreachable_timeout": 5.0, "timeout": 1.0, **changes}
     url = [server.url for server in servers]
     return TeacherConfig(name="served", url=url, model="tiny", **settings)
 
 
 def spoil_text(fault: str, text: str) -> tuple[str, str]:
-    """A text with a fault, and its finish_reason."""
+    """Return the text with a fault, and the finish_reason of the response."""
     return {
         "cut": (text[:200], "length"),
         "number": (text.replace("The ", "The two ", 1), "stop"),
@@ -39,25 +39,27 @@ def spoil_text(fault: str, text: str) -> tuple[str, str]:
 
 
 class FaultyServer(LocalServer):
-    """A server whose first responses have `faults`, other than those to canaries.
+    """A server whose first responses have one of `faults` each, in order. Responses to the canary,
+    the prompt with which a pool tests servers, do not count and have none of these faults.
 
     Attributes:
-        always: Fault of every response to a prompt; "*" stands for every prompt.
+        always: The fault of every response to a prompt; the prompt "*" stands for all prompts,
+            including the canary.
         requests: The requests so far, without canaries.
-        times: When they came.
+        request_times: When each of these requests arrived.
         delay: Seconds before a response.
-        most: Most requests that were in flight at once.
-        texts: The rationale for each prompt.
+        max_in_flight: Maximum number of requests that were answered at the same time.
+        rationales: The rationale for each prompt.
     """
 
     def __init__(self, store: MemoryStore, faults: Iterable[Fault] = (), port: int = 0) -> None:
         self.faults, self.always = list(faults), {}
         self.requests: list[dict[str, Any]] = []
-        self.times: list[float] = []
+        self.request_times: list[float] = []
         self.lock = threading.Lock()
-        self.in_flight = self.most = 0
+        self.in_flight = self.max_in_flight = 0
         self.delay = 0.0
-        self.texts = {prompt: text for _, prompt, text in prompts_and_rationales(store)}
+        self.rationales = {prompt: text for _, prompt, text in prompts_and_rationales(store)}
         super().__init__(Handler, port)
 
 
@@ -73,14 +75,14 @@ class Handler(JsonHandler):
             fault = server.always.get(prompt) or server.always.get("*")
             if request["messages"] != CANARY:
                 server.requests.append(request)
-                server.times.append(time.monotonic())
+                server.request_times.append(time.monotonic())
                 if fault is None and server.faults:
                     fault = server.faults.pop(0)
             server.in_flight += 1
-            server.most = max(server.most, server.in_flight)
+            server.max_in_flight = max(server.max_in_flight, server.in_flight)
         time.sleep(server.delay)
         try:
-            self.respond_to_prompt(request, server.texts.get(prompt, "Hello."), fault)
+            self.respond_to_prompt(request, server.rationales.get(prompt, "Hello."), fault)
         finally:
             with server.lock:
                 server.in_flight -= 1

@@ -1,4 +1,4 @@
-"""A benchmark in memory with any number of scenes and items."""
+"""A benchmark in memory, with any number of scenes and items."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from tests.teacher import synthetic
 
 @dataclass
 class MemoryStore:
+    """The parts of a `data.store.Store` that the teacher reads; rationales go to `folder`."""
+
     folder: Path
     scenes: dict[str, Scene]
     items: list[SelectionItem]
@@ -29,8 +31,8 @@ class MemoryStore:
 
 
 def make_store(folder: Path, count: int) -> MemoryStore:
-    """`count` items, each with its own scene; item-5 has too short a prefix, the last is a test
-    item."""
+    """Return a store with `count` items, each with its own scene. The prefix of item-5 is too short
+    for predicates; the last item is a test item."""
     rng = np.random.default_rng(4)
     scenes, items = {}, []
     for k in range(count):
@@ -54,7 +56,7 @@ def make_store(folder: Path, count: int) -> MemoryStore:
 
 
 def prompts_and_rationales(store: MemoryStore) -> list[tuple[str, str, str]]:
-    """System prompt, user prompt and rationale of each item that has predicates."""
+    """Return the system prompt, user prompt and rationale of each item that has predicates."""
     texts = []
     for item in store.selection():
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)

@@ -1,4 +1,4 @@
-"""Narrates a benchmark in memory: the arguments are a folder, a number of items and a URL."""
+"""Narrates a benchmark in memory with a server. Arguments: a folder, the number of items, a URL."""
 
 import sys
 from pathlib import Path
@@ -9,7 +9,7 @@ from tests.teacher.memory_store import make_store
 
 if __name__ == "__main__":
     folder, count, url = sys.argv[1:]
-    # A random model's responses are all rejected, so that one attempt settles an item.
+    # All responses of a random model are rejected; with one attempt, each item gets one response.
     cfg = TeacherConfig(
         name="tiny", url=url, model="tiny", attempts=1, max_tokens=16, concurrency=32
     )

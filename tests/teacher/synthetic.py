@@ -1,4 +1,4 @@
-"""Scenes in closed form: objects at constant velocity in front of a pinhole camera."""
+"""Scenes without a simulator: objects at constant velocity in front of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ KINDS = [SceneObject(*kind) for kind in product(SHAPES, MATERIALS, COLORS)]
 
 
 def axes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the unit vectors to the right, down and forward of the camera."""
     forward = -EYE / np.linalg.norm(EYE)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -32,6 +33,7 @@ def axes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def project(points: np.ndarray) -> np.ndarray:
+    """Return the pixels (x, y) of points in the scene."""
     right, down, forward = axes()
     seen = points - EYE
     depth = np.maximum(seen @ forward, 0.1)
@@ -39,7 +41,7 @@ def project(points: np.ndarray) -> np.ndarray:
 
 
 def on_ground(pixel: tuple[float, float]) -> np.ndarray:
-    """The point on the ground at a pixel."""
+    """Return the point on the ground that is seen at a pixel."""
     right, down, forward = axes()
     x, y = (np.asarray(pixel) - CENTRE) / FOCAL
     ray = forward + x * right + y * down
@@ -54,8 +56,9 @@ def scene(
     scene_id: str = "scene",
     frames: int = FRAMES,
 ) -> Scene:
-    """Objects from `starts` (x, y) at `velocities` (units/s); they pass through each
-    other, and a pair collides in the first frame with a distance of at most 0.4."""
+    """Return a scene with objects that start at `starts` (x, y) and move at `velocities` (units/s).
+    They pass through each other; the collision of a pair is recorded at the first frame in which
+    its distance is at most 0.4."""
     start, velocity = (np.array(a, dtype=float).reshape(-1, 2) for a in (starts, velocities))
     count = len(start)
     time = np.arange(frames)[:, None, None] / FPS
@@ -88,6 +91,7 @@ def scene(
 
 
 def random_scene(rng: np.random.Generator, scene_id: str = "scene") -> Scene:
+    """Return a scene with two to six objects, of which about 60% move."""
     count = int(rng.integers(2, 7))
     kinds = [KINDS[i] for i in rng.permutation(len(KINDS))[:count]]
     speeds = rng.uniform(0, 2.5, (count, 1)) * (rng.random((count, 1)) < 0.6)
@@ -109,7 +113,8 @@ def item(
     scene_id: str = "scene",
     split: str = "train",
 ) -> SelectionItem:
-    """An item with the candidates `frames`; `scene_ids` has the other scenes of candidates."""
+    """Return an item with a candidate at each of `frames`. `scene_ids` has the scene of each
+    candidate, by position, that is not from the scene of the item."""
     foreign = scene_ids or {}
     return SelectionItem(
         item_id=item_id,

@@ -1,9 +1,10 @@
-"""Claims of rationales: false ones are contradicted, true ones are not.
+"""Claims of rationales: false claims are contradicted, true claims are not.
 
-facts.json has predicates, FACTS.
-claims.txt has sentences about FACTS, each with its truth and the letter of its section.
-claim_verdicts.jsonl has sentences about FACTS with the verdict on each claim.
-prose.jsonl has rationales by a language model, with the predicates in their prompts.
+facts.json: the predicates of an item, FACTS.
+claims.txt: sentences about FACTS. A line has "true" or "false", the letter of a section (a key of
+SECTION) and the sentence.
+claim_verdicts.jsonl: sentences about FACTS, each with its claims and their verdicts.
+prose.jsonl: rationales written by a language model, with the predicates that it was given.
 """
 
 import json
@@ -21,11 +22,11 @@ from benchmarks.experiments.mutations import (
 )
 from conf.schema import TeacherConfig
 from teacher.narrator import write_rationale
-from teacher.reading.phrases import PHRASES
+from teacher.reading.phrases import VOCABULARY
 from teacher.sections import SECTIONS
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from tests.teacher.test_predicates import cases
+from tests.teacher.test_predicates import random_cases
 
 HERE = Path(__file__).parent
 SECTION = {"S": SECTIONS[0], "M": SECTIONS[1], "P": SECTIONS[2], "C": SECTIONS[3], "O": SECTIONS[4]}
@@ -37,10 +38,12 @@ PROSE = list(read_rationales(HERE / "prose.jsonl"))
 
 
 def contradicted(text, predicates):
+    """Return the claims of a rationale that its predicates contradict."""
     return [str(c) for c in extract_claims(text, predicates) if c.verdict == "contradicted"]
 
 
 def verdicts(section, sentence):
+    """Return the verdict on each claim of a sentence about FACTS, without mentions of objects."""
     claims = extract_claims(f"{SECTION[section]}: {sentence}", FACTS)
     return {str(c): c.verdict for c in claims if c.kind != "mention"}
 
@@ -52,7 +55,7 @@ def test_only_false_sentences_are_contradicted(truth, section, sentence):
 
 
 @pytest.mark.parametrize("case", VERDICTS, ids=lambda case: case["sentence"])
-def test_subject_and_polarity_of_claims(case):
+def test_claims_of_a_sentence_and_their_verdicts(case):
     assert verdicts(case["section"], case["sentence"]) == case["claims"]
 
 
@@ -73,7 +76,7 @@ def test_ambiguous_claims_are_not_contradicted(section, plain, ambiguous):
 
 
 @pytest.mark.parametrize("verb", ["stops", "slows", "settles", "comes to rest"])
-def test_place_of_a_halt_is_not_assigned_to_the_next_object(verb):
+def test_place_where_an_object_stops_is_not_a_claim(verb):
     for sentence in (
         f"The {RED} {verb} near the top, the {BLUE} stays.",
         f"It {verb} near the top.",
@@ -88,7 +91,7 @@ def test_most_claims_of_true_sentences_are_supported():
     assert detected.count("supported") > 0.9 * len(detected) > 200
 
 
-def test_spans_of_claims():
+def test_spans_are_the_words_of_claims():
     text = f"Scene parse: The {RED} is near the left.\nOutcome: B is right.\nAnswer: B"
     spans = {(c.kind, text[slice(*c.span)]) for c in extract_claims(text, FACTS)}
     assert ("region", "near the left") in spans
@@ -98,7 +101,7 @@ def test_spans_of_claims():
 
 @pytest.fixture(scope="module")
 def rationales(benchmark_store):
-    """The item id, text and predicates of each rationale, by source."""
+    """The item id, text and predicates of each rationale, by who wrote it."""
     return {"narrator": list(read_rationales(benchmark_store.folder)), "prose": PROSE}
 
 
@@ -115,7 +118,7 @@ def test_no_true_claim_is_contradicted(rationales, source):
     ("source", "kind"),
     [
         *(("narrator", kind) for kind in MUTATIONS),
-        # Free prose has too few of the other words.
+        # The other words are too rare in free prose.
         *(("prose", kind) for kind in MUTATIONS if kind not in ("time", "candidate")),
     ],
 )
@@ -131,7 +134,17 @@ def test_false_word_is_contradicted(rationales, source, kind):
 @pytest.mark.slow
 def test_extraction_never_raises_and_is_deterministic():
     rng = Random(0)
-    words = [*PHRASES, RED, BLUE, "the red cube", "A", "B", "Candidate D", "near the top", "both"]
+    words = [
+        *VOCABULARY,
+        RED,
+        BLUE,
+        "the red cube",
+        "A",
+        "B",
+        "Candidate D",
+        "near the top",
+        "both",
+    ]
     words += [*",.;:()—’'\n", "it", "they", "Outcome: ", "Answer: ", "\nPrediction: ", "", "“", "é"]
     bodies = [
         " ".join(rng.choices(words, k=length)) for length in (0, 1, 2, 3, 5, 8, 20, 60, 200) * 40
@@ -143,7 +156,7 @@ def test_extraction_never_raises_and_is_deterministic():
 
 def test_validator_rejects_contradictions():
     cfg = TeacherConfig(name="template")
-    item, predicates = next(cases(9))
+    item, predicates = next(random_cases(9))
     text = write_rationale(predicates, item, seed=1)
     claims = validate_rationale(text, predicates, item, cfg).claims
     assert sum(claim.verdict == "supported" for claim in claims) > 20

@@ -1,11 +1,11 @@
-"""The grammar in the server's engine (xgrammar): the texts that it accepts."""
+"""The texts that the grammar of rationales accepts in xgrammar, the grammar engine of vLLM."""
 
 import pytest
 import xgrammar
 
 from teacher.narrator import write_rationale
 from teacher.sections import GRAMMAR
-from tests.teacher.test_predicates import cases
+from tests.teacher.test_predicates import random_cases
 
 BROKEN = {
     "a digit": lambda t: t.replace(" the ", " the 2 ", 1),
@@ -27,6 +27,7 @@ BROKEN = {
 
 @pytest.fixture(scope="module")
 def accepts():
+    """A function that returns whether the grammar accepts a text."""
     tokens = xgrammar.TokenizerInfo(["<end>"], stop_token_ids=[0])
     grammar = xgrammar.GrammarCompiler(tokens).compile_grammar(GRAMMAR)
 
@@ -38,16 +39,16 @@ def accepts():
 
 
 def test_rationales_of_the_narrator_are_accepted(accepts):
-    for item, predicates in cases(60):
+    for item, predicates in random_cases(60):
         assert accepts(write_rationale(predicates, item, seed=0))
 
 
 @pytest.mark.parametrize("flaw", BROKEN)
 def test_broken_form_is_rejected(accepts, flaw):
     changed = 0
-    for item, predicates in cases(20):
-        whole = write_rationale(predicates, item, seed=0)
-        text = BROKEN[flaw](whole)
-        assert text == whole or not accepts(text)
-        changed += text != whole
+    for item, predicates in random_cases(20):
+        valid = write_rationale(predicates, item, seed=0)
+        text = BROKEN[flaw](valid)
+        assert text == valid or not accepts(text)
+        changed += text != valid
     assert changed

@@ -1,4 +1,4 @@
-"""Candidates' letters: detection, and relabelling for another order."""
+"""Letters of candidates: their detection, and their replacement for another order of candidates."""
 
 from itertools import permutations
 
@@ -46,7 +46,8 @@ def test_relabelling_composes():
 
 
 def test_relabelled_rationale_is_valid_for_the_reordered_item(micro_store):
-    cfg, rng, moved = TeacherConfig(name="template"), np.random.default_rng(0), 0
+    cfg, rng = TeacherConfig(name="template"), np.random.default_rng(0)
+    answers_moved = 0
     for item in micro_store.selection():
         scene = micro_store.scene(item.scene_id)
         predicates = extract_predicates(item, scene, micro_store.scene)
@@ -61,5 +62,5 @@ def test_relabelled_rationale_is_valid_for_the_reordered_item(micro_store):
         verdict = validate_rationale(relabel_text(text, order), facts, other, cfg)
         assert verdict.accepted, verdict.reasons
         assert verdict.answer == other.letter
-        moved += other.letter != item.letter
-    assert moved > 20
+        answers_moved += other.letter != item.letter
+    assert answers_moved > 20

@@ -1,4 +1,4 @@
-"""Narration of a store in memory: resuming, damaged files, and faulty servers."""
+"""Narration of a benchmark in memory: resuming, damaged files, and faulty servers."""
 
 import threading
 import time
@@ -13,7 +13,7 @@ from teacher.narrate import ensure_rationales, narrate_store
 from teacher.rationale_log import Journal, read_rationales
 from teacher.sections import GRAMMAR, GRAMMAR_VERSION
 from tests.teacher import synthetic
-from tests.teacher.faulty_server import served
+from tests.teacher.faulty_server import teacher_at
 from tests.user_errors import raises_user_error
 
 TEMPLATE = TeacherConfig(name="template")
@@ -24,7 +24,7 @@ def journal_path(store):
     return store.folder / "rationales.jsonl"
 
 
-def test_template_narrates_all_training_items_except_short_ones(store):
+def test_narrator_writes_all_training_items_except_those_with_too_short_a_prefix(store):
     narration = narrate_store(store, TEMPLATE)
     assert [r.item_id for r in narration.rationales] == NARRATED
     figures = narration.figures
@@ -36,11 +36,13 @@ def test_template_narrates_all_training_items_except_short_ones(store):
 
 @pytest.mark.parametrize("kept", [0, 10, 0.3, 0.5, -1])
 def test_killed_run_resumes_to_the_same_bytes(store, kept):
+    """`kept` is the share (between 0 and 1) or the number of bytes left of the journal."""
     narrate_store(store, TEMPLATE)
-    whole = journal_path(store).read_bytes()
-    journal_path(store).write_bytes(whole[: int(kept * len(whole)) if 0 < kept < 1 else kept])
+    complete = journal_path(store).read_bytes()
+    stop = int(kept * len(complete)) if 0 < kept < 1 else kept
+    journal_path(store).write_bytes(complete[:stop])
     narrate_store(store, TEMPLATE)
-    assert journal_path(store).read_bytes() == whole
+    assert journal_path(store).read_bytes() == complete
 
 
 @pytest.mark.parametrize(
@@ -66,7 +68,7 @@ def test_journal_of_another_benchmark_is_refused(store):
         narrate_store(store, TEMPLATE)
 
 
-def test_rejected_responses_set_items_aside_under_these_settings_only(store):
+def test_items_are_set_aside_only_under_the_settings_that_reject_their_responses(store):
     first = narrate_store(store, TEMPLATE)
     strict = narrate_store(store, replace(TEMPLATE, min_words=240, attempts=2))
     assert strict.rationales == []
@@ -77,8 +79,8 @@ def test_rejected_responses_set_items_aside_under_these_settings_only(store):
     assert journal_path(store).read_bytes() == before
 
 
-def test_second_process_waits_for_the_journal(store):
-    """As the jobs of a sweep do that start together."""
+def test_second_writer_waits_for_the_journal(store):
+    """Jobs of a sweep that start together may narrate the same benchmark."""
     narrations = []
     other = threading.Thread(
         target=lambda: narrations.append(narrate_store(store, TEMPLATE)), daemon=True
@@ -93,7 +95,7 @@ def test_second_process_waits_for_the_journal(store):
 
 def test_accepted_rationales_are_saved_as_parquet(store, start_server):
     path = store.folder / "rationales.parquet"
-    narration = narrate_store(store, served(start_server("number")))
+    narration = narrate_store(store, teacher_at(start_server("number")))
     rows = pq.read_table(path).to_pylist()
     without_claims = [replace(r, claims={}) for r in narration.rationales]
     assert [Rationale.from_row(row) for row in rows] == without_claims
@@ -104,7 +106,7 @@ def test_accepted_rationales_are_saved_as_parquet(store, start_server):
 
 def test_server_faults_cost_no_attempt(store, start_server):
     server = start_server(503, "cut", 500, "number")
-    narration = narrate_store(store, served(server, samples=1))
+    narration = narrate_store(store, teacher_at(server, samples=1))
     assert [r.item_id for r in narration.rationales] == NARRATED
     assert narration.figures["rejected"] == {"cut off": 1, "number": 1}
     assert narration.figures["too_short"] == 1
@@ -115,9 +117,9 @@ def test_server_faults_cost_no_attempt(store, start_server):
     assert not {"seed", "structured_outputs"} & set(request)
 
 
-def test_grammar_is_sent_and_recorded(store, start_server):
+def test_grammar_is_sent_and_its_version_recorded(store, start_server):
     server = start_server()
-    free, constrained = served(server), served(server, grammar=True)
+    free, constrained = teacher_at(server), teacher_at(server, grammar=True)
     narrate_store(store, free)
     requests = len(server.requests)
     narration = narrate_store(store, constrained)
@@ -129,12 +131,12 @@ def test_grammar_is_sent_and_recorded(store, start_server):
 
 def test_several_samples_are_requested_only_after_a_rejection(store, start_server):
     server = start_server("number")
-    narration = narrate_store(store, served(server, concurrency=1, samples=3))
+    narration = narrate_store(store, teacher_at(server, concurrency=1, samples=3))
     assert [request["n"] for request in server.requests] == [1, 3] + [1] * 11
     assert narration.rationales[0].attempt == 1
     first = [r for r in read_rationales(journal_path(store)) if r.item_id == "item-0"]
     assert [(r.attempt, r.accepted) for r in first] == [(0, False), (1, True), (2, True), (3, True)]
-    # The samples of one request share its cost.
+    # The prompt tokens of a request count once, for the first of its samples.
     assert [r.prompt_tokens for r in first] == [1000, 1000, 0, 0]
     assert first[0].completion_tokens == 101
     assert sum(r.completion_tokens for r in first[1:]) == 303
@@ -143,7 +145,7 @@ def test_several_samples_are_requested_only_after_a_rejection(store, start_serve
 def test_samples_do_not_exceed_the_attempts(store, start_server):
     server = start_server()
     server.always["*"] = "number"
-    narration = narrate_store(store, served(server, attempts=4, samples=2))
+    narration = narrate_store(store, teacher_at(server, attempts=4, samples=2))
     assert narration.figures["set_aside"] == 12
     attempts = [r.attempt for r in read_rationales(journal_path(store))]
     assert sorted(attempts) == sorted([0, 1, 2, 3] * 12)
@@ -155,14 +157,14 @@ def test_samples_do_not_exceed_the_attempts(store, start_server):
     [("cut", "cut off"), ("empty", "empty"), ("thinking", "thinking"), ("long", "too long")],
 )
 def test_unusable_response_is_rejected_with_its_reason(store, start_server, fault, reason):
-    narration = narrate_store(store, served(start_server(fault)))
+    narration = narrate_store(store, teacher_at(start_server(fault)))
     assert narration.figures["rejected"] == {reason: 1}
     assert len(narration.rationales) == 12
     assert all(len(r.text) <= 20_000 for r in read_rationales(journal_path(store)))
 
 
-def test_half_of_a_surrogate_pair_is_replaced(store, start_server):
-    assert len(narrate_store(store, served(start_server("surrogate"))).rationales) == 12
+def test_lone_surrogate_in_a_response_is_replaced(store, start_server):
+    assert len(narrate_store(store, teacher_at(start_server("surrogate"))).rationales) == 12
     assert len(pq.read_table(store.folder / "rationales.parquet")) == 12
 
 
@@ -173,7 +175,7 @@ def test_half_of_a_surrogate_pair_is_replaced(store, start_server):
 )  # fmt: skip
 def test_failed_request_is_repeated(store, start_server, fault):
     server = start_server(fault)
-    narration = narrate_store(store, served(server))
+    narration = narrate_store(store, teacher_at(server))
     assert narration.figures["rejected"] == {}
     assert len(narration.rationales) == 12
     assert len(server.requests) == 13
@@ -182,9 +184,9 @@ def test_failed_request_is_repeated(store, start_server, fault):
 @pytest.mark.parametrize("status", [500, 400])
 def test_item_without_response_is_set_aside(store, start_server, status):
     server = start_server()
-    prompt = next(iter(server.texts))
+    prompt = next(iter(server.rationales))
     server.always[prompt] = status
-    narration = narrate_store(store, served(server, concurrency=1, attempts=2))
+    narration = narrate_store(store, teacher_at(server, concurrency=1, attempts=2))
     assert len(narration.rationales) == 11
     assert narration.figures["rejected"] == {"unanswered": 2}
     assert narration.figures["set_aside"] == 1
@@ -194,26 +196,26 @@ def test_item_without_response_is_set_aside(store, start_server, status):
         assert prompts.count(prompt) == 2
 
 
-def test_killed_run_requests_only_the_rest_and_a_finished_run_needs_no_server(store, start_server):
+def test_resumed_run_requests_only_missing_items_and_finished_run_none(store, start_server):
     store.items = [item for item in store.items if item.item_id != "item-5"]
     server = start_server()
-    narrate_store(store, served(server))
+    narrate_store(store, teacher_at(server))
     lines = journal_path(store).read_bytes().splitlines(keepends=True)
     journal_path(store).write_bytes(b"".join(lines[:7]) + lines[7][:40])
     server.requests.clear()
-    narration = narrate_store(store, served(server))
+    narration = narrate_store(store, teacher_at(server))
     assert len(server.requests) == len(lines) - 7
     assert len(narration.rationales) == 12
     server.stop()
     before = journal_path(store).read_bytes()
-    again = narrate_store(store, served(server))
+    again = narrate_store(store, teacher_at(server))
     assert (again.rationales, again.figures) == (narration.rationales, narration.figures)
     assert journal_path(store).read_bytes() == before
 
 
-def test_unknown_model_is_reported_with_the_served_ones(store, start_server):
+def test_unknown_model_is_reported_with_the_models_of_the_server(store, start_server):
     with raises_user_error("unknown-model", contains=("teacher.model=tiny", "other")):
-        narrate_store(store, served(start_server(404), concurrency=1))
+        narrate_store(store, teacher_at(start_server(404), concurrency=1))
 
 
 @pytest.mark.parametrize("status", [401, 400, 403, 422])
@@ -222,7 +224,7 @@ def test_server_that_refuses_every_request_is_reported(store, start_server, stat
     server.always["*"] = status
     code = "invalid-api-key" if status == 401 else "server-refuses"
     with raises_user_error(code, contains=(server.url, "fault")):
-        narrate_store(store, served(server))
+        narrate_store(store, teacher_at(server))
     assert read_rationales(journal_path(store)) == []
 
 
@@ -235,14 +237,14 @@ def test_incompatible_server_is_reported(store, start_server, reply):
     server = start_server()
     server.always["*"] = reply
     with raises_user_error("incompatible-server", contains=server.url):
-        narrate_store(store, served(server))
+        narrate_store(store, teacher_at(server))
     assert read_rationales(journal_path(store)) == []
 
 
 def test_fallback_is_marked_and_optional(store, start_server):
-    """Every response of the server contains a number, so all items are set aside."""
+    """All responses of the server contain a number, so all items are set aside."""
     server = start_server(*["number"] * 40)
-    cfg = served(server, attempts=2, samples=1)
+    cfg = teacher_at(server, attempts=2, samples=1)
     without = narrate_store(store, cfg)
     assert (without.rationales, without.figures["set_aside"]) == ([], 12)
     requests = len(server.requests)

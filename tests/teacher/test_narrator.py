@@ -1,4 +1,4 @@
-"""The built-in narrator passes the validator, and the validator rejects broken rationales."""
+"""The validator accepts rationales of the built-in narrator, and rejects them when broken."""
 
 import re
 import sys
@@ -13,14 +13,14 @@ from teacher.predicates import extract_predicates
 from teacher.validation.validator import WORD, validate_rationale
 from tests.children import run_child
 from tests.teacher import synthetic
-from tests.teacher.test_predicates import cases
+from tests.teacher.test_predicates import random_cases
 
 CFG = TeacherConfig(name="template")
 
 
 def test_every_rationale_is_accepted():
     vocabulary, lengths = set(), []
-    for item, predicates in cases(250):
+    for item, predicates in random_cases(250):
         text = write_rationale(predicates, item, seed=3)
         assert validate_rationale(text, predicates, item, CFG).reasons == ()
         lengths.append(len(WORD.findall(text)))
@@ -45,7 +45,7 @@ def test_length_is_valid_for_sparse_and_crowded_scenes():
 
 
 def test_text_varies_with_the_seed_and_is_reproducible():
-    item, predicates = next(cases(9))
+    item, predicates = next(random_cases(9))
     texts = {write_rationale(predicates, item, seed) for seed in range(8)}
     assert len(texts) > 4
     assert write_rationale(predicates, item, 0) == write_rationale(predicates, item, 0)
@@ -54,12 +54,12 @@ def test_text_varies_with_the_seed_and_is_reproducible():
 
 def test_text_is_the_same_in_another_process():
     code = (
-        "from tests.teacher.test_predicates import cases\n"
+        "from tests.teacher.test_predicates import random_cases\n"
         "from teacher.narrator import write_rationale\n"
-        "item, predicates = next(cases(9))\n"
+        "item, predicates = next(random_cases(9))\n"
         "print(write_rationale(predicates, item, 5))"
     )
-    item, predicates = next(cases(9))
+    item, predicates = next(random_cases(9))
     result = run_child([sys.executable, "-c", code], check=True)
     assert result.stdout.strip() == write_rationale(predicates, item, 5)
 
@@ -121,7 +121,7 @@ def swap_sections(text, item):
     ],
 )
 def test_broken_rationale_is_rejected(mutate, reason):
-    for item, predicates in cases(6):
+    for item, predicates in random_cases(6):
         text = write_rationale(predicates, item, 0)
         verdict = validate_rationale(mutate(text, item), predicates, item, CFG)
         assert not verdict.accepted

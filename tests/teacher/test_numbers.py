@@ -1,4 +1,5 @@
-"""Detection of numbers: labelled sentences, insertions into prose, and adversarial text."""
+"""Detection of numbers in labelled sentences, in prose with inserted numbers, and in adversarial
+text."""
 
 from __future__ import annotations
 
@@ -15,19 +16,20 @@ from teacher.narrator import write_description, write_rationale
 from teacher.numbers.detection import find_numbers
 from tests.teacher import synthetic
 from tests.teacher.adversarial_text import PIECES, repeat_piece
-from tests.teacher.test_predicates import cases
+from tests.teacher.test_predicates import random_cases
 
 FOLDER = Path(__file__).parent / "sentences"
 
 
 def sentences(kind: str) -> list[str]:
+    """Return the sentences in a file of FOLDER, one per line."""
     path = FOLDER / f"{kind}.txt"
-    # Not splitlines, for some sentences hold other line separators.
+    # `splitlines` would also split sentences that contain other line separators.
     return path.read_text(encoding="utf-8").removesuffix("\n").split("\n")
 
 
 POSITIVE, NEGATIVE = sentences("positive"), sentences("negative")
-PHRASES = """
+NUMBER_PHRASES = """
 [3]|[0.4] units|frame [63]|[1,200]|[12]-[40]|[30]%|the [2nd] collision|[3]D|v[2]|[½]|[¾]|r[²]
 [③]|[Ⅳ]|[٣]|[五]|[𝟗]|[&#51;]|[&amp;#50;]|[&frac12;]|[5️⃣]|[🥈]|[🕒]|[⚃]
 [two] spheres|[three]|[twenty-one]|[two hundred]|[zero]|[nil]|a [dozen]|[thousands]
@@ -39,22 +41,22 @@ a [trio]|a [single] cube|[percent]|for some [seconds]|a [minute] later|a [few fr
 [tw\u043e]|[\uff54\uff57\uff4f]|[\u24e3\u24e6\u24de]|[TWO]|[twoSpheres]|[twospheres]|[e!ght]
 [dos]|[deux]|[zwei]|[cinque]|[três]|[twee]|[два]|[пять]|[τρία]|[दो]|[ثلاثة]|[셋]
 """.strip().replace("\n", "|")
-"""Phrases that state a number; the part to be detected is in brackets."""
+"""Phrases that state a number, separated by "|"; the part to be detected is in brackets."""
 
 
 @cache
 def narrator_texts(count: int) -> list[str]:
-    """Rationales by the built-in narrator."""
-    return [write_rationale(predicates, item, seed=5) for item, predicates in cases(count)]
+    """Return rationales of the built-in narrator."""
+    return [write_rationale(predicates, item, seed=5) for item, predicates in random_cases(count)]
 
 
 def free_texts() -> list[str]:
-    """Rationales in free prose."""
+    """Return rationales in free prose."""
     return (FOLDER / "rationales.txt").read_text().strip().split("\n\n")
 
 
 def spots(text: str) -> Iterator[int]:
-    """Positions where a phrase can be inserted: white space and the ends of sentences."""
+    """Yield positions where a phrase can be inserted: white space and the ends of sentences."""
     yield from (m.start() for m in re.finditer(r"\s|(?<=\.)(?=\s)|\Z", text))
 
 
@@ -63,7 +65,7 @@ def detect(text: str) -> list[str]:
 
 
 def assert_spans_are_valid(text: str) -> None:
-    """Spans are ordered, disjoint and inside the text, and each is a number on its own."""
+    """Assert that spans are ordered, disjoint and inside the text, and numbers on their own."""
     last = 0
     for start, stop in find_numbers(text):
         assert last <= start < stop <= len(text)
@@ -73,7 +75,7 @@ def assert_spans_are_valid(text: str) -> None:
 
 
 def test_recall_and_precision_on_unseen_sentences() -> None:
-    """Independently written by the same policy, and not used for the rules."""
+    """The rules were not tuned on these sentences, which were written independently of them."""
     positive, negative = sentences("unseen_positive"), sentences("unseen_negative")
     detected = sum(bool(find_numbers(sentence)) for sentence in positive)
     false_alarms = sum(bool(find_numbers(sentence)) for sentence in negative)
@@ -110,7 +112,7 @@ def test_spans_index_the_original(text, stated):
     assert text[slice(*span)] == stated
 
 
-@pytest.mark.parametrize("phrase", PHRASES.split("|"))
+@pytest.mark.parametrize("phrase", NUMBER_PHRASES.split("|"))
 def test_inserted_number_is_detected(phrase):
     plain = phrase.replace("[", "").replace("]", "")
     parts = [m.span(1) for m in re.finditer(r"\[(.*?)\]", phrase)]
@@ -118,11 +120,11 @@ def test_inserted_number_is_detected(phrase):
     parts = [(start - 2 * k - 1, stop - 2 * k - 1) for k, (start, stop) in enumerate(parts)]
     for text in (narrator_texts(2)[-1], random.Random(phrase).choice(free_texts())):
         for spot in spots(text):
-            whole = f"{text[:spot]} {plain}{text[spot:]}"
-            spans = find_numbers(whole)
+            changed = f"{text[:spot]} {plain}{text[spot:]}"
+            spans = find_numbers(changed)
             for start, stop in parts:
                 first, last = spot + 1 + start, spot + 1 + stop
-                assert any(a <= first and last <= b for a, b in spans), ascii(whole[spot:][:60])
+                assert any(a <= first and last <= b for a, b in spans), ascii(changed[spot:][:60])
 
 
 def test_prose_without_numbers():

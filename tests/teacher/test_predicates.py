@@ -1,4 +1,4 @@
-"""Predicates of scenes in closed form and of a benchmark, compared with the oracle."""
+"""Predicates of synthetic scenes and of a benchmark, compared with the oracle."""
 
 import json
 import math
@@ -22,7 +22,8 @@ from tests.teacher import synthetic
 
 
 def toward(start, pixel, frames):
-    """The velocity that moves an object from a ground point to a pixel in a number of frames."""
+    """Return the velocity that moves an object from a point on the ground to a pixel in a number of
+    frames."""
     return (synthetic.on_ground(pixel)[:2] - start) / frames * synthetic.FPS
 
 
@@ -33,7 +34,7 @@ DIRECTIONS = {
 
 
 def test_compass():
-    assert {word: compass_direction(5.0 * way) for word, way in DIRECTIONS.items()} == {
+    assert {word: compass_direction(5.0 * step) for word, step in DIRECTIONS.items()} == {
         word: word for word in COMPASS
     }
     assert compass_direction(np.zeros(2)) is None
@@ -68,8 +69,9 @@ def test_meeting_after_the_last_frame_is_unseen():
     assert extract_facts(scene, 20, 50, 55).courses[0].when == "unseen"
 
 
-def test_a_course_is_measured_by_the_frame_rate_of_the_scene():
-    """Two objects that close at 0.04 units/s are stationary, at any frame rate."""
+def test_collision_course_depends_on_the_frame_rate_of_the_scene():
+    """Objects that approach at 0.04 units/s count as stationary. The same positions at four times
+    the frame rate mean 0.16 units/s."""
     scene = synthetic.scene([(-0.3, 0), (0.3, 0)], [(0.02, 0), (-0.02, 0)])
     assert find_collision_courses(scene, 10) == []
     faster = replace(scene, fps=100, velocities=scene.velocities * 4)
@@ -104,12 +106,12 @@ def expected_speed(velocity):
     return next((word for bound, word in bounds if speed < bound), "very quickly")
 
 
-def expected_extent(far):
-    return "stays" if far < 8 else "shifts slightly" if far < 60 else "moves across"
+def expected_extent(distance):
+    return "stays" if distance < 8 else "shifts slightly" if distance < 60 else "moves across"
 
 
 def points_along(word, displacement):
-    """Whether a compass word is the nearest to the direction of a displacement."""
+    """Return whether a compass word is the nearest to the direction of a displacement."""
     displacement = np.asarray(displacement, dtype=float)
     cosine = displacement @ DIRECTIONS[word]
     cosine /= np.linalg.norm(displacement) * np.linalg.norm(DIRECTIONS[word])
@@ -117,8 +119,8 @@ def points_along(word, displacement):
 
 
 def closest_pass(scene, i, j, cut, since):
-    """Distances of two objects over 60 frames of straight motion in small steps, and their relative
-    speed."""
+    """Return the distances of two objects over 60 frames of straight motion in small steps, and
+    their relative speed (units/s)."""
     ground = scene.positions[:, :, :2]
     steps = [(ground[cut, k] - ground[since[k], k]) / (cut - since[k]) for k in (i, j)]
     ahead = np.arange(0, 60, 0.01)[:, None]
@@ -133,7 +135,7 @@ def expected_sight(scene, frame, k):
 
 
 def test_every_fact_agrees_with_the_oracle(benchmark_store):
-    """Regions, speeds, directions, meetings and closeness, computed by independent code."""
+    """Regions, speeds, directions, meetings and closeness are computed here by independent code."""
     counts = Counter()
     for item in benchmark_store.selection():
         scene, target = benchmark_store.scene(item.scene_id), item.target_frame
@@ -168,22 +170,23 @@ def test_every_fact_agrees_with_the_oracle(benchmark_store):
                 assert rests if o.heading is None else points_along(o.heading, way)
                 counts["heading"] += o.heading is not None
             moved = (scene.image_positions[target, k] - scene.image_positions[cut, k]) * square
-            far = math.hypot(*moved)
+            distance = math.hypot(*moved)
             if {o.sight, o.target_sight} == {"out of view"}:
                 assert (o.extent, o.travel) == ("unseen", None)
             else:
-                assert o.extent == expected_extent(far)
-                assert far < 8 if o.travel is None else points_along(o.travel, moved)
-            gone = {o.sight == "out of view", o.target_sight == "out of view"} == {True, False}
-            assert (o.object in (*predicates.entering, *predicates.leaving)) == gone
+                assert o.extent == expected_extent(distance)
+                assert distance < 8 if o.travel is None else points_along(o.travel, moved)
+            crosses = {o.sight == "out of view", o.target_sight == "out of view"} == {True, False}
+            assert (o.object in (*predicates.entering, *predicates.leaving)) == crosses
             assert not (o.object in predicates.entering and o.sight != "out of view")
-            counts["crossing"] += gone
+            counts["crossing"] += crosses
         check_meetings(scene, predicates, cut, target, since, counts)
     assert min(counts[kind] for kind in ("region", "heading", "crossing", "course", "close")) > 5
     assert counts["never"] > 0
 
 
 def check_meetings(scene, predicates, cut, target, since, counts):
+    """Check the collision courses, contacts and close pairs of `predicates`."""
     names = [o.noun_phrase for o in scene.objects]
     on_course = {frozenset(m.objects): m.when for m in predicates.courses}
     contacts = {frozenset(m.objects): m.when for m in predicates.contacts}
@@ -201,7 +204,7 @@ def check_meetings(scene, predicates, cut, target, since, counts):
         else:
             distances, closing = closest_pass(scene, i, j, cut, since)
             nearing = distances[1] < distances[0] and closing >= 0.05
-            if abs(distances.min() - 0.5) > 1e-3:  # The steps are that coarse.
+            if abs(distances.min() - 0.5) > 1e-3:  # Otherwise, the steps are too coarse to tell.
                 assert (pair in on_course) == (nearing and distances.min() < 0.5)
             if pair in on_course:
                 assert on_course[pair] == when or (when is None and on_course[pair] == "unseen")
@@ -226,14 +229,15 @@ def test_predicates_of_a_benchmark_contain_no_number(benchmark_store):
         assert not any(c.isdigit() for c in text)
 
 
-def cases(count):
+def random_cases(count):
+    """Yield items of random scenes with their predicates, at most `count`."""
     rng = np.random.default_rng(1)
     for k in range(count):
         scene, other = synthetic.random_scene(rng), synthetic.random_scene(rng, "other")
         frames = tuple(int(f) for f in 40 + rng.permutation(80)[:4])
         answer = int(rng.integers(4))
         if not scene.in_view[frames[answer]].any():
-            continue  # No builder selects a target without visible objects.
+            continue  # The builders of items never select a target without visible objects.
         foreign = {(answer + 1) % 4: "other"} if k % 3 == 0 else {}
         item = synthetic.item(
             frames,

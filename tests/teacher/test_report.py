@@ -1,4 +1,4 @@
-"""The report of a narration: its figures, counted by hand, and its page."""
+"""The report of a narration: its figures, compared with counts by hand, and its HTML page."""
 
 import json
 import re
@@ -38,7 +38,7 @@ def figures_of(*responses):
     return summarize(ITEMS, by_item)
 
 
-def test_every_figure_is_counted():
+def test_figures_equal_counts_by_hand():
     figures = figures_of(
         response(0, 0, "The red metal cube rests here. The red metal cube stays."),
         response(1, 0, reasons=["number: 'two'", "number: 'half'", "too short"]),
@@ -70,7 +70,7 @@ def test_claims_are_summed_and_shown_as_shares():
     assert line.split()[1:] == ["8", "50.0%", "12.5%", "37.5%"]
 
 
-def test_idle_time_of_servers_costs_nothing():
+def test_long_pauses_between_responses_are_not_counted_as_hours():
     times = [100.0, 101.0, 103.0, 5000.0, 5001.0]
     figures = figures_of(
         *(

@@ -1,4 +1,4 @@
-"""teacher.serve: its checks, the arguments of vLLM, and a real vLLM server."""
+"""teacher.serve: its checks, the command-line arguments of vLLM, and a real vLLM server."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ def command(url=URL, **settings):
 
 
 def flags(available, **settings):
+    """Return the arguments of vLLM on a machine with `available` GPUs."""
     return serve.vllm_arguments(command(**settings), "/weights", "127.0.0.1", 8000, available)
 
 
@@ -56,6 +57,7 @@ def server(model, tmp_path_factory):
 
 
 def complete(server, n):
+    """Return `n` responses of a server to one prompt."""
     cfg = TeacherConfig(name="tiny", url=server.url, model="tiny", max_tokens=8)
 
     async def main():
@@ -181,7 +183,7 @@ def test_vllm_enforces_the_grammar_of_rationales(server, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_server_or_client_loses_and_repeats_no_response(server, tmp_path):
+def test_killing_the_server_or_client_neither_loses_nor_repeats_a_response(server, tmp_path):
     store = make_store(tmp_path, ITEMS + 2)
     path = tmp_path / "rationales.jsonl"
     client = narrate_in_process(tmp_path, server.url)
@@ -200,7 +202,7 @@ def test_a_killed_server_or_client_loses_and_repeats_no_response(server, tmp_pat
     assert Counter((r.item_id, r.attempt) for r in rationales) == Counter(
         (item_id, 0) for item_id in expected
     )
-    # The outage of the server is not a reason to reject a response.
+    # Responses are not rejected because the server was down.
     assert not [r for r in rationales if "unanswered" in "".join(r.reasons)]
     assert path.read_bytes().startswith(kept[: kept.rindex(b"\n") + 1])
 

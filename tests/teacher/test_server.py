@@ -1,4 +1,4 @@
-"""The server pool with local servers that are down, busy, slow or rate-limited."""
+"""The pool of servers, with local servers that are down, busy, slow or rate-limited."""
 
 import asyncio
 import json
@@ -10,13 +10,15 @@ import pytest
 from teacher.narrate import narrate_store
 from teacher.server_narrator import request_fields
 from teacher.servers.pool import ServerPool
-from tests.teacher.faulty_server import FaultyServer, completion, served
+from tests.teacher.faulty_server import FaultyServer, completion, teacher_at
 from tests.user_errors import raises_user_error
 
 MESSAGES = [{"role": "user", "content": "Are you there?"}]
 
 
 def complete(cfg, times=1, n=1, **fields):
+    """Send a prompt `times` times at once, and return the responses of each request."""
+
     async def main():
         async with ServerPool(cfg, request_fields(cfg)) as pool:
             requests = (pool.complete(MESSAGES, n, **fields) for _ in range(times))
@@ -28,40 +30,40 @@ def complete(cfg, times=1, n=1, **fields):
 def test_concurrency_limits_requests_in_flight(store, start_server):
     server = start_server()
     server.delay = 0.05
-    narrate_store(store, served(server, concurrency=3))
-    assert server.most == 3
+    narrate_store(store, teacher_at(server, concurrency=3))
+    assert server.max_in_flight == 3
 
 
-def test_fields_of_one_request_override_the_pools(start_server):
+def test_fields_of_a_request_override_those_of_the_pool(start_server):
     server = start_server()
-    complete(served(server, temperature=0.3), seed=7, temperature=0.6)
+    complete(teacher_at(server, temperature=0.3), seed=7, temperature=0.6)
     request = server.requests[0]
     assert (request["seed"], request["temperature"], request["top_p"]) == (7, 0.6, 0.8)
 
 
 def test_fewer_responses_than_requested_are_accepted(start_server):
     server = start_server(json.dumps(completion("Hello.", "stop", 2)).encode())
-    assert len(complete(served(server), n=4)[0]) == 2
+    assert len(complete(teacher_at(server), n=4)[0]) == 2
     assert server.requests[0]["n"] == 4
 
 
 def test_rate_limit_delays_the_next_request(start_server):
     server = start_server({"Retry-After": "0.5"}, {}, {"Retry-After": "soon"})
-    assert complete(served(server))[0][0].text == "Hello."
+    assert complete(teacher_at(server))[0][0].text == "Hello."
     assert len(server.requests) == 4
-    assert server.times[1] - server.times[0] >= 0.5
+    assert server.request_times[1] - server.request_times[0] >= 0.5
 
 
 def test_other_server_answers_while_one_is_rate_limited(start_server):
     limited, other = start_server(), start_server()
     limited.always["*"] = {"Retry-After": "60"}
-    assert len(complete(served(limited, other, concurrency=8), times=8)) == 8
+    assert len(complete(teacher_at(limited, other, concurrency=8), times=8)) == 8
     assert len(other.requests) == 8
 
 
-def test_lasting_rate_limit_or_missing_server_ends_in_an_error(start_server):
+def test_lasting_rate_limit_or_stopped_server_is_reported(start_server):
     server = start_server()
-    cfg = served(server, unreachable_timeout=0.2)
+    cfg = teacher_at(server, unreachable_timeout=0.2)
     server.always["*"] = {"Retry-After": "60"}
     with raises_user_error("no-server", contains=(server.url, "429")):
         complete(cfg)
@@ -75,7 +77,7 @@ def test_least_busy_server_gets_the_next_request(start_server):
     slow.delay, fast.delay = 0.1, 0.005
 
     async def main():
-        async with ServerPool(served(slow, fast), {}) as pool:
+        async with ServerPool(teacher_at(slow, fast), {}) as pool:
 
             async def send_ten():
                 for _ in range(10):
@@ -94,12 +96,12 @@ def test_broken_server_does_not_affect_the_others(store, start_server, state):
     broken.always["*"] = 500
     if state == "stopped":
         broken.stop()
-    narration = narrate_store(store, served(broken, up))
+    narration = narrate_store(store, teacher_at(broken, up))
     assert len(narration.rationales) == 12
     assert narration.figures["rejected"] == {}
 
 
-def test_restart_of_a_server_costs_no_attempt(store, start_server):
+def test_restart_of_a_server_rejects_no_response(store, start_server):
     server = start_server()
     port = server.server_port
     server.delay = 0.05
@@ -114,7 +116,7 @@ def test_restart_of_a_server_costs_no_attempt(store, start_server):
 
     thread = threading.Thread(target=restart)
     thread.start()
-    narration = narrate_store(store, served(server))
+    narration = narrate_store(store, teacher_at(server))
     thread.join()
     restarted[0].stop()
     assert len(narration.rationales) == 12
@@ -124,4 +126,4 @@ def test_restart_of_a_server_costs_no_attempt(store, start_server):
 
 def test_repeated_url_counts_once(start_server):
     server = start_server()
-    assert len(ServerPool(served(server, server), {}).servers) == 1
+    assert len(ServerPool(teacher_at(server, server), {}).servers) == 1

@@ -1,4 +1,4 @@
-"""A random Qwen3 with a few hundred thousand weights and its own tokenizer, made offline."""
+"""A Qwen3 with a few hundred thousand random weights and its own tokenizer, built offline."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TEMPLATE = (
 
 def save_tiny_qwen3(folder: Path, texts: Iterable[str]) -> Path:
     """Save a model, and a tokenizer trained on `texts`, in the format that vLLM reads."""
-    # Imported here, because few of the tests that import this file serve a model.
+    # Imported here because they are slow to import, and most tests do not serve a model.
     import torch
     from transformers import Qwen3Config, Qwen3ForCausalLM
 
@@ -41,7 +41,7 @@ def save_tiny_qwen3(folder: Path, texts: Iterable[str]) -> Path:
     )
     model = Qwen3ForCausalLM(config).to(torch.bfloat16)
     with torch.no_grad():
-        # The model never ends a response, so that all responses have the requested length.
+        # Responses then never end early, so that all have the maximum length.
         model.model.embed_tokens.weight[config.eos_token_id] = 0
     model.save_pretrained(folder)
     tokenizer.save_pretrained(folder)

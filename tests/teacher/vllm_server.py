@@ -1,4 +1,4 @@
-"""A real vLLM server, started by `python -m teacher.serve`, which tests can kill and stop."""
+"""A real vLLM server, which tests start with `python -m teacher.serve`, stop and kill."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ ENVIRONMENT = ROOT / ".venv-vllm"
 
 
 class VllmServer:
-    """The command with a model in a folder; `url` stays the same after a restart."""
+    """Runs `python -m teacher.serve` with a model. `url` stays the same after a restart.
+
+    Args:
+        model: The folder of the model.
+        folder: Receives the output of the command.
+        settings: More settings of the command, such as "frames=true".
+    """
 
     def __init__(self, model: Path, folder: Path, *settings: str) -> None:
         self.url = f"http://127.0.0.1:{free_port()}/v1"
@@ -46,12 +52,12 @@ class VllmServer:
         return True
 
     def kill(self) -> None:
-        """Kill vLLM and all its processes, as if the machine went down."""
+        """Kill all processes of vLLM, as if the machine went down."""
         os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 
     def stop(self, number: int = signal.SIGTERM) -> int:
-        """Send a signal to vLLM; returns its exit status."""
+        """Send a signal to vLLM, and return its exit status."""
         if self.process.poll() is None:
             self.process.send_signal(number)
         return self.process.wait()

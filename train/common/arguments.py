@@ -1,4 +1,4 @@
-"""Convert the project's settings to arguments of the trainers of transformers."""
+"""Convert settings of training to the arguments of transformers' Trainer."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ from train.common.checkpoints import STATE
 PROJECT = "dynapix"
 """Name of the project in experiment trackers."""
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
+"""The name in transformers of each value of train.schedule."""
 
 
 def common_arguments(
     train: TrainConfig, run: Run, seed: int, checkpoint: Path | None
 ) -> dict[str, Any]:
-    """Return the arguments that `TrainingArguments` and its subclasses share.
+    """Return the `TrainingArguments` that students and retrievers have in common.
 
     Args:
-        train: Settings with a resolved precision.
+        train: The settings; `precision` is bf16 or fp32, not auto.
         checkpoint: The checkpoint that the run resumes from, or None.
     """
     if checkpoint is None:
         # The trainer reads a value below 1 as a share of all steps, but 1 as every step.
-        every = min(1 / train.evaluations, 0.9999)
+        interval = min(1 / train.evaluations, 0.9999)
     else:
-        every = json.loads((checkpoint / STATE).read_text())["eval_steps"]
+        # The number of steps that the trainer computed from the share when the run started.
+        interval = json.loads((checkpoint / STATE).read_text())["eval_steps"]
     return {
         "output_dir": str(run.folder),
         "seed": seed,
@@ -48,17 +50,17 @@ def common_arguments(
         "use_cpu": not torch.cuda.is_available(),
         **checkpointing_arguments(train.gradient_checkpointing),
         "eval_strategy": "steps",
-        "eval_steps": every,
+        "eval_steps": interval,
         # A resumed run already has the initial evaluation in its metrics.jsonl.
         "eval_on_start": checkpoint is None,
         "save_strategy": "steps",
-        "save_steps": every,
+        "save_steps": interval,
         "save_total_limit": train.keep_checkpoints,
         "logging_steps": 1,
         "dataloader_num_workers": train.workers,
         "dataloader_pin_memory": torch.cuda.is_available(),
         "remove_unused_columns": False,
-        # This also exempts the best checkpoint from deletion under `save_total_limit`.
+        # With this, `save_total_limit` never deletes the best checkpoint.
         "load_best_model_at_end": train.best_metric is not None,
         "metric_for_best_model": train.best_metric,
         "report_to": list(train.report_to) or "none",

@@ -1,4 +1,4 @@
-"""Check a loaded model and its longest input before the first step of a run, and describe them."""
+"""Check a loaded model and its longest input before the first step, and describe both in a log."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from conf.schema import RetrieverConfig, StudentConfig
 from data.records import RetrievalQuery
 from data.render.frame_cache import FrameReader
 from models.checks import check_widths
-from models.parameter_counts import check_towers, count_towers
+from models.parameter_counts import check_parameter_counts, count_parameters
 from models.retriever.embedder import Retriever, frame_input, query_input
 from models.retriever.multi_vector import find_scored_tokens
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
 
 
-def audit(
+def audit_student(
     model: nn.Module,
     processor: ProcessorMixin,
     cfg: StudentConfig,
     sample: Sample,
     collator: Collator,
 ) -> str:
-    """Return the parameter counts by tower, the vision tokens of the frames, and the longest
-    sample, decoded, with its supervised tokens between >>> and <<<.
+    """Return the parameter counts by tower, the sizes of the frames in vision tokens, and the
+    decoded longest sample, with its supervised tokens between >>> and <<<.
 
     Raises:
-        UserError: the counts differ from the preset, or the sample is too long.
+        UserError: the parameter counts contradict the preset, or the sample is too long.
     """
     batch = collator([sample])
     ids = batch["input_ids"][0].tolist()
-    prompt = len(ids) - int((batch["labels"] != IGNORED).sum())
-    supervised = [k >= prompt for k in range(len(ids))]
+    prompt_length = len(ids) - int((batch["labels"] != IGNORED).sum())
+    supervised = [k >= prompt_length for k in range(len(ids))]
     return "\n".join(
         [
             *describe_model(model, processor, cfg, batch),
@@ -53,12 +53,12 @@ def audit(
 def audit_retriever(
     model: Retriever, cfg: RetrieverConfig, query: RetrievalQuery, frames: FrameReader
 ) -> str:
-    """Return the parameter counts by tower, the vision tokens of the frames, and the longest query
-    and a frame, decoded, with the tokens whose vectors are scored between >>> and <<<.
+    """Return the parameter counts by tower, the sizes of the frames in vision tokens, and the
+    decoded longest query and its target, with the scored tokens between >>> and <<<.
 
     Raises:
-        UserError: the counts differ from the preset, the model is narrower than its widest width,
-            or the query is too long.
+        UserError: the parameter counts contradict the preset, the embeddings have fewer entries
+            than the widest width, or the query is too long.
     """
     if cfg.late is None:
         check_widths(cfg, model.get_embedding_dimension())
@@ -77,7 +77,7 @@ def audit_retriever(
     for name, inputs in (("the longest query", query_inputs), ("a frame", frame_inputs)):
         ids = inputs["input_ids"]
         if cfg.late is None:
-            # The embedding is the state of the last token.
+            # The embedding is the hidden state of the last token alone.
             scored = [k == ids.shape[1] - 1 for k in range(ids.shape[1])]
         else:
             mask = inputs["attention_mask"]
@@ -92,10 +92,10 @@ def describe_model(
     cfg: StudentConfig | RetrieverConfig,
     inputs: Mapping[str, Any],
 ) -> list[str]:
-    """Compare the parameter counts with the preset, and return them with the grids of vision tokens
-    (frames x rows x columns) in `inputs`."""
-    towers = count_towers(model)
-    check_towers(towers, cfg.name, cfg.quantization, cfg.lora.rank)
+    """Compare the parameter counts with the preset, and return lines with the counts and the grids
+    of vision tokens in `inputs` (time x rows x columns; a step of time is a pair of frames)."""
+    towers = count_parameters(model)
+    check_parameter_counts(towers, cfg.name, cfg.quantization, cfg.lora.rank)
     merge = processor.image_processor.merge_size
     grids = []
     for name, medium in (("video_grid_thw", "a video"), ("image_grid_thw", "an image")):
@@ -103,7 +103,7 @@ def describe_model(
             time, height, width = inputs[name][0].tolist()
             grids.append(f"{medium} of {time} x {height // merge} x {width // merge} tokens")
     return [
-        f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'whole'})",
+        f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'all weights'})",
         towers.map("{:,}".format).rename_axis(None).to_string(),
         f"frames of {cfg.image_size} x {cfg.image_size} px become {' and '.join(grids)}",
     ]
@@ -116,11 +116,11 @@ def describe_input(
     marked: Sequence[bool],
     meaning: str,
 ) -> list[str]:
-    """Return the number of tokens and the text of an input, with the marked tokens between >>> and
-    <<< and each run of vision tokens shortened to one."""
+    """Return two lines: the number of tokens of an input, and its text, with the marked tokens
+    between >>> and <<<, and of consecutive vision tokens only the first."""
     text = ""
-    for is_marked, run in groupby(zip(ids, marked, strict=True), itemgetter(1)):
-        decoded = tokenizer.decode([token for token, _ in run])
+    for is_marked, pairs in groupby(zip(ids, marked, strict=True), itemgetter(1)):
+        decoded = tokenizer.decode([token for token, _ in pairs])
         text += f">>>{decoded}<<<" if is_marked else decoded
     return [
         f"{name} has {len(ids)} tokens, {sum(marked)} of them {meaning}:",

@@ -15,17 +15,17 @@ from train.common.curves import plot_curves
 from train.common.journal import ANSWERS, CURVES, JOURNAL, read_journal, read_lines
 
 NOT_REPRODUCIBLE = ("_runtime", "_per_second", "total_flos", "train_loss")
-"""Endings of logged names that are left out of the journal: timings, and the trainer's mean loss,
-which counts only the steps since the run resumed."""
+"""Suffixes of logged names that the journal leaves out: timings, numbers of operations, and the
+trainer's mean loss, which in a resumed run counts only the steps since it resumed."""
 BAR_MEASURES = ("loss", "letter_accuracy", "token_accuracy", "recall@10")
-"""Endings of the measures that the progress bar shows."""
+"""Suffixes of the measures that the progress bar shows."""
 
 
 class JournalCallback(TrainerCallback):
     """Appends what the trainer logs to metrics.jsonl, and plots the curves with each checkpoint.
 
-    A resumed run first drops the lines after its checkpoint from metrics.jsonl and samples.jsonl,
-    so that both end as those of an uninterrupted run.
+    A run that resumes first deletes the lines of steps after its checkpoint from metrics.jsonl and
+    samples.jsonl, and a run that starts again deletes all lines.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -50,12 +50,12 @@ class JournalCallback(TrainerCallback):
 
 
 class BestCheckpointCallback(TrainerCallback):
-    """Refuses a train.best_metric that the evaluation at the start did not measure, and sets the
-    best checkpoint's folder from its step, on every rank.
+    """Raises UserError if the initial evaluation did not measure train.best_metric, and sets the
+    folder of the best checkpoint on every rank.
 
-    The library looks for the folder while it is written. With FSDP, whose checkpoints are written
-    in parts, that is too early: an earlier checkpoint remains the best, or the ranks disagree and
-    wait for each other forever at the end.
+    The library sets the folder only if it already exists on the disk. With FSDP, the ranks write a
+    checkpoint in parts, and some may not find it yet: then an earlier checkpoint remains the best,
+    or the ranks disagree and wait for each other forever at the end of the run.
     """
 
     def on_step_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
@@ -78,27 +78,27 @@ class BestCheckpointCallback(TrainerCallback):
 
 
 class EpochCallback(TrainerCallback):
-    """Calls `set_epoch` of datasets and samplers. A run that resumes within an epoch wraps its
-    sampler, and the library then no longer calls it."""
+    """Calls `set_epoch` of datasets and samplers at the beginning of each epoch. The library does
+    not reach a sampler that it has wrapped to resume within an epoch."""
 
-    def __init__(self, *followers: Any) -> None:
-        self._followers = followers
+    def __init__(self, *datasets_and_samplers: Any) -> None:
+        self._datasets_and_samplers = datasets_and_samplers
 
     def on_epoch_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        # The epoch is fractional where a run resumes within one.
-        for follower in self._followers:
-            follower.set_epoch(int(state.epoch or 0))
+        # The epoch is fractional if the run resumed within an epoch.
+        for part in self._datasets_and_samplers:
+            part.set_epoch(int(state.epoch or 0))
 
 
 class MetricsBar(ProgressCallback):
-    """The trainer's progress bar with the latest measures."""
+    """The library's progress bar, followed by the latest measures."""
 
     def __init__(self) -> None:
         super().__init__()
         self._latest: dict[str, float] = {}
 
     def on_prediction_step(self, args, state, control, **_) -> None:
-        """A bar for each evaluation would break the line of the run's bar."""
+        """Show no bar for an evaluation: it would break the line of the training bar."""
 
     def on_log(self, args, state, control, logs=None, **_) -> None:
         for name, value in (logs or {}).items():

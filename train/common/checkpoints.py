@@ -1,4 +1,4 @@
-"""Find the checkpoint that a run resumes from."""
+"""Find the checkpoint that a run resumes from, and check that checkpoints are complete."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ PARTS = {
     "random state": ("rng_state*.pth",),
     "trainer's state": (STATE,),
 }
-"""Parts of a checkpoint, each with the patterns of its files. Without some of them the trainer
-would resume without an error, with a new optimizer or other random numbers. If several ranks write
-a part each, the list of the parts (.metadata) is written last."""
+"""The parts of a checkpoint. Each part has patterns of files, at least one of which must match: if,
+say, the optimizer or the random state were missing, the trainer would resume without an error, but
+not as if it had never stopped. Of the files that FSDP writes, .metadata is written last."""
 READERS = {
     ".json": lambda path: json.loads(path.read_bytes()),
     ".safetensors": lambda path: safe_open(path, "pt"),
     # torch writes zip archives, whose table of contents is at the end.
     **dict.fromkeys((".pt", ".pth", ".bin"), lambda path: zipfile.ZipFile(path).close()),
 }
-"""Functions that fail on an incomplete file, by its suffix."""
+"""By suffix, a function that raises an error if a file is incomplete."""
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
     """Return the newest complete checkpoint in a run's folder, or None.
 
-    A warning names those that a kill, a crash or a full disk left incomplete.
+    Newer ones that a kill, a crash or a full disk left incomplete are skipped with a warning.
     """
     named = [(re.fullmatch(r"checkpoint-(\d+)", p.name), p) for p in folder.glob("checkpoint-*")]
     numbered = sorted(((int(m[1]), p) for m, p in named if m), reverse=True)
     for k, (_, path) in enumerate(numbered):
         if (problem := find_damage(path)) is None:
             return path
-        instead = "resuming from the one before" if k + 1 < len(numbered) else "starting again"
+        instead = "trying the one before" if k + 1 < len(numbered) else "training starts again"
         log.warning("%s is incomplete (%s): %s", path, problem, instead)
     return None
 
@@ -66,9 +66,9 @@ def check_best_checkpoint(checkpoint: Path, best_step: int | None) -> None:
 
 
 def find_damage(checkpoint: Path) -> str | None:
-    """Return what is missing or incomplete in a checkpoint, or None.
+    """Return a phrase that says what is missing or incomplete in a checkpoint, or None.
 
-    The trainer writes its state last, but a machine that crashes may lose any file.
+    The trainer writes its state last, but if the machine crashes, any file may be lost.
     """
     for part, patterns in PARTS.items():
         if not any(True for pattern in patterns for _ in checkpoint.glob(pattern)):

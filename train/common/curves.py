@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 DPI = 150
 COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
-"""Distinguishable with any colour vision (Paul Tol's bright set)."""
+"""Colors that people with any colour vision can distinguish (Paul Tol's bright set)."""
 
 
 def empty_figure(width: float, height: float) -> Figure:
@@ -29,16 +29,17 @@ def empty_figure(width: float, height: float) -> Figure:
 
 
 def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:
-    """Plot the losses over the steps, and each measure of the held-out samples below them.
+    """Plot the losses over the steps in one panel, and each other measure in a panel of its own.
 
     Args:
-        records: Lines of a run's journal, each with `step` and some of `loss`, `eval_loss`,
-            `eval_<name>_loss` and others.
+        records: Lines of a run's journal, each with `step` and with `loss` or measures `eval_*`.
+        path: The image file.
     """
     import pandas as pd
     from cycler import cycler
 
     table = pd.DataFrame([*records] or [{"step": 0}]).groupby("step").last()
+    # The columns of each panel, with the labels of their curves.
     panels: dict[str, dict[str, str]] = {"loss": {}}
     for key in sorted(k for k in table if k.startswith("eval_")):
         panel, label = panel_and_label(key.removeprefix("eval_"))
@@ -46,13 +47,13 @@ def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:
     columns = 1 if len(panels) <= 3 else 2
     rows = -(-len(panels) // columns)
     figure = empty_figure(8.5 * columns, 0.6 + 2.5 * rows)
-    panes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in panes[len(panels) :]:
+    all_axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in all_axes[len(panels) :]:
         axes.set_axis_off()
     if "loss" in table:
         training = table["loss"].dropna()
-        panes[0].plot(training, color="#999999", linewidth=1.2, label="training")
-    for axes, (panel, labels) in zip(panes, panels.items(), strict=False):
+        all_axes[0].plot(training, color="#999999", linewidth=1.2, label="training")
+    for axes, (panel, labels) in zip(all_axes, panels.items(), strict=False):
         axes.set_prop_cycle(cycler(linestyle=("-", ":", "--")) * cycler(color=COLORS))
         for key, label in labels.items():
             axes.plot(table[key].dropna(), linewidth=1.8, marker="o", markersize=4, label=label)
@@ -65,7 +66,8 @@ def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:
 
 
 def panel_and_label(measure: str) -> tuple[str, str]:
-    """Return the label of the axes on which a measure is plotted, and the label of its curve."""
+    """Return the panel in which a measure is plotted and the label of its curve, such as
+    ("letter accuracy", "answer event") for answer_letter_accuracy_event."""
     common = re.sub(r"_(event|time|window)$|@\d+$", "", measure).split("_")
     panel = common[-1:] if common[-1] == "loss" else common[-2:]
     rest = " ".join(word for word in measure.split("_") if word not in panel)

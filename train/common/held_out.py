@@ -1,4 +1,4 @@
-"""Held-out training scenes, on which runs are evaluated. Test scenes are never used in training."""
+"""Held-out training scenes, on which runs are evaluated while they train; no test scenes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from conf.errors import UserError
 from data.store import Store
 
-HELD_OUT = 0.1
+HELD_OUT_SHARE = 0.1
 """Share of the training scenes that are held out."""
 
 Row = TypeVar("Row")
@@ -19,12 +19,13 @@ Row = TypeVar("Row")
 def held_out_scenes(store: Store) -> set[str]:
     """Return the names of the held-out training scenes, at least one.
 
-    The choice depends on each scene's name only, not on a run's seed or on the other scenes: a base
-    must not have been trained on a scene that evaluates a student trained over it.
+    Whether a scene is held out depends on its name, not on a run's seed or on the other scenes.
+    The runs that train a base and a student over it thus hold out the same scenes.
     """
     names = store.scene_ids("train")
-    # A store of a few scenes may have none below the bound.
-    return {n for n in names if name_fraction(n) < HELD_OUT} or {min(names, key=name_fraction)}
+    # In a small benchmark, no scene may be below the share.
+    held_out = {name for name in names if name_fraction(name) < HELD_OUT_SHARE}
+    return held_out or {min(names, key=name_fraction)}
 
 
 def name_fraction(name: str) -> float:
@@ -33,15 +34,15 @@ def name_fraction(name: str) -> float:
 
 
 def shuffled(rows: list[Row], seed: int) -> list[Row]:
-    """Return the rows in an order that depends on the seed."""
+    """Return the rows in a random order, which the seed determines."""
     return [rows[k] for k in np.random.default_rng([seed, 2]).permutation(len(rows))]
 
 
 def check_not_empty(count: int, what: str) -> None:
-    """Raise UserError if nothing remains to train on or to evaluate."""
+    """Raise UserError if `count` is 0; `what` names the missing items, queries or rationales."""
     if count == 0:
         raise UserError(
-            f"no {what} remain: see the shortfalls that python -m data.build prints and the "
-            "rejects that python -m teacher.narrate prints",
+            f"there are no {what}: see the shortfalls that python -m data.build prints and the "
+            "rejected rationales that python -m teacher.narrate prints",
             code="no-training-data",
         )

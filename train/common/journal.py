@@ -1,4 +1,4 @@
-"""A run's journal: what was logged while it trained."""
+"""A run's journal: the losses and measures that its trainer logged, one JSON line per log."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from conf.runs import read_json_lines
 
 JOURNAL = "metrics.jsonl"
 ANSWERS = "samples.jsonl"
-"""A student's answers at each evaluation of its run, one JSON line each."""
+"""The answers that a student generated at each evaluation, one JSON line per answer."""
 CURVES = "curves.png"
 BEST_STEP = "best_step"
-"""Name of the kept checkpoint's step among a run's metrics."""
+"""Name, among a run's metrics, of the step of the best checkpoint."""
 
 
 def read_journal(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of a run's metrics.jsonl without a line that a kill cut off."""
+    """Return the lines of the metrics.jsonl in a run's folder, as `read_lines` does."""
     return read_lines(folder / JOURNAL)
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Return the JSON lines of a file that have a step."""
+    """Return the JSON lines of a file that have a step. Lines that a kill cut off are skipped; a
+    missing file has no lines."""
     records = read_json_lines(path) if path.exists() else ()
     return [record for record in records if "step" in record]
 
 
 def run_metrics(folder: Path, best_step: int | None = None) -> dict[str, float]:
-    """Return a run's metrics: `<name>_at_start` of the first evaluation and `<name>` of the kept
-    weights, which are those of the last step or of `best_step`."""
+    """Return a run's metrics: `<name>_at_start` from the first evaluation, and `<name>` from the
+    evaluation of the weights that were kept, those of `best_step` or else of the last step."""
     records = [r for r in read_journal(folder) if any(k.startswith("eval_") for k in r)]
     metrics: dict[str, float] = {}
     if best_step is not None:

@@ -1,4 +1,4 @@
-"""Compare the outputs of a merged model with those of the trained one."""
+"""Compare the outputs of a merged model with those of the trained model."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from data.store import Store
 
 @dataclass(frozen=True)
 class ModelOutputs:
-    """What a model returns for held-out items.
+    """The outputs of a model for held-out items or queries, by name.
 
     Attributes:
-        values: Tensors by name, such as logits.
-        choices: What the model chooses for each item, by name.
-        scales: By name, the tensors whose size a difference is relative to; by default the values.
+        values: Tensors, such as logits.
+        choices: The index of what the model chooses for each item or query.
+        scales: Tensors to whose size a difference is relative; by default, the values themselves.
     """
 
     values: dict[str, list[torch.Tensor]]
@@ -30,8 +30,8 @@ class ModelOutputs:
 
 
 def compare(before: ModelOutputs, after: ModelOutputs) -> dict[str, float]:
-    """Root mean square differences relative to the size of the values (`<name>_difference`), and
-    the share of equal choices (`<name>_agreement`)."""
+    """Return the root mean square of the differences between values, relative to that of their
+    scales (`<name>_difference`), and the share of equal choices (`<name>_agreement`)."""
     measured: dict[str, float] = {}
     for name, values in before.values.items():
         changes = [b - a for b, a in zip(values, after.values[name], strict=True)]
@@ -49,15 +49,15 @@ def root_mean_square(tensors: Sequence[torch.Tensor]) -> float:
 
 
 def open_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
-    """Open the benchmark on which merged weights are compared.
+    """Open the benchmark on which a merged model is compared with the trained model.
 
     Raises:
-        UserError: It is missing; an export does not build it.
+        UserError: The benchmark is missing. An export does not build it.
     """
     if not (folder := root / cfg.name).exists():
         raise UserError(
-            f"{folder} is missing, and the export compares the merged weights with the trained "
-            "ones on its held-out items: build it with python -m data.build, or set verify=false",
+            f"{folder} is missing, and the export compares the merged with the trained model on "
+            "its held-out scenes: build it with python -m data.build, or set verify=false",
             code="missing-benchmark",
         )
     return ensure_benchmark(cfg, root, workers)

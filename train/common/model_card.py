@@ -1,4 +1,4 @@
-"""The model card of an export, from the records of its training run."""
+"""Build the model card of an export from the records of its training run."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def model_card(
     """Return the card of an export.
 
     Args:
-        name: The training run.
-        settings: Its settings.
-        folder: Its folder.
-        format: What was exported: bf16, fp32 or adapter.
-        measured: Differences between the exported and the trained model.
+        name: Name of the training run.
+        settings: Settings of the training run.
+        folder: Folder of the training run.
+        format: bf16, fp32 or adapter.
+        measured: What `train.common.merge.compare` returned; empty without a comparison.
     """
     student = isinstance(settings, SftCommand)
     product = "student" if student else "retriever"

@@ -1,4 +1,4 @@
-"""Run a trainer from its start or a checkpoint to its end, and turn library errors into advice."""
+"""Run a trainer to its last step, and turn errors of the libraries into advice for the user."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from train.common.checkpoints import STATE, check_best_checkpoint
 
 log = logging.getLogger(__name__)
 
-SERIALIZED = f"{UserError.__module__}.{UserError.__qualname__}: "
-"""What precedes the message of a UserError in the traceback of another process."""
+MESSAGE_PREFIX = f"{UserError.__module__}.{UserError.__qualname__}: "
+"""The text before the message of a UserError in the traceback of another process."""
 
 
 def run_training(
@@ -34,14 +34,14 @@ def run_training(
     """Train from the start or a checkpoint, and keep the journal and the curves.
 
     Args:
-        memory_settings: The settings to lower when memory runs out.
+        memory_settings: The settings that the error for running out of memory advises to lower.
 
     Returns:
-        The step of the best checkpoint, whose weights the trainer's model then has, if
-        train.best_metric names a measure; else None.
+        If train.best_metric is set, the step of the best checkpoint, whose weights the trainer's
+        model then has. Otherwise None, and the model has the weights of the last step.
 
     Raises:
-        UserError: memory runs out, no evaluation has the measure of train.best_metric, or a worker
+        UserError: memory runs out, the evaluations do not measure train.best_metric, or a worker
             process or another rank raises a UserError.
     """
     add_callbacks(trainer, run)
@@ -60,7 +60,7 @@ def run_training(
 
 
 def add_callbacks(trainer: Trainer, run: Run) -> None:
-    """Add the progress bar, the journal, the checks, and the trackers' settings."""
+    """Add the progress bar, the journal and the check of train.best_metric, and set up W&B."""
     trainer.remove_callback(ProgressCallback)
     trainer.remove_callback(PrinterCallback)
     trainer.add_callback(MetricsBar())
@@ -68,14 +68,15 @@ def add_callbacks(trainer: Trainer, run: Run) -> None:
         trainer.add_callback(JournalCallback(run.folder))
     trainer.add_callback(BestCheckpointCallback())
     if "wandb" in trainer.args.report_to:
-        # A resumed run is the same run at W&B; its files belong into the run's folder.
+        # Keep W&B's files in the run's folder; a resumed run continues the same run at W&B.
         wandb = {"DIR": run.folder, "PROJECT": PROJECT, "RUN_ID": run_id(run), "RESUME": "allow"}
         for name, value in wandb.items():
             os.environ.setdefault(f"WANDB_{name}", str(value))
 
 
 def train_to_last_step(trainer: Trainer, checkpoint: Path | None) -> None:
-    """Train from the start or a checkpoint; after the last step, only load the final weights."""
+    """Train from the start or from a checkpoint. If the checkpoint is that of the last step, only
+    load the final weights: those of the best checkpoint, if there is one."""
     if checkpoint is not None:
         log.info("resuming from %s", checkpoint)
         state = TrainerState.load_from_json(str(checkpoint / STATE))
@@ -92,44 +93,44 @@ def train_to_last_step(trainer: Trainer, checkpoint: Path | None) -> None:
 
 
 @contextmanager
-def explain_errors(when: str, lower: str) -> Iterator[None]:
-    """Turn library errors that the user can correct into a UserError.
+def explain_errors(when: str, advice: str) -> Iterator[None]:
+    """Turn errors of the libraries that the user can correct into a UserError.
 
     Args:
-        when: What the program is doing.
-        lower: The settings to lower when memory runs out.
+        when: What the program is doing, such as "while training".
+        advice: What to do if memory runs out.
     """
     try:
-        with explain_out_of_memory(when, lower):
+        with explain_out_of_memory(when, advice):
             yield
     except RuntimeError as error:
-        if SERIALIZED not in str(error):
+        if MESSAGE_PREFIX not in str(error):
             raise
-        # The error of another rank, whose traceback the library includes.
+        # A UserError of another rank, whose traceback is part of the library's message.
         raise UserError(user_message(error), code="failed-rank") from error
     except UserError as error:
         raise UserError(user_message(error), code=error.code) from error
 
 
 def explain_load_errors(group: str) -> AbstractContextManager[None]:
-    """Apply `explain_errors` while a student or retriever is loaded."""
+    """Return `explain_errors` for the loading of a model; `group` is student or retriever."""
     advice = f"set {group}.quantization=nf4, or give a smaller {group}.model"
     return explain_errors(f"while loading the {group}", advice)
 
 
 def user_message(error: Exception) -> str:
     """Return an error's message without the traceback of a worker process or of another rank."""
-    return str(error).rpartition(SERIALIZED)[2].strip()
+    return str(error).rpartition(MESSAGE_PREFIX)[2].strip()
 
 
 def check_fsdp(trainer: Trainer, checkpoint: Path | None) -> None:
-    """Raise UserError if the launcher's FSDP cannot train here, or if a run that was started with
-    FSDP is resumed without it, or the reverse."""
+    """Raise UserError if the launcher requests FSDP that cannot be used, or if a run that was
+    started with FSDP resumes without it, or the reverse."""
     fsdp = trainer.is_fsdp_enabled
     if is_sharded() and not fsdp:
         raise UserError(
-            "accelerate has FSDP for several GPUs only and would train without it: start without "
-            "--use_fsdp (and with --multi_gpu, on CPUs too)",
+            "accelerate uses FSDP on several GPUs only, and would train without it here: start "
+            "without --use_fsdp; for several ranks, also on CPUs, give --multi_gpu",
             code="unsupported-with-fsdp",
         )
     if fsdp and trainer.accelerator.state.fsdp_plugin.fsdp_version != 2:
@@ -140,8 +141,8 @@ def check_fsdp(trainer: Trainer, checkpoint: Path | None) -> None:
     if checkpoint is not None and any(checkpoint.glob("pytorch_model_fsdp*")) != fsdp:
         started = "without" if fsdp else "with"
         raise UserError(
-            f"{checkpoint} was written {started} FSDP: start the run {started} it again, on any "
-            "number of ranks, or start another one with run=NAME",
+            f"{checkpoint} was written {started} FSDP: resume the run {started} FSDP, on any "
+            "number of ranks, or start another run with run=NAME",
             code="other-launch",
         )
 
@@ -149,7 +150,7 @@ def check_fsdp(trainer: Trainer, checkpoint: Path | None) -> None:
 def load_weights(trainer: Trainer, checkpoint: Path) -> None:
     """Load a checkpoint's weights without resuming from it."""
     if trainer.is_fsdp_enabled:
-        # A sharded checkpoint needs a sharded model, and accelerate shards it with its optimizer.
+        # A sharded checkpoint needs a sharded model; accelerate shards a model with its optimizer.
         trainer.create_optimizer()
         trainer.accelerator.prepare(trainer.model, trainer.optimizer)
     trainer._load_from_checkpoint(str(checkpoint))

@@ -1,4 +1,4 @@
-"""The queries that a retriever is trained on and measured on, and how batches are composed."""
+"""Choose the queries that train and evaluate a retriever, and compose batches of them."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 
 
 def split_queries(
-    store: Store, batch: int, negatives: int, validation: int, seed: int
+    store: Store, batch: int, negatives: int, max_validation: int, seed: int
 ) -> tuple[list[RetrievalQuery], list[RetrievalQuery]]:
-    """The training queries, and up to `validation` queries of held-out training scenes.
+    """Return the training queries, and up to `max_validation` queries of held-out training scenes.
 
     Raises:
-        UserError: There are none, or fewer than a batch; or `check_training` raises.
+        UserError: One list is empty, a batch cannot be filled, or `check_training` raises.
     """
     queries = store.retrieval("train")
     check_training(store, queries, negatives)
     held_out = held_out_scenes(store)
     training = [q for q in queries if q.scene_id not in held_out]
-    # The benchmark lists queries by builder: a shuffled part has queries of every builder.
-    measured = shuffled([q for q in queries if q.scene_id in held_out], seed)[:validation]
+    # The benchmark lists the queries by type of question; a shuffled part has all types.
+    validation = shuffled([q for q in queries if q.scene_id in held_out], seed)[:max_validation]
     check_not_empty(len(training), "training queries")
-    check_not_empty(len(measured), "queries of held-out training scenes")
+    check_not_empty(len(validation), "queries of held-out training scenes")
     if len(training) < batch:
         raise UserError(
             f"train.batch={batch} is more than the {len(training)} training queries of "
             f"{store.folder}: lower it",
             code="batch-too-large",
         )
-    return training, measured
+    return training, validation
 
 
 class QueryBatchSampler(DefaultBatchSampler):
-    """Random batches in which, as far as possible, no query's target is a document of another
-    query.
+    """Composes random batches in which, if possible, no query's target is a document (the target or
+    a hard negative) of another query.
 
-    A batch holds `batch` queries over all ranks, in equal consecutive shares, so that its content
-    is independent of the world size. Queries that do not fill a batch wait for another epoch.
+    A batch has the same `batch` queries whatever the number of ranks; the sampler yields an equal
+    part of it for each rank. Queries that do not fill another batch are left out of the epoch.
 
     Args:
         queries: The training queries.
-        negatives: Hard negatives of each query that are documents of its batch.
-        batch: Queries in a batch, over all ranks.
-        seed: With the epoch, determines the order.
+        negatives: Number of hard negatives of each query that are among its documents.
+        batch: Queries per batch, over all ranks.
+        seed: Determines the order, together with the epoch.
         world_size: Number of ranks.
     """
 
@@ -80,22 +80,22 @@ class QueryBatchSampler(DefaultBatchSampler):
                 yield batch[start : start + self.batch_size]
 
     def _next_batch(self, waiting: list[int]) -> tuple[list[int], list[int]]:
-        """The next batch of the waiting queries, and the queries that still wait."""
+        """Return the next batch of the waiting queries, and the queries that still wait."""
         batch, postponed = [], []
-        targets: set[FrameRef] = set()
-        ranked: set[FrameRef] = set()
+        batch_targets: set[FrameRef] = set()
+        batch_documents: set[FrameRef] = set()
         for position, k in enumerate(waiting):
             query = self._queries[k]
             documents = set(documents_of(query, self._negatives))
-            if query.target in ranked or documents & targets:
+            if query.target in batch_documents or documents & batch_targets:
                 postponed.append(k)
                 continue
             batch.append(k)
-            targets.add(query.target)
-            ranked |= documents
+            batch_targets.add(query.target)
+            batch_documents |= documents
             if len(batch) == self._batch:
                 return batch, postponed + waiting[position + 1 :]
-        # Too few of the remaining queries are compatible: the loss masks identical frames.
+        # Too few queries are compatible. Add others: the loss masks identical frames.
         missing = self._batch - len(batch)
         return batch + postponed[:missing], postponed[missing:]
 
@@ -103,12 +103,12 @@ class QueryBatchSampler(DefaultBatchSampler):
 def batch_columns(
     queries: Sequence[RetrievalQuery], negatives: int
 ) -> list[list[RetrievalQuery | FrameRef]]:
-    """Return the columns of a batch as `train.retriever.loss` takes them: the queries, their
-    targets, then a column for each hard negative."""
+    """Return the columns of a batch for `RankingLoss`: the queries, their targets, then a column
+    for each hard negative."""
     documents = (documents_of(query, negatives) for query in queries)
     return [list(queries), *map(list, zip(*documents, strict=True))]
 
 
 def documents_of(query: RetrievalQuery, negatives: int) -> list[FrameRef]:
-    """Return a query's target and its first hard negatives."""
+    """Return a query's target and its first `negatives` hard negatives."""
     return [query.target, *query.hard_negatives[:negatives]]

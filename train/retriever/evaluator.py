@@ -1,4 +1,4 @@
-"""Rank frames of held-out training scenes while a retriever is trained."""
+"""Evaluate a retriever during training: it ranks frames of held-out training scenes."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from data.tracks.retrieval.database import UniqueFrames
 from models.retriever.embedder import Retriever, embed
 
 FRAME_STEP = 6
-"""Interval of the frames of a held-out scene that are candidates for the database."""
+"""Interval, in frames, between the frames of a scene that are considered for the database."""
 RECALLS = (1, 10, 50)
+"""The values of k for which recall@k is measured."""
 
 
 def build_database(queries: Sequence[RetrievalQuery], store: Store) -> list[FrameRef]:
-    """Return a small database in the order of the scenes: the queries' targets, and every
-    `FRAME_STEP`th frame of their scenes that looks different from all others."""
+    """Return a small database, sorted by scene and frame: the queries' targets, and those of every
+    `FRAME_STEP`th frame of their scenes that look different from all frames in the database."""
     targets = {q.target: None for q in queries}
     unique = UniqueFrames(store.scene)
     for target in targets:
@@ -34,14 +35,14 @@ def build_database(queries: Sequence[RetrievalQuery], store: Store) -> list[Fram
 
 
 class HeldOutEvaluator(BaseEvaluator):
-    """Measures recall and the mean reciprocal rank of the queries' targets in a database, at the
-    full width.
+    """Measures recall@k and the mean reciprocal rank of the queries' targets in a database, at the
+    full width of the embeddings.
 
-    Frames with equal scores rank in the order of the database; in `evaluation.retrieve` they share
-    their rank.
+    Frames with equal scores are ranked in the order of the database. In `evaluation.retrieve`, they
+    share a rank.
 
     Args:
-        batch: Queries or frames of which pixels are in memory at a time.
+        batch: Number of queries or frames per rank whose pixels are in memory at a time.
     """
 
     def __init__(
@@ -60,11 +61,12 @@ class HeldOutEvaluator(BaseEvaluator):
     def __call__(
         self, model: Retriever, output_path=None, epoch: int = -1, steps: int = -1
     ) -> dict[str, float]:
-        queries, documents = (
+        query_vectors, frame_vectors = (
             embed(model, items, self._frames, self._cfg, self._batch)
             for items in (self._queries, self._database)
         )
-        order = model.similarity(queries, documents).argsort(dim=1, descending=True, stable=True)
+        scores = model.similarity(query_vectors, frame_vectors)
+        order = scores.argsort(dim=1, descending=True, stable=True)
         targets = torch.tensor([self._database.index(q.target) for q in self._queries])
         ranks = (1 + (order.cpu() == targets[:, None]).int().argmax(dim=1)).tolist()
         recalls = {f"recall@{k}": sum(rank <= k for rank in ranks) / len(ranks) for k in RECALLS}

@@ -15,19 +15,19 @@ from models.retriever.embedder import Item, Retriever, model_inputs
 from models.student.collator import MEDIA
 
 FEATURES = "vision_features"
-"""Prefix, before a kind of media, of the vision tower's outputs among a model's inputs."""
+"""Prefix of the inputs that hold outputs of the vision tower, such as vision_features_image."""
 
 
 class RetrieverInputs:
-    """Loads the inputs of one mini-batch at a time, so that memory is independent of the batch.
+    """Loads the inputs of one mini-batch at a time: memory does not depend on the batch size.
 
     Args:
-        model: The retriever; its backbone gets a hook that accepts outputs of its vision tower.
-        frames: Pixels of the benchmark's frames.
-        cfg: The retriever's preset: its instructions and the frames of a prefix.
+        model: The retriever. Its backbone gets the hook `pass_features`.
+        frames: Reads the pixels of the benchmark's frames.
+        cfg: The retriever's preset, with its instructions and the number of frames of a prefix.
         bf16: Whether the vision tower computes in bf16.
-        reuse_features: Whether the frozen vision tower's outputs of a step's first pass are kept
-            for its second pass.
+        reuse_features: Whether to compute the outputs of the frozen vision tower in the first pass
+            of a step only, and to keep them for the second pass.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class RetrieverInputs:
         model[0].register_forward_pre_hook(pass_features)
 
     def load(self, items: Sequence[Item]) -> dict[str, Any]:
-        """Return the inputs of queries, or of frames, on the CPU."""
+        """Return the inputs of queries or of frames, on the CPU."""
         kept = self._kept.pop(tuple(items), None)
         if kept is not None:
             return kept
@@ -55,8 +55,8 @@ class RetrieverInputs:
         self, items: Sequence[Item], inputs: dict[str, Any], first_pass: bool
     ) -> dict[str, Any]:
         """Move loaded inputs to the model's device. In a first pass with `reuse_features`, also
-        replace the pixels by the vision tower's outputs, which the next `load` of these items
-        returns."""
+        replace the pixels by the vision tower's outputs, and keep the result, which the next `load`
+        of the same items returns."""
         inputs = send_to_device(inputs, self._model.device, non_blocking=True)
         if first_pass and self._reuse:
             inputs = self._encode_media(inputs)
@@ -64,6 +64,7 @@ class RetrieverInputs:
         return inputs
 
     def _encode_media(self, inputs: dict[str, Any]) -> dict[str, Any]:
+        """Return inputs in which the vision tower's outputs replace the pixels."""
         encoded = dict(inputs)
         for kind, (pixels, grid) in MEDIA.items():
             if pixels in encoded:
@@ -75,8 +76,8 @@ class RetrieverInputs:
 
 
 def pass_features(module: Any, args: tuple[dict[str, Any]]) -> None:
-    """Pass kept outputs of the vision tower to the backbone, under the name that its `forward`
-    has for them. This is a hook that is called before that `forward`."""
+    """Forward pre-hook of a backbone: rename kept outputs of the vision tower to the input in which
+    Qwen3-VL takes them instead of pixels."""
     (inputs,) = args
     kept = {kind: inputs.pop(f"{FEATURES}_{kind}", None) for kind in MEDIA}
     if outputs := {k: encoder_outputs(layers) for k, layers in kept.items() if layers is not None}:

@@ -1,8 +1,9 @@
 """The retriever's loss: multiple-negatives ranking at several widths, with cached gradients.
 
-As in GradCache (Gao et al., 2021), a batch is embedded twice, a mini-batch at a time: first without
-gradients, for the loss and its gradients with respect to the embeddings, and then to propagate
-these. Inputs are loaded when a pass reaches them. Memory is thus independent of the batch.
+As in GradCache (Gao et al., 2021), a batch is embedded twice, one mini-batch at a time. The first
+pass, without gradients, computes embeddings, from which the loss and its gradients with respect to
+the embeddings are computed. The second pass propagates these gradients to the weights. Each pass
+loads the inputs of a mini-batch when it reaches it, so memory does not depend on the batch size.
 """
 
 from __future__ import annotations
@@ -33,17 +34,19 @@ Out = TypeVar("Out")
 
 
 class RankingLoss(nn.Module):
-    """The cross entropy of each query's target among the documents of all ranks, summed over
-    widths. A document that is the same frame as a query's target is not a negative of that query.
+    """The cross entropy of each query's target among all documents, summed over widths.
+
+    Documents are the targets and hard negatives of all queries of a batch, on all ranks. A document
+    that is the same frame as a query's target is not a negative of that query.
 
     Args:
         model: The retriever.
         inputs: Loads the inputs of a mini-batch.
-        widths: How many leading entries of the vectors are scored.
-        weights: Of the widths' losses; None weighs each by 1.
+        widths: Embedding sizes. The loss at a width scores that many leading entries of a vector.
+        weights: Weight of the loss at each width; None weights every width by 1.
         scale: Inverse temperature of the scores.
-        mini_batch: Queries or frames in a mini-batch; the gradients are independent of it.
-        prefetch: Mini-batches that a thread loads ahead.
+        mini_batch: Queries or frames per mini-batch. The gradients do not depend on it.
+        prefetch: Number of mini-batches that a thread loads in advance.
     """
 
     def __init__(
@@ -58,17 +61,18 @@ class RankingLoss(nn.Module):
         prefetch: int = 0,
     ) -> None:
         super().__init__()
-        # The trainer replaces it by its wrapper for several ranks.
+        # With several ranks, the trainer replaces this attribute by the model wrapped in DDP.
         self.model = model
         self._inputs = inputs
         self._widths, self._weights = widths, weights or [1.0] * len(widths)
         self._scale, self._mini_batch, self._prefetch = scale, mini_batch, prefetch
 
     def forward(self, columns: Sequence[Sequence[Item]], labels: None = None) -> torch.Tensor:
-        """Return the loss of a batch, whose `backward` propagates the cached gradients.
+        """Return the loss of a batch. Its `backward` runs the second pass.
 
         Args:
             columns: The queries, their targets, then a column for each hard negative.
+            labels: Not used; the trainer passes None.
 
         Raises:
             UserError: an embedding is not finite.
@@ -93,6 +97,7 @@ class RankingLoss(nn.Module):
     def _load(
         self, parts: Sequence[Sequence[Item]], first_pass: bool
     ) -> Iterator[tuple[Sequence[Item], dict[str, Any]]]:
+        """Yield each mini-batch with its inputs on the model's device."""
         loaded = prefetched(self._inputs.load, parts, self._prefetch)
         for part, inputs in zip(parts, loaded, strict=True):
             yield part, self._inputs.prepare(part, inputs, first_pass)
@@ -100,9 +105,9 @@ class RankingLoss(nn.Module):
     def _embed(
         self, part: Sequence[Item], inputs: dict[str, Any]
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (items, vectors, width), and (items, vectors) whether a vector is scored."""
+        """Return vectors (items, vectors, width), and a mask (items, vectors) of scored vectors."""
         task = "document" if isinstance(part[0], FrameRef) else "query"
-        # Of the outputs, torch's wrapper for several ranks only finds those in a plain dict.
+        # The outputs have the type of the inputs, and DDP finds their tensors in a plain dict only.
         outputs = self.model(dict(inputs), task=task)
         if (single := outputs.get("sentence_embedding")) is not None:
             return single[:, None], single.new_ones(len(single), 1, dtype=torch.bool)
@@ -114,7 +119,7 @@ class RankingLoss(nn.Module):
         vectors: Sequence[torch.Tensor],
         masks: Sequence[torch.Tensor],
     ) -> torch.Tensor:
-        """Return the loss of embeddings by mini-batches."""
+        """Return the loss of a batch, given the vectors and masks of its mini-batches."""
         split = math.ceil(len(columns[0]) / self._mini_batch)
         queries, query_mask = cat_padded_token_embeddings(vectors[:split], masks[:split])
         documents, document_mask = cat_padded_token_embeddings(vectors[split:], masks[split:])
@@ -126,8 +131,8 @@ class RankingLoss(nn.Module):
         identical = identical_frames(frames, targets)
         loss = torch.zeros((), device=queries.device)
         for width, weight in zip(self._widths, self._weights, strict=True):
-            ours, theirs = (normalize(v[..., :width], dim=-1) for v in (queries, documents))
-            scores = self._scale * maxsim(ours, theirs, query_mask, document_mask)
+            cut = [normalize(v[..., :width], dim=-1) for v in (queries, documents)]
+            scores = self._scale * maxsim(*cut, query_mask, document_mask)
             loss += weight * cross_entropy(scores.masked_fill(identical, -torch.inf), targets)
         return loss
 
@@ -138,20 +143,20 @@ class RankingLoss(nn.Module):
         gradients: Sequence[torch.Tensor],
         factor: torch.Tensor,
     ) -> None:
-        """Embed again with the same dropout, and propagate `factor` times the gradients."""
+        """Embed again, with the same dropout, and propagate `factor` times the gradients."""
         for k, (part, inputs) in enumerate(self._load(parts, first_pass=False)):
             # Ranks average their gradients once, after the last mini-batch.
-            waits = k < len(parts) - 1 and world_size() > 1
-            with self.model.no_sync() if waits else nullcontext(), torch.enable_grad(), states[k]:
+            defer = k < len(parts) - 1 and world_size() > 1
+            with self.model.no_sync() if defer else nullcontext(), torch.enable_grad(), states[k]:
                 embedded, _ = self._embed(part, inputs)
                 (factor * (embedded.float() * gradients[k].float()).sum()).backward()
 
 
 def identical_frames(frames: Sequence[FrameRef], targets: torch.Tensor) -> torch.Tensor:
-    """Return (targets, frames): whether a frame equals the target frame at another position.
+    """Return a mask (targets, frames) of the frames that equal a target but are at other positions.
 
     Args:
-        targets: Positions of targets among `frames`.
+        targets: Positions of the targets among `frames`.
     """
     numbers = {frame: k for k, frame in enumerate(frames)}
     codes = torch.tensor([numbers[frame] for frame in frames], device=targets.device)
@@ -160,10 +165,10 @@ def identical_frames(frames: Sequence[FrameRef], targets: torch.Tensor) -> torch
 
 
 def prefetched(load: Callable[[In], Out], items: Sequence[In], ahead: int) -> Iterator[Out]:
-    """Yield `load(item)` of each item in order, up to `ahead` of them loaded in advance by a single
-    thread: several must not share a tokenizer."""
+    """Yield `load(item)` of each item in order. A thread loads up to `ahead` items in advance; only
+    one thread, because threads must not share a tokenizer."""
     if not ahead:
-        # Without a thread: its own pool of OpenMP threads would compete with the model's for cores.
+        # Use no thread: its own pool of OpenMP threads would compete with the model's for cores.
         yield from map(load, items)
         return
     with ThreadPoolExecutor(1) as pool:

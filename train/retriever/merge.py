@@ -25,6 +25,7 @@ from train.retriever.batches import split_queries
 MAX_QUERIES = 64
 """Maximum number of held-out queries. Each is scored against the targets of all these queries."""
 BATCH = 8
+"""Number of queries or frames that are embedded at a time."""
 
 HeldOut = tuple[list[RetrievalQuery], FrameReader]
 
@@ -33,8 +34,8 @@ HeldOut = tuple[list[RetrievalQuery], FrameReader]
 class RetrieverMerge:
     """Merges a retriever, and computes its outputs before and after.
 
-    Differences of scores are relative to the score of a query with itself, because scores may all
-    be close to zero.
+    Differences of scores are relative to the scores of the queries with themselves, because all
+    scores of frames may be close to zero.
 
     Attributes:
         settings: The settings of the training run.
@@ -44,11 +45,11 @@ class RetrieverMerge:
     settings: ContrastiveCommand
     saved: Path
     max_difference = 0.1
-    """Largest accepted relative difference. Rounding to bf16 causes up to 0.03 in small retrievers,
-    whose adapters change as much as their base gives."""
+    """Largest accepted relative difference. Rounding to bf16 causes up to 0.03 in small retrievers
+    whose adapters contribute as much to the outputs as their base."""
 
     def held_out(self, root: Path, workers: int) -> HeldOut:
-        """Return validation queries of the run, and a reader of the benchmark's frames."""
+        """Return some validation queries of the run, and a reader of the benchmark's frames."""
         settings, train = self.settings, self.settings.train
         store = open_benchmark(settings.benchmark, root, workers)
         _, queries = split_queries(
@@ -57,11 +58,10 @@ class RetrieverMerge:
         return queries[:MAX_QUERIES], FrameReader(store, settings.retriever.image_size)
 
     def trained_outputs(self, items: HeldOut) -> ModelOutputs:
-        """Return the outputs of the adapters over their base."""
+        """Return the outputs of the trained retriever, the adapters over their base."""
         settings = self.settings
         model = load_trained(settings.retriever, settings.train.precision, self.saved)
-        # Keep the 4-bit weights as trained: some CPUs round products of repacked weights
-        # differently, which would add to the measured difference.
+        # Prevent a CPU from repacking 4-bit weights for inference, which changes the rounding.
         compat.keep_differentiable(model)
         return self._outputs(model, items)
 
@@ -77,7 +77,7 @@ class RetrieverMerge:
         model.save_pretrained(str(folder), create_model_card=False)
 
     def merged_outputs(self, folder: Path, items: HeldOut) -> ModelOutputs:
-        """Return the outputs of the merged model in a folder."""
+        """Return the outputs of the merged retriever in a folder."""
         return self._outputs(load_merged(folder, self.settings.retriever), items)
 
     def _outputs(self, model: Retriever, items: HeldOut) -> ModelOutputs:

@@ -46,25 +46,25 @@ def build_trainer(
     """Audit the model and the longest query, and return a trainer.
 
     Args:
-        cfg: Settings with a resolved precision.
-        rank_batch: Queries that each rank contributes to a step.
+        cfg: Settings whose train.precision is bf16 or fp32, not auto.
+        rank_batch: Queries per step and rank.
         checkpoint: The checkpoint that the run resumes from, or None.
 
     Raises:
-        UserError: the model is not what its preset says, or the longest query is too long.
+        UserError: the model does not fit its preset, or the longest query is too long.
     """
     train, retriever = cfg.train, cfg.retriever
     frames = FrameReader(store, retriever.image_size)
     log.info(audit_retriever(model, retriever, longest_query(training, model.tokenizer), frames))
     negatives = train.hard_negatives
     sampler = QueryBatchSampler(training, negatives, train.batch, cfg.seed, world_size())
-    # The dataset holds numbers; the loss loads pixels, and prefetches them itself.
+    # The dataset has only query numbers: the loss itself loads the pixels, without workers.
     common = common_arguments(train, run, cfg.seed, checkpoint) | {"dataloader_num_workers": 0}
     if retriever.late is None:
-        trainer, arguments = RetrieverTrainer, SentenceTransformerTrainingArguments
+        trainer_type, arguments = RetrieverTrainer, SentenceTransformerTrainingArguments
     else:
-        trainer, arguments = MultiVectorTrainer, MultiVectorEncoderTrainingArguments
-    return trainer(
+        trainer_type, arguments = MultiVectorTrainer, MultiVectorEncoderTrainingArguments
+    return trainer_type(
         model=model,
         args=arguments(**common, per_device_train_batch_size=rank_batch, dataloader_drop_last=True),
         train_dataset=numbered_rows(len(training)),
@@ -85,7 +85,7 @@ def build_loss(
     model: Retriever,
     frames: FrameReader,
 ) -> RankingLoss:
-    """Return the ranking loss; a retriever with many vectors has a single width."""
+    """Return the ranking loss. A retriever with many vectors per input has a single width."""
     bf16 = train.precision == "bf16"
     return RankingLoss(
         model,

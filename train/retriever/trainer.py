@@ -1,8 +1,8 @@
-"""sentence-transformers' trainers on batches of query numbers.
+"""Trainers of sentence-transformers whose batches are the numbers (indices) of queries.
 
 The library's collator would load the pixels of a whole batch, and its sampler would put queries
-with the same frames into one batch. Here a batch holds the numbers of queries that
-`QueryBatchSampler` chose, and the loss loads their pixels.
+with the same frames into one batch. Here `QueryBatchSampler` chooses the queries of a batch, and
+the loss loads their pixels.
 """
 
 from __future__ import annotations
@@ -21,28 +21,27 @@ from models.retriever.embedder import ADAPTERS, Item, load_adapters
 from train.retriever.batches import QueryBatchSampler
 
 NUMBER = "query"
-"""The column of a training row: the number of its query."""
+"""Name of the only column of the training dataset: the number of a query."""
 
 
 def numbered_rows(count: int) -> Dataset:
-    """Return a training row for each query, with its number."""
+    """Return a training dataset for `count` queries. Each row has the number of a query."""
     return Dataset.from_dict({NUMBER: list(range(count))})
 
 
 class IndexCollator(SentenceTransformerDataCollator):
-    """Collates rows to the numbers of their queries."""
+    """Collates rows into a list of the numbers of their queries."""
 
     def __call__(self, rows: list[dict[str, int]]) -> dict[str, list[int]]:
         return {"indices": [row[NUMBER] for row in rows]}
 
 
 class IndexBatchTrainer:
-    """Mixin for the library's trainers.
+    """Mixin that lets a trainer of the library take batches of query numbers.
 
     Args:
         sampler: Chooses the queries of each batch.
-        columns_of: Returns the columns of a batch, which the loss takes, from the numbers of its
-            queries.
+        columns_of: Turns the numbers of a batch's queries into the columns that the loss takes.
     """
 
     def __init__(
@@ -57,7 +56,7 @@ class IndexBatchTrainer:
         super().__init__(*args, **options)
 
     def add_model_card_callback(self, *_: Any) -> None:
-        """Add no callback: its card would show texts of the rows, which only hold numbers."""
+        """Add no callback: its model card would show texts of the rows, which have numbers only."""
 
     def get_batch_sampler(self, *_: Any, **__: Any) -> QueryBatchSampler:
         return self._sampler
@@ -66,8 +65,8 @@ class IndexBatchTrainer:
         return self._columns_of(inputs["indices"]), None
 
     def _load_from_checkpoint(self, checkpoint_path: str) -> None:
-        """Load the weights of the adapters only: the library would load the base again, without
-        quantisation, and its weights would not fit."""
+        """Load only the adapters and the head, if adapters are trained. The library would load the
+        base too, without quantisation, and its weights would not fit the quantised model."""
         folder = Path(checkpoint_path)
         if (folder / ADAPTERS).exists():
             load_adapters(self.model, folder)
@@ -75,14 +74,14 @@ class IndexBatchTrainer:
             super()._load_from_checkpoint(checkpoint_path)
 
     def _load_best_model(self) -> None:
-        """Load the best weights or fail: the library would only log an error and keep the last
-        weights."""
+        """Load the best weights, or raise an error. The library would only log the error and keep
+        the last weights."""
         self._load_from_checkpoint(self.state.best_model_checkpoint)
 
 
 class RetrieverTrainer(IndexBatchTrainer, SentenceTransformerTrainer):
-    """For a retriever with one vector."""
+    """Trains a retriever with one vector per input."""
 
 
 class MultiVectorTrainer(IndexBatchTrainer, MultiVectorEncoderTrainer):
-    """For a retriever with many vectors."""
+    """Trains a retriever with many vectors per input."""

@@ -1,4 +1,4 @@
-"""The training and held-out datasets of a student."""
+"""The training dataset and the validation datasets of a student."""
 
 from __future__ import annotations
 
@@ -29,7 +29,11 @@ from train.tiny_base import questions
 
 @dataclass(frozen=True)
 class SupervisedItem:
-    """A selection item in one mode, with its rationale and match lines (empty in answer mode)."""
+    """A selection item, and what a student's response to it in one mode is made of.
+
+    `rationale` is the teacher's full text, and each of `matches` says whether a candidate matches.
+    Both are empty in answer mode, and `matches` also in regimes without the match layout.
+    """
 
     item: SelectionItem
     mode: str
@@ -45,18 +49,18 @@ class SupervisedItem:
     def text(self) -> str:
         return f"{self.item.question} {instruction(self.mode, self.regime)} {self.response}"
 
-    def lazy(self, frames: FrameReader, frame_count: int, seed: int | None) -> LazySample:
-        """Return a sample with `frame_count` frames of the prefix. With a seed, each epoch permutes
-        the candidates."""
+    def lazy_sample(self, frames: FrameReader, frame_count: int, seed: int | None) -> LazySample:
+        """Return a sample that shows `frame_count` frames of the prefix. If `seed` is not None, its
+        candidates are permuted in each epoch."""
         render = partial(self.render, frames, frame_count, seed)
         return LazySample(self.text, frame_count // 2 + len(LETTERS), render, self.item.family)
 
     def render(self, frames: FrameReader, frame_count: int, seed: int | None, epoch: int) -> Sample:
-        one = self if seed is None else self.permuted(seed, epoch)
-        return selection_sample(one.item, one.mode, one.regime, frames, frame_count, one.response)
+        s = self if seed is None else self.permuted(seed, epoch)
+        return selection_sample(s.item, s.mode, s.regime, frames, frame_count, s.response)
 
     def permuted(self, seed: int, epoch: int) -> SupervisedItem:
-        """Permute the candidates, and the letters in the texts with them, by seed and epoch."""
+        """Return a copy with permuted candidates, and with their new letters in its texts."""
         order = seeded_rng(seed, epoch, self.item.item_id).permutation(len(LETTERS)).tolist()
         return replace(
             self,
@@ -70,9 +74,9 @@ class SupervisedItem:
 def supervised_items(
     store: Store, items: list[SelectionItem], rationales: dict[str, Rationale], regime: str
 ) -> dict[str, list[SupervisedItem]]:
-    """Return each item in answer mode and, if it has a rationale, in reasoning mode.
+    """Return, by mode, every item in answer mode, and in reasoning mode if `rationales` has its id.
 
-    A CoT student learns both modes, so that it can be prompted in either.
+    A student that is trained on rationales learns both modes, so that it can be prompted in either.
     """
     by_mode: dict[str, list[SupervisedItem]] = {mode: [] for mode in MODES}
     for item in items:
@@ -92,7 +96,8 @@ def supervised_items(
 def load_datasets(
     cfg: SftCommand, store: Store, rationales: list[Rationale]
 ) -> tuple[StudentDataset, dict[str, StudentDataset]]:
-    """Return the training dataset of a regime, and the held-out datasets by mode.
+    """Return the training dataset, and the validation datasets by mode or, if the regime is
+    describe, by kind of question.
 
     Raises:
         UserError: a dataset is empty.
@@ -102,15 +107,15 @@ def load_datasets(
     if train.regime not in WITHOUT_RATIONALES:
         check_not_empty(len(rationales), "accepted rationales")
     held_out = held_out_scenes(store)
-    others = set(store.scene_ids("train")) - held_out
+    training_scenes = set(store.scene_ids("train")) - held_out
     items = store.selection("train")
     # No frame of a held-out scene is visible in training, not even as a distractor.
-    trained = [item for item in items if uses_only(item, others)]
+    training_items = [item for item in items if uses_only(item, training_scenes)]
     if train.regime == "describe":
-        measured = [item for item in items if uses_only(item, held_out)]
+        validation_items = [item for item in items if uses_only(item, held_out)]
         training, validation = (
             questions.build_questions(store, part, frame_count, frames, seed)
-            for part in (trained, measured)
+            for part in (training_items, validation_items)
         )
         validation = {
             kind: shuffled(samples, seed)[: train.validation_items]
@@ -118,15 +123,18 @@ def load_datasets(
         }
     else:
         by_item = {r.item_id: r for r in rationales}
-        # The items are sorted by family: a part of them has all families only if they are shuffled.
-        measured = shuffled([i for i in items if i.scene_id in held_out], seed)
+        # The items are sorted by family; a part of them has all families only if they are shuffled.
+        validation_items = shuffled([i for i in items if i.scene_id in held_out], seed)
 
-        def lazy(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
+        def samples_of(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
             by_mode = supervised_items(store, items, by_item, train.regime)
-            return {m: [s.lazy(frames, frame_count, seed) for s in by_mode[m]] for m in by_mode}
+            return {
+                mode: [s.lazy_sample(frames, frame_count, seed) for s in supervised]
+                for mode, supervised in by_mode.items()
+            }
 
-        training = lazy(trained, seed if train.permute_candidates else None)
-        validation = lazy(measured[: train.validation_items], None)
+        training = samples_of(training_items, seed if train.permute_candidates else None)
+        validation = samples_of(validation_items[: train.validation_items], None)
     samples = [sample for part in training.values() for sample in part]
     check_not_empty(len(samples), f"samples for train.regime={train.regime}")
     check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
@@ -134,7 +142,7 @@ def load_datasets(
 
 
 def uses_only(item: SelectionItem, scenes: set[str]) -> bool:
-    """Whether the prefix and all candidates of an item are of these scenes."""
+    """Whether the prefix and all candidates of an item are frames of these scenes."""
     return {item.scene_id, *(c.scene_id for c in item.candidates)} <= scenes
 
 
@@ -146,7 +154,7 @@ def tokenizer_corpus(store: Store, rationales: list[Rationale]) -> list[str]:
         f"Candidate {x} does not match: it shows other objects and lacks\n{answer_line(x)}"
         for x in LETTERS
     ]
-    # Every digit and the timestamps' frame, often enough to be worth merges.
+    # Timestamps as prompts have them, with every digit.
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     instructions = [instruction(mode, "cot") for mode in MODES]
     roles = ["user", "assistant", "Later: "]

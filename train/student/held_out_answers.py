@@ -1,4 +1,4 @@
-"""Answers that a student generates for held-out items at each evaluation of its training."""
+"""Generate a student's answers to validation samples at each evaluation of its training."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ log = logging.getLogger(__name__)
 
 
 class HeldOutAnswers:
-    """Generates a student's answers to the first held-out samples of a mode, in one batch, and
+    """Generates a student's answers to the first validation samples of a mode, in one batch, and
     appends them to the run's samples.jsonl. Decoding is greedy and uses no random numbers.
 
     Args:
-        cfg: Settings with a resolved precision.
+        cfg: Settings whose train.precision is bf16 or fp32, not auto.
         folder: The run's folder.
     """
 
@@ -41,22 +41,22 @@ class HeldOutAnswers:
     def measure(
         self, model: nn.Module, mode: str, samples: StudentDataset, step: int
     ) -> dict[str, float]:
-        """Return the share of answers that can be parsed and the share that is right, over the
-        items that ask for a letter; empty if none does. The main rank writes the answers.
+        """Generate answers, which the main rank writes, and return the shares of parsable and of
+        correct answers among the samples whose answer is a letter; empty if there are none.
 
         Raises:
-            UserError: out of memory.
+            UserError: memory runs out.
         """
         train, student = self._cfg.train, self._cfg.student
-        held_out = [samples[k] for k in range(min(train.generated_items, len(samples)))]
-        inputs = self._collator([replace(sample, response=None) for sample in held_out])
+        first = [samples[k] for k in range(min(train.generated_items, len(samples)))]
+        inputs = self._collator([replace(sample, response=None) for sample in first])
         limit = response_token_limit(mode, student.max_new_tokens)
-        when = f"while generating {len(held_out)} answers after step {step}"
+        when = f"while generating {len(first)} answers after step {step}"
         lower = "lower train.generated_items, or set it to 0, in another run (run=NAME)"
         with explain_out_of_memory(when, lower):
             texts = generate(model, self._processor, inputs, limit, train.precision)
         rows = []
-        for sample, generated in zip(held_out, texts, strict=True):
+        for sample, generated in zip(first, texts, strict=True):
             parsed = parse_choice(generated.text, cut=generated.cut)
             rows.append(
                 {
@@ -66,24 +66,24 @@ class HeldOutAnswers:
                     "text": generated.text,
                     "letter": parsed.letter,
                     "reason": None if parsed.letter else parsed.reason and str(parsed.reason),
-                    # None for a response without an answer line.
+                    # None if the reference response has no answer line.
                     "answer": parse_choice(sample.response).letter,
                 }
             )
         if rank() == 0:
             self._write(rows)
-        letters = [row for row in rows if row["answer"]]
-        if not letters:
+        graded = [row for row in rows if row["answer"]]
+        if not graded:
             return {}
         return {
-            "generated_parse_rate": sum(r["letter"] is not None for r in letters) / len(letters),
-            "generated_accuracy": sum(r["letter"] == r["answer"] for r in letters) / len(letters),
+            "generated_parse_rate": sum(r["letter"] is not None for r in graded) / len(graded),
+            "generated_accuracy": sum(r["letter"] == r["answer"] for r in graded) / len(graded),
         }
 
     def _write(self, rows: list[dict[str, Any]]) -> None:
         with open(self._path, "a") as file:
             file.writelines(json.dumps(row) + "\n" for row in rows)
-        # The log prints another item at each evaluation.
+        # One of the answers, which depends on the step, is logged.
         row = rows[rows[0]["step"] % len(rows)]
         answer = f"; the answer is {row['answer']}" if row["answer"] else ""
         text = indent(row["text"] or "(empty)", "    ")

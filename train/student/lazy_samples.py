@@ -1,4 +1,4 @@
-"""Samples that are rendered when they are read, so that memory holds the pixels of a batch only."""
+"""Samples that are rendered when they are read, so that few pixels are in memory at a time."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class LazySample:
     """A sample before it is rendered.
 
     Attributes:
-        text: The part of its text that other samples of its kind do not have.
-        media: Number of images and of pairs of a clip's frames. With `text`, it determines the
-            length in tokens.
-        render: Returns the sample of an epoch.
-        family: The selection item's family, None for other samples.
+        text: Text of the prompt and the response, without parts that all prompts have.
+        media: Number of images plus number of frame pairs of the clip. With `text`, it determines
+            the estimated length in tokens.
+        render: Returns the sample in a given epoch.
+        family: Family of the selection item; None for samples of the regime describe.
     """
 
     text: str
@@ -39,8 +39,8 @@ class LazySample:
 class StudentDataset(Dataset):
     """Samples that are rendered when a trainer reads them.
 
-    A negative index ~k returns sample k without supervision, which fills up the last step of an
-    epoch.
+    The index ~k, which is negative, returns sample k unsupervised. `LengthSampler` fills up the
+    last step of an epoch with such indices.
     """
 
     samples: Sequence[LazySample]
@@ -66,10 +66,10 @@ class StudentDataset(Dataset):
         return [s.text for s in self.samples]
 
     def lengths(self, tokenizer: PreTrainedTokenizerBase, image_size: int) -> list[int]:
-        """Estimate the tokens of each sample without rendering it."""
+        """Estimate each sample's number of tokens, with frames of `image_size` px, not rendered."""
         ids = tokenizer(self.texts, add_special_tokens=False).input_ids
-        each = round(image_size / TOKEN_PIXELS) ** 2 + EXTRA_TOKENS
-        return [len(i) + s.media * each for i, s in zip(ids, self.samples, strict=True)]
+        per_medium = round(image_size / TOKEN_PIXELS) ** 2 + EXTRA_TOKENS
+        return [len(i) + s.media * per_medium for i, s in zip(ids, self.samples, strict=True)]
 
 
 def seeded_rng(*keys: int | str) -> np.random.Generator:

@@ -1,4 +1,4 @@
-"""The order of training samples: random over an epoch, by length within a step."""
+"""The order of training samples: random within an epoch, sorted by length within a step."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from torch.utils.data import Sampler
 
 @dataclass(eq=False)
 class LengthSampler(Sampler[int]):
-    """Yields all samples in a random order per epoch, those of a step sorted by length.
+    """Yields the indices of all samples in random order; those of each step are sorted by length.
 
-    Sorting keeps the padding of a micro-batch small. The samples of a step do not depend on how it
-    is split into micro-batches and ranks.
+    Sorting keeps the padding of micro-batches small. Which samples a step has depends neither on
+    the size of the micro-batches nor on the number of ranks.
 
-    Ranks take one micro-batch each in turn, and the order of the ranks alternates, so that no rank
-    always has the longest. If the last step of an epoch cannot be shared evenly, it is filled up
-    with unsupervised samples (negative indices of `StudentDataset`).
+    accelerate gives consecutive micro-batches to the ranks in turn. Every other round is reversed,
+    so that no rank always gets the longest samples. If the samples of an epoch's last step cannot
+    be divided evenly among the ranks, the index ~k of its shortest sample k is added, which
+    `StudentDataset` returns unsupervised.
 
     Attributes:
-        lengths: Of all samples.
-        batch: Samples of a step, over all its micro-batches and ranks.
+        lengths: Length of each sample in tokens.
+        batch: Samples per step, over all micro-batches and ranks.
     """
 
     lengths: Sequence[int]
@@ -43,12 +44,12 @@ class LengthSampler(Sampler[int]):
         lengths = np.asarray(self.lengths)
         for start in range(0, len(order), self.batch):
             step = order[start : start + self.batch]
-            # The longest first, so that running out of memory shows at the start of a run.
+            # The longest samples are first.
             step = step[np.argsort(-lengths[step], kind="stable")]
             yield from self._deal(step).tolist()
 
     def _deal(self, step: np.ndarray) -> np.ndarray:
-        """Order a step's samples, longest first, as the ranks take them."""
+        """Arrange the sorted samples of a step in the order in which the ranks get them."""
         fillers = np.repeat(~step[-1:], self._missing(len(step)))
         rounds = np.append(step, fillers)
         if self.world_size > 1:
@@ -57,6 +58,6 @@ class LengthSampler(Sampler[int]):
         return rounds.ravel()
 
     def _missing(self, samples: int) -> int:
-        """Return how many samples a step of this size lacks to give all ranks equal work."""
+        """Return the number of samples to add to a step so that all ranks get equally many."""
         each_round = self.micro_batch * self.world_size
         return -samples % each_round if self.world_size > 1 else 0

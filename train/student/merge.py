@@ -1,4 +1,4 @@
-"""Merge a student into its base."""
+"""Merge the adapters of a trained student into its base."""
 
 from __future__ import annotations
 
@@ -20,46 +20,47 @@ from train.student.lazy_samples import StudentDataset
 from train.student.metrics import LetterAccuracy
 
 MAX_SAMPLES = 16
-"""Held-out samples of each mode that are compared: at 8B, their logits take 3 GB."""
+"""Number of validation samples per mode that are compared; at 8B, their logits take 3 GB."""
 
 Items = dict[str, StudentDataset]
+"""Validation samples by mode."""
 
 
 @dataclass(frozen=True)
 class StudentMerge:
-    """Compares the logits that predict supervised tokens, and the letters chosen, by mode.
+    """Merges a student, and computes its outputs before and after: for each mode, the logits that
+    predict supervised tokens and the chosen letters.
 
     Attributes:
-        settings: Of the training run.
+        settings: The settings of the training run.
         saved: The folder of the trained adapters.
     """
 
     settings: SftCommand
     saved: Path
     max_difference = 0.05
-    """On the tiny student, rounding to bf16 moves logits by 0.005 of their size, and merging into
-    the 4-bit weights by 0.2."""
+    """Largest accepted relative difference. In the tiny student, rounding to bf16 causes 0.005;
+    merging into the 4-bit weights would cause 0.2."""
 
     def held_out(self, root: Path, workers: int) -> Items:
-        """Return the samples that measured the run, by mode."""
+        """Return the run's validation samples, from a benchmark and rationales that must exist."""
         settings = self.settings
         store = open_benchmark(settings.benchmark, root, workers)
         if settings.train.regime in WITHOUT_RATIONALES:
             return load_datasets(settings, store, [])[1]
         if not (journal := store.folder / JOURNAL_FILE).exists():
             raise UserError(
-                f"{journal} is missing, and the export compares the merged weights with the "
-                "trained ones on its rationales: run python -m teacher.narrate, or set "
-                "verify=false",
+                f"{journal} is missing, and the export compares the merged with the trained model "
+                "on its rationales: run python -m teacher.narrate, or set verify=false",
                 code="missing-rationales",
             )
         return load_datasets(settings, store, ensure_rationales(store, settings.teacher))[1]
 
     def trained_outputs(self, items: Items) -> ModelOutputs:
-        """Return the outputs of the adapters over their base."""
+        """Return the outputs of the trained student, the adapters over their base."""
         precision = self.settings.train.precision
         model, processor = loading.load_trained(self.settings.student, precision, self.saved)
-        # Some CPUs round 4-bit products differently once the weights are packed for inference.
+        # Prevent a CPU from repacking 4-bit weights for inference, which changes the rounding.
         compat.keep_differentiable(model)
         return self._outputs(model, processor, items, precision == "bf16")
 
@@ -71,7 +72,7 @@ class StudentMerge:
         loading.write_model(model, processor, folder)
 
     def merged_outputs(self, folder: Path, items: Items) -> ModelOutputs:
-        """Return the outputs of the merged model in a folder."""
+        """Return the outputs of the merged student in a folder."""
         return self._outputs(*loading.load_merged(folder), items, autocast=False)
 
     @torch.inference_mode()

@@ -1,4 +1,4 @@
-"""Measures of held-out samples, reduced to a few numbers a sample before the logits are dropped."""
+"""Accuracies on validation samples, measured from a few numbers per sample instead of logits."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from train.student.lazy_samples import StudentDataset
 
 
 class TokenAccuracy:
-    """Share of supervised tokens that are the most likely ones, given all tokens before.
+    """Share of supervised tokens that have the highest logit, given all correct tokens before them.
 
     Args:
-        words: Token ids by kind of word. Each kind is also measured alone: the words for what is
-            visible count little among all tokens, most of which are grammar.
+        words: Token ids by kind of word. Each kind also has an accuracy of its own, because the
+            words that describe a frame are few among all tokens.
     """
 
     def __init__(self, words: dict[str, list[int]]) -> None:
         self._words = {kind: torch.tensor(ids) for kind, ids in words.items()}
 
     def reduce(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """Return (B, 2 * (1 + kinds)): right tokens and their number, kind by kind."""
+        """Return (B, 2 * (1 + kinds)): counts of correct tokens and of all tokens, kind by kind."""
         chosen, following = logits[:, :-1].argmax(dim=-1), labels[:, 1:]
         right = chosen == following
         counted = [following != IGNORED]
@@ -31,6 +31,7 @@ class TokenAccuracy:
         return torch.cat(counts, dim=1)
 
     def measure(self, prediction: EvalPrediction, samples: StudentDataset) -> dict[str, float]:
+        """Return the accuracy over all tokens and for each kind of word that occurs."""
         counts = prediction.predictions.sum(axis=0).reshape(-1, 2)
         return {
             f"{kind}_accuracy": float(right / counted)
@@ -40,10 +41,10 @@ class TokenAccuracy:
 
 
 class LetterAccuracy:
-    """Share of samples whose answer letter has the highest logit among the letters.
+    """Share of samples whose correct letter has the highest logit of all letters.
 
-    The text before the letter is the held-out response. In reasoning mode that is the teacher's
-    rationale: the measure is then whether the student's answer follows from it.
+    The model reads the correct response up to the letter. In reasoning mode, this includes the
+    teacher's rationale, so the accuracy measures whether the student draws the conclusion from it.
 
     Args:
         letters: Token ids of the letters, from `letter_ids`.
@@ -53,13 +54,13 @@ class LetterAccuracy:
         self._letters = torch.tensor(letters)
 
     def reduce(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """Return (B, 2): index of the chosen letter and of the right one.
+        """Return (B, 2): the index of the chosen letter and that of the correct letter.
 
-        The letter is the last supervised token but one, before the end of the turn.
+        The letter is the second-to-last supervised token; the last ends the turn.
         """
         letters = self._letters.to(logits.device)
         positions = torch.arange(labels.shape[1], device=labels.device)
-        # Several ranks pad their batches on the right to one width.
+        # With several ranks, the trainer pads batches on the right, to the width of the widest.
         letter = torch.where(labels != IGNORED, positions, 0).amax(dim=1) - 1
         rows = torch.arange(len(labels), device=labels.device)
         chosen = logits[rows, letter - 1][:, letters].argmax(dim=-1)

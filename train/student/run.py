@@ -15,7 +15,7 @@ from models.distributed import split_batch
 from models.memory import available_cpu_bytes
 from models.student.collator import Collator, letter_ids
 from train.common.arguments import common_arguments
-from train.common.audit import audit
+from train.common.audit import audit_student
 from train.common.callbacks import EpochCallback
 from train.student.held_out_answers import HeldOutAnswers
 from train.student.lazy_samples import StudentDataset
@@ -31,8 +31,8 @@ log = logging.getLogger(__name__)
 def prefetch_factor(workers: int, accumulation: int) -> int | None:
     """Return the number of batches that each worker prepares in advance; None without workers.
 
-    The trainer requests all micro-batches of an optimizer step at once. Together the workers
-    prepare at least that many, so that they are ready when the previous step ends.
+    The trainer requests all micro-batches of an optimizer step at once. Together, the workers
+    prepare at least as many in advance, so that they are ready when the previous step ends.
     """
     return max(2, math.ceil(accumulation / workers)) if workers else None
 
@@ -49,27 +49,29 @@ def build_trainer(
     """Audit the model and the longest sample, and return a trainer for the regime.
 
     Args:
-        cfg: Settings with a resolved precision.
+        cfg: Settings whose train.precision is bf16 or fp32, not auto.
         checkpoint: The checkpoint that the run resumes from, or None.
 
     Raises:
-        UserError: the model is not what its preset says, or the longest sample is too long.
+        UserError: the model does not fit its preset, the longest sample is too long, or
+            train.reuse_features is set and the vision tower is trained or sharded.
     """
     train, student = cfg.train, cfg.student
     if train.regime == "describe":
-        # Descriptions have no answer letter to measure.
-        trainer, collator = ObjectTokenTrainer, ObjectTokenCollator(processor, student.max_length)
+        trainer_type = ObjectTokenTrainer
+        collator = ObjectTokenCollator(processor, student.max_length)
+        # Descriptions have no answer letter.
         accuracy = TokenAccuracy(scene_word_tokens(processor))
     else:
-        trainer, collator = StudentTrainer, Collator(processor, student.max_length)
+        trainer_type, collator = StudentTrainer, Collator(processor, student.max_length)
         accuracy = LetterAccuracy(letter_ids(processor))
     lengths = training.lengths(processor.tokenizer, student.image_size)
     longest = training[lengths.index(max(lengths))]
-    log.info(audit(model, processor, student, longest, collator))
+    log.info(audit_student(model, processor, student, longest, collator))
     sampler = LengthSampler(lengths, train.batch, cfg.seed, train.micro_batch, world_size())
     cache = answers = None
     if train.reuse_features:
-        # Half of the free memory, shared by the ranks of this machine.
+        # The ranks of this machine together cache up to half of its free memory.
         limit = available_cpu_bytes() // 2 // local_world_size()
         cache = VisionCache(model, train.precision, limit)
     if train.generated_items:
@@ -82,11 +84,11 @@ def build_trainer(
         per_device_eval_batch_size=train.micro_batch,
         dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
         label_names=["labels"],
-        # Every pass uses all adapters; the vision tower of a whole model is unused in prompts
-        # without images.
+        # Every pass uses all adapters. If all weights are trained, prompts without images leave
+        # those of the vision tower unused.
         ddp_find_unused_parameters=not student.lora.rank,
     )
-    return trainer(
+    return trainer_type(
         model=model,
         args=arguments,
         data_collator=TrainerCollator(collator, digests=cache is not None),

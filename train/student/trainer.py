@@ -1,7 +1,7 @@
-"""The student's trainer: what differs from transformers.Trainer.
+"""The student's trainer, a transformers.Trainer with its own loss, order of samples and measures.
 
-The loss weighs every supervised token of an accumulated batch alike. A non-finite loss or gradient
-stops the run before a checkpoint is written.
+The loss weights all supervised tokens of an accumulated batch equally. A non-finite loss or
+gradient stops the run before the affected weights are saved.
 """
 
 from __future__ import annotations
@@ -29,17 +29,18 @@ from train.student.metrics import LetterAccuracy, TokenAccuracy
 from train.student.vision_cache import PAIRS, VisionCache, pair_digests
 
 STOPPED = "stopped.json"
-"""Names the samples of a non-finite loss or gradient; ranks above 0 put their number in front."""
+"""File with the samples of a non-finite loss or gradient; ranks above 0 prefix their number."""
 
 
 def token_mean(
     outputs: Any, labels: torch.Tensor, num_items_in_batch: torch.Tensor | int | None = None
 ) -> torch.Tensor:
-    """Return the cross entropy of a micro-batch as its part of the accumulated batch's token mean.
+    """Return a micro-batch's part of the mean cross entropy over an accumulated batch's tokens.
 
-    It is the sum over the micro-batch's supervised tokens, divided by their number in the whole
-    accumulated batch. Transformers averages this model's samples first: an answer of three tokens
-    would weigh as much as a rationale.
+    This is the sum over the supervised tokens of the micro-batch, divided by `num_items_in_batch`,
+    the number of supervised tokens of the accumulated batch (default: of the micro-batch). For
+    Qwen3-VL, transformers would average each micro-batch first: an answer of three tokens could
+    then weigh as much as a rationale.
     """
     predicted, following = outputs.logits[:, :-1].flatten(0, 1), labels[:, 1:].flatten()
     total = cross_entropy(predicted.float(), following, ignore_index=IGNORED, reduction="sum")
@@ -48,8 +49,8 @@ def token_mean(
 
 
 def token_losses(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-    """Return (B, 2): each sample's cross entropy summed over its supervised tokens, and their
-    number."""
+    """Return (B, 2): for each sample, the sum of the cross entropy over its supervised tokens, and
+    the number of these tokens."""
     following = labels[:, 1:]
     losses = cross_entropy(
         logits[:, :-1].transpose(1, 2).float(), following, ignore_index=IGNORED, reduction="none"
@@ -59,7 +60,8 @@ def token_losses(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class TrainerCollator:
-    """Adds the samples' ids to a batch and, for a `VisionCache`, the digests of its frames."""
+    """Adds the samples' ids to a batch and, if `digests` is set for a `VisionCache`, the digests of
+    its frame pairs."""
 
     collator: Collator
     digests: bool
@@ -72,13 +74,13 @@ class TrainerCollator:
 class StudentTrainer(Trainer):
     """A Trainer with its own order of samples, loss and measures.
 
-    The loss of an evaluation is the mean over all supervised tokens of its samples, independent of
-    the batch size and of the world size.
+    The loss of an evaluation is the mean over all supervised tokens of its samples. It depends
+    neither on the batch size nor on the number of ranks.
 
     Args:
         sampler: The order of the training samples.
-        accuracy: The measure of an evaluation.
-        answers: Generates answers to held-out items at each evaluation, or None.
+        accuracy: Computes the accuracies of an evaluation.
+        answers: Generates answers to validation samples at each evaluation, or None.
         vision_cache: Keeps the frozen vision tower's outputs, or None.
     """
 
@@ -107,7 +109,7 @@ class StudentTrainer(Trainer):
         return self._sampler
 
     def _reduce(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """Return (B, 2 + columns of the accuracy), so that no logits are kept."""
+        """Return (B, 2 + columns of the accuracy), which the evaluation keeps instead of logits."""
         reduced = self._accuracy.reduce(logits, labels)
         return torch.cat([token_losses(logits, labels), reduced], dim=-1)
 
@@ -115,7 +117,7 @@ class StudentTrainer(Trainer):
         losses, reduced = np.split(prediction.predictions, [2], axis=-1)
         total, count = losses.sum(axis=0, dtype=np.float64)
         kept = EvalPrediction(reduced, prediction.label_ids)
-        # This replaces the trainer's own mean, which it names the same.
+        # "loss" replaces the library's loss, which is a mean over batches instead of tokens.
         return {**self._accuracy.measure(kept, self._evaluated), "loss": total / count}
 
     def evaluation_loop(
@@ -125,7 +127,7 @@ class StudentTrainer(Trainer):
         settings["metric_key_prefix"] = metric_key_prefix
         output = super().evaluation_loop(dataloader, *args, **settings)
         if self._answers is not None:
-            # All ranks generate: each one holds a part of a sharded model.
+            # All ranks generate, because each rank has only a part of a sharded model.
             if "generate" not in vars(self.model):
                 register_fsdp_forward_method(self.model, "generate")
             mode, step = metric_key_prefix.removeprefix("eval_"), self.state.global_step
@@ -136,7 +138,7 @@ class StudentTrainer(Trainer):
     def compute_loss(
         self, model: Module, inputs: dict[str, Any], return_outputs: bool = False, **settings: Any
     ) -> Any:
-        """Raises UserError for a non-finite loss, after writing the samples' ids to a file."""
+        """Raise UserError for a non-finite loss, after the ids of its samples are written."""
         ids = inputs.pop("sample_ids")
         if self._vision_cache is not None:
             self._vision_cache.encode_media(inputs)
@@ -149,7 +151,7 @@ class StudentTrainer(Trainer):
         return result
 
     def log(self, logs: dict[str, float], *args: Any, **settings: Any) -> None:
-        """Raises UserError for a non-finite gradient, before its weights are saved."""
+        """Raise UserError for a non-finite gradient, before the resulting weights are saved."""
         super().log(logs, *args, **settings)
         if "grad_norm" in logs:
             ids, self._step_samples = self._step_samples, []

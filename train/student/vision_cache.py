@@ -1,8 +1,8 @@
 """A cache of the frozen vision tower's outputs.
 
-The tower encodes each pair of frames separately: two neighbours of a clip, or an image twice. The
-output for a pair is therefore the same in every sample, epoch and evaluation. The key of a pair is
-a digest of its pixels.
+The tower encodes each pair of frames separately. A pair is two consecutive frames of a clip, or the
+same image twice. Its output is therefore the same in every sample, epoch and evaluation, and can be
+cached under a digest of the pair's pixels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from models.student.collator import MEDIA
 from models.student.prompts import Sample
 
 PAIRS = "frame_pairs"
-"""Name of the digests of a batch's frame pairs: of its images, then of its clips."""
+"""Name of the digests of a batch's frame pairs: those of its images, then those of its clips."""
 
 
 def pair_digests(samples: Sequence[Sample]) -> list[bytes]:
@@ -32,7 +32,7 @@ def pair_digests(samples: Sequence[Sample]) -> list[bytes]:
     for sample in samples:
         if sample.clip is not None:
             pixels = sample.clip.pixels
-            # The last frame of an odd number forms a pair with itself.
+            # If the number of frames is odd, the last frame forms a pair with itself.
             pairs += zip(pixels[::2], [*pixels[1::2], pixels[-1]], strict=False)
     digests = []
     for first, second in pairs:
@@ -46,13 +46,12 @@ def pair_digests(samples: Sequence[Sample]) -> list[bytes]:
 class VisionCache:
     """Replaces the pixels of batches by the tower's outputs, which it keeps in the CPU's memory.
 
-    Once `limit` bytes are reached, no more outputs are kept; the tower then encodes other pairs
-    each time.
+    An output that would exceed the limit is not kept; the tower encodes its pair each time.
 
     Args:
         model: The student, with or without adapters.
-        precision: bf16 or fp32.
-        limit: In bytes.
+        precision: bf16 or fp32, in which the tower computes.
+        limit: Maximum size of the kept outputs in bytes.
 
     Raises:
         UserError: the vision tower is trained, or sharded over ranks.
@@ -68,8 +67,8 @@ class VisionCache:
             )
         if is_sharded():
             raise UserError(
-                "train.reuse_features=true does not work with FSDP, which leaves no rank a whole "
-                "vision tower: set it to false, or start without --use_fsdp",
+                "train.reuse_features=true does not work with FSDP, since no rank has all weights "
+                "of the vision tower: set it to false, or start without --use_fsdp",
                 code="unsupported-with-fsdp",
             )
         self._base = base
@@ -79,7 +78,7 @@ class VisionCache:
         self.bytes = 0
 
     def encode_media(self, inputs: dict[str, Any]) -> None:
-        """Replace a batch's pixels by the tower's outputs, as `mm_encoder_outputs`."""
+        """Replace a batch's pixels and digests by the tower's outputs, `mm_encoder_outputs`."""
         digests, size = inputs.pop(PAIRS), []
         keys: dict[str, list[bytes]] = {}
         pixels: dict[bytes, torch.Tensor] = {}
@@ -105,7 +104,8 @@ class VisionCache:
     def _encode(
         self, pixels: dict[bytes, torch.Tensor], size: list[int]
     ) -> dict[bytes, torch.Tensor]:
-        """Return (1 + deepstack layers, tokens, hidden) for each pair; all pairs have one size."""
+        """Return the output (1 + deepstack layers, tokens, hidden) for each pair. All pairs have
+        `size` patches in height and width."""
         if not pixels:
             return {}
         patches = torch.cat(list(pixels.values()))

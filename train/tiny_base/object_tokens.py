@@ -2,8 +2,8 @@
 
 The language loss alone trains vision slowly, because a model can lower it by learning phrases and
 nearly ignore the images. This loss trains each visual token that shows an object to predict the
-words that name the object: its color, material and shape. In candidates the token also predicts
-the candidate's letter, and in clips the object's heading.
+words that name the object: its color, material and shape. In a candidate, the token also predicts
+the candidate's letter; in a clip, it also predicts the object's heading or "stationary".
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from train.student.trainer import StudentTrainer
 WEIGHT = 6.0
 """Weight of the loss at one visual token, relative to one supervised token of the response."""
 PLACES = ("top", "left", "right", "center", "bottom")
-"""First words of the regions after "near the", such as "top" of "top-left"."""
+"""Words that follow "near the" in the names of regions; "top-left" begins with "top"."""
 MOTION = ("moves", "does")
-"""First words of motion ("moves slowly") and of rest ("does not move")."""
-WORDS = 4
-"""Highest number of words per visual token: color, material, shape, and a candidate's letter or a
-heading."""
-NONE = -1
-"""Padding for tokens with fewer words."""
+"""First words of the phrases for motion ("moves slowly") and rest ("does not move")."""
+MAX_WORDS = 4
+"""Maximum number of words per visual token: color, material, shape, and a candidate's letter or the
+motion in a clip."""
+NO_WORD = -1
+"""Padding for visual tokens with fewer words."""
 
 
 def scene_word_tokens(processor: ProcessorMixin) -> dict[str, list[int]]:
-    """Return the first token ids of the words for objects, places and motion, by kind of word."""
+    """Return ids of the first tokens of words for objects, places and motion, by kind of word."""
     kinds = {"color": COLORS, "material": MATERIALS, "shape": SHAPES, "place": PLACES}
     kinds |= {"motion": MOTION, "heading": COMPASS}
     return {kind: [first_token(processor, w) for w in words] for kind, words in kinds.items()}
@@ -49,10 +49,11 @@ def first_token(processor: ProcessorMixin, word: str) -> int:
 
 
 class ObjectTokenCollator(Collator):
-    """Makes batches with `object_labels` (N, 2 + WORDS) and with logits at all positions.
+    """Makes batches with `object_labels` (N, 2 + MAX_WORDS), and with `labels` and `logits_to_keep`
+    for all positions, so that the model returns logits at the visual tokens too.
 
-    A row of `object_labels` has the batch row and the position of a visual token, and then the
-    first token ids of its words, padded with NONE.
+    A row of `object_labels` has the batch row and the position of a visual token, and then the ids
+    of the first tokens of its words, padded with NO_WORD.
     """
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
@@ -68,23 +69,23 @@ class ObjectTokenCollator(Collator):
             if sample.supervised
             for row in self._label_rows(sample, k, batch["input_ids"][k])
         ]
-        batch["object_labels"] = torch.tensor(rows).reshape(-1, 2 + WORDS)
+        batch["object_labels"] = torch.tensor(rows).reshape(-1, 2 + MAX_WORDS)
         return batch
 
     def _label_rows(self, sample: Sample, row: int, ids: torch.Tensor) -> Iterator[list[int]]:
         visual = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
         positions = torch.isin(ids, visual).nonzero()[:, 0].tolist()
-        each = len(positions) // max(1, sample.pictures)
-        grid = math.isqrt(each)
+        per_picture = len(positions) // max(1, sample.pictures)
+        grid = math.isqrt(per_picture)
         for label in sample.object_labels:
             column, line = (min(int(share * grid), grid - 1) for share in label.place)
-            position = positions[label.picture * each + line * grid + column]
+            position = positions[label.picture * per_picture + line * grid + column]
             words = [first_token(self._processor, word) for word in label.words]
-            yield [row, position, *words, *[NONE] * (WORDS - len(words))]
+            yield [row, position, *words, *[NO_WORD] * (MAX_WORDS - len(words))]
 
 
 class ObjectTokenTrainer(StudentTrainer):
-    """A trainer that adds the object token loss to the training loss."""
+    """A trainer that adds the loss on object tokens to the training loss."""
 
     def compute_loss(
         self,
@@ -99,7 +100,7 @@ class ObjectTokenTrainer(StudentTrainer):
         )
         if model.training and len(object_labels):
             # `num_items_in_batch` counts the tokens of all ranks, but gradients are averaged over
-            # ranks. The number of ranks turns the average into a sum, as in the language loss.
+            # ranks. A factor of the number of ranks makes it a sum, as in the language loss.
             weight = self.accelerator.num_processes * WEIGHT
             object_loss = object_token_loss(outputs.logits, object_labels)
             loss = loss + weight * object_loss / num_items_in_batch
@@ -114,10 +115,10 @@ def object_token_loss(logits: torch.Tensor, object_labels: torch.Tensor) -> torc
 
     Args:
         logits: (B, L, V).
-        object_labels: (N, 2 + WORDS), see `ObjectTokenCollator`.
+        object_labels: (N, 2 + MAX_WORDS), see `ObjectTokenCollator`.
     """
     row, position, words = object_labels[:, 0], object_labels[:, 1], object_labels[:, 2:]
     log_probabilities = logits[row, position].float().log_softmax(dim=-1)
-    is_word = words != NONE
-    each = log_probabilities.gather(1, words.clamp(min=0)).masked_fill(~is_word, 0.0)
-    return -(each.sum(dim=1) / is_word.sum(dim=1)).sum()
+    is_word = words != NO_WORD
+    of_words = log_probabilities.gather(1, words.clamp(min=0)).masked_fill(~is_word, 0.0)
+    return -(of_words.sum(dim=1) / is_word.sum(dim=1)).sum()

@@ -1,9 +1,17 @@
 """Questions about frames and clips that train the tiny base to recognise objects and motion.
 
-The oracle answers them. They are about a single frame and about four candidates (the objects and
-their places), about the motion of an object in a clip, about a clip and its outcome in the words of
-the built-in narrator, about candidates compared with such a description, about which of two frames
-is the later one, and about which candidate fits a description. None is the selection task.
+The oracle determines the answers. The kinds of questions (`KINDS`) ask for
+
+    frame       the objects of a frame and the regions where they are
+    candidates  the same for each of four candidates
+    where       the region of one object in each of four candidates
+    moves       the motion of one object in a clip
+    clip        a description of a clip and its outcome, as the built-in narrator writes it
+    compared    the region of one object in each candidate, compared with such a description
+    later       the later of two frames after a clip
+    match       the candidate that fits a description
+
+None of them is the selection task.
 """
 
 from __future__ import annotations
@@ -18,14 +26,7 @@ import numpy as np
 from data.records import LETTERS, Scene, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from models.student.prompts import (
-    Clip,
-    ObjectLabel,
-    Sample,
-    answer_line,
-    conversation,
-    load_clip,
-)
+from models.student.prompts import Clip, ObjectLabel, Sample, answer_line, conversation, load_clip
 from teacher.narrator import write_description, write_match_lines
 from teacher.predicates import (
     REGIONS,
@@ -49,14 +50,14 @@ MATCH = (
     'why. End with a line "Answer:" and the letter.'
 )
 QUESTIONS = (FRAME, CANDIDATES, WHERE, COMPARE, MOVES, CLIP, LATER, MATCH)
-MOVED = 0.08
-"""Least displacement of an object in the later of two frames, as a share of the image's width."""
-CLEAR = 0.3
-"""Visible fraction above which a visual token should name an object."""
+MIN_DISPLACEMENT = 0.08
+"""A later frame is distinguishable if an object has moved by more than this share of the width."""
+CLEARLY_VISIBLE = 0.3
+"""An object gets labels at visual tokens if its visible fraction is above this."""
 HIDDEN = 0.05
-"""Visible fraction at or below which an object is not described."""
-NAMED = 4
-"""Most objects that a description names."""
+"""An object is described if its visible fraction is above this."""
+MAX_NAMED = 4
+"""Maximum number of objects that the description in a question of kind match names."""
 
 
 class Picture(NamedTuple):
@@ -84,17 +85,18 @@ class Question:
 def build_questions(
     store: Store, items: list[SelectionItem], frame_count: int, frames: FrameReader, seed: int
 ) -> dict[str, list[LazySample]]:
-    """Return samples by kind of question. Frames, candidates and their order are random in each
-    epoch."""
+    """Return samples by kind of question. In each epoch, frames, candidates and their order are
+    chosen anew."""
     builder = QuestionBuilder(store, items, frame_count, frames, seed)
     return {kind: [s for item in items for s in builder.samples(item, kind)] for kind in KINDS}
 
 
 @dataclass(frozen=True)
 class QuestionBuilder:
-    """Builds questions about items; seed, epoch and item determine the random choices.
+    """Builds questions about items.
 
-    Each kind of question has a method, which returns None for items that do not allow it.
+    Each kind of question has a method, which returns None if an item does not allow the question.
+    The random choices depend on the seed, the epoch, the item, the kind and the repetition.
     """
 
     store: Store
@@ -104,7 +106,7 @@ class QuestionBuilder:
     seed: int
 
     def samples(self, item: SelectionItem, kind: str) -> Iterator[LazySample]:
-        """Return the samples of a kind; the first epoch's question estimates their length."""
+        """Yield the samples of a kind. Their length is estimated from the question of epoch 0."""
         if first := self.build(item, kind, 0, epoch=0):
             media = len(first.pictures) + self.frame_count // 2 * first.after_clip
             for repeat in range(KINDS[kind][1]):
@@ -117,7 +119,7 @@ class QuestionBuilder:
         return method(self, item, seeded_rng(self.seed, epoch, item.item_id, *keys))
 
     def render(self, item: SelectionItem, kind: str, repeat: int, epoch: int) -> Sample:
-        """Return the sample of a question: the clip, the pictures with their captions, the text."""
+        """Return the sample of a question: the clip, the pictures with captions, and the text."""
         question = self.build(item, kind, repeat, epoch)
         clip, labels = self.labelled_clip(item) if question.after_clip else (None, [])
         pairs = (len(clip.indices) + 1) // 2 if clip else 0
@@ -135,8 +137,8 @@ class QuestionBuilder:
         return conversation(name, parts, question.answer, clip, labels)
 
     def labelled_clip(self, item: SelectionItem) -> tuple[Clip, list[ObjectLabel]]:
-        """Return the clip of an item's prefix, and its objects with their headings. A visual token
-        of a clip covers two frames; objects are labelled as in the first."""
+        """Return the clip of an item's prefix, and labels of its objects with their headings. A
+        visual token of a clip covers two frames; the labels are at the places in the first."""
         indices, scene = self.prefix_frames(item), self.scene(item)
         labels = []
         for k, pair in enumerate(zip(indices[::2], [*indices[1::2], indices[-1]], strict=False)):
@@ -146,13 +148,13 @@ class QuestionBuilder:
         return load_clip(item.scene_id, indices, self.frames), labels
 
     def frame(self, item: SelectionItem, rng: np.random.Generator) -> Question:
-        """The objects of a frame and their places."""
+        """Ask for the objects of a random frame and their regions."""
         scene_id, frame = self.random_frame(item, rng)
         answer = describe_frame(self.store.scene(scene_id), frame)
         return Question(FRAME, answer, [Picture(scene_id, frame)])
 
     def candidates(self, item: SelectionItem, rng: np.random.Generator) -> Question:
-        """The objects and places of four candidates."""
+        """Ask for the objects and regions of four candidates."""
         pictures = self.random_four(item, rng)
         lines = [
             f"Candidate {p.letter}: {describe_frame(self.store.scene(p.scene_id), p.frame)}"
@@ -161,7 +163,7 @@ class QuestionBuilder:
         return Question(CANDIDATES, "\n".join(lines), pictures)
 
     def where(self, item: SelectionItem, rng: np.random.Generator) -> Question:
-        """The place of one object in four candidates, as a rationale compares them."""
+        """Ask for the region of one object in four candidates, as a rationale compares them."""
         pictures = self.random_four(item, rng)
         places = self.regions(pictures)
         phrase = self.choose_object(item, {p for objects in places for p in objects}, places, rng)
@@ -172,7 +174,7 @@ class QuestionBuilder:
         return Question(WHERE.format(phrase), answer, pictures)
 
     def moves(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
-        """The motion of an object in the clip; half of the objects are stationary."""
+        """Ask for the motion of an object in the clip; half of the objects are stationary."""
         facts = extract_facts(
             self.scene(item), item.prefix_start, item.prefix_stop, item.target_frame
         )
@@ -181,26 +183,26 @@ class QuestionBuilder:
             return None
         stationary = rng.random() < 0.5
         chosen = [o for o in visible if (o.speed == "stationary") == stationary] or visible
-        o = chosen[rng.integers(len(chosen))]
+        fact = chosen[rng.integers(len(chosen))]
         moment = f"{facts.instant[0].upper()}{facts.instant[1:]}"
-        heading = f" toward the {o.heading}" if o.heading else ""
-        motion = "does not move" if o.speed == "stationary" else f"moves {o.speed}{heading}"
-        answer = f"{moment}, the {o.object} is {o.region} and {motion}."
-        return Question(MOVES.format(o.object), answer, [], after_clip=True)
+        heading = f" toward the {fact.heading}" if fact.heading else ""
+        motion = "does not move" if fact.speed == "stationary" else f"moves {fact.speed}{heading}"
+        answer = f"{moment}, the {fact.object} is {fact.region} and {motion}."
+        return Question(MOVES.format(fact.object), answer, [], after_clip=True)
 
     def clip(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
-        """The clip and its outcome; in half of the samples the target frame is visible."""
+        """Ask for a description of the clip; half of the prompts also show the target frame."""
         if (text := self.describe_clip(item)) is None:
             return None
         target = [Picture(item.scene_id, item.target_frame)]
         return Question(CLIP, text, target if rng.random() < 0.5 else [], after_clip=True)
 
     def compared(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
-        """An object's place in the item's candidates, compared with a description of the clip.
+        """Ask to compare an object's region in each candidate with a description of the clip.
 
-        As in a rationale, the text has the predicted place before the visible places, and the model
-        must not confuse them. The description is part of the prompt: as part of the response it
-        would outweigh the few words about visible places in the loss.
+        The description states the predicted region before the answer states the visible regions,
+        as in a rationale; the model must not confuse them. It is in the prompt, because in the
+        response it would outweigh the few words about visible regions in the loss.
         """
         if (text := self.describe_clip(item)) is None:
             return None
@@ -218,7 +220,7 @@ class QuestionBuilder:
         return Question(question, " ".join(verdicts), pictures, after_clip=True)
 
     def later(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
-        """Which of two distinguishable frames is later; only if something moves after the clip."""
+        """Ask which frame is later: the prefix's last one, or one in which an object has moved."""
         if not (frames := find_moved_frames(self.scene(item), item.prefix_stop)):
             return None
         pair = item.prefix_stop, frames[rng.integers(len(frames))]
@@ -227,7 +229,7 @@ class QuestionBuilder:
         return Question(LATER, answer_line(LETTERS[order.index(1)]), pictures, after_clip=True)
 
     def match(self, item: SelectionItem, rng: np.random.Generator) -> Question | None:
-        """The one candidate that fits a description, if regions distinguish it."""
+        """Ask which candidate fits a description, if regions or missing objects distinguish it."""
         predicates = extract_predicates(item, self.scene(item), self.store.scene)
         predicates = predicates and keep_regional_differences(predicates)
         if not predicates:
@@ -235,7 +237,7 @@ class QuestionBuilder:
         differing = {d.object for c in predicates.candidates for d in c.differences[:1]}
         visible = [o for o in predicates.objects if o.target_sight == "shown"]
         visible.sort(key=lambda o: o.object not in differing)
-        named = ", ".join(f"the {o.object} {o.target_region}" for o in visible[:NAMED])
+        named = ", ".join(f"the {o.object} {o.target_region}" for o in visible[:MAX_NAMED])
         answer = "\n".join([*write_match_lines(predicates, item), answer_line(item.letter)])
         pictures = add_letters([(c.scene_id, c.frame) for c in item.candidates])
         return Question(MATCH.format(named), answer, pictures)
@@ -244,13 +246,13 @@ class QuestionBuilder:
         return self.store.scene(item.scene_id)
 
     def describe_clip(self, item: SelectionItem) -> str | None:
-        """The clip and its outcome by the built-in narrator; None if the clip is too short."""
+        """Return the narrator's description of the clip and its outcome; None for a short clip."""
         return write_description(
             self.scene(item), item.prefix_start, item.prefix_stop, item.target_frame, self.seed
         )
 
     def regions(self, pictures: list[Picture]) -> list[dict[str, str]]:
-        """The regions of the visible objects of each picture."""
+        """Return the regions of the visible objects of each picture, by noun phrase."""
         return [visible_regions(self.store.scene(p.scene_id), p.frame) for p in pictures]
 
     def choose_object(
@@ -260,7 +262,7 @@ class QuestionBuilder:
         places: list[dict[str, str]],
         rng: np.random.Generator,
     ) -> str:
-        """A random visible object, if possible one whose place distinguishes candidates."""
+        """Return a random visible object, preferably one whose region differs between pictures."""
         names = sorted(visible) or [o.noun_phrase for o in self.scene(item).objects]
         names = [p for p in names if len({objects.get(p) for objects in places}) > 1] or names
         return names[rng.integers(len(names))]
@@ -270,14 +272,14 @@ class QuestionBuilder:
         return add_letters([frames[place] for place in rng.permutation(len(frames))])
 
     def random_four(self, item: SelectionItem, rng: np.random.Generator) -> list[Picture]:
-        """An item's own candidates or, easier to distinguish, frames of four random items."""
+        """Return the item's candidates or, easier to distinguish, frames of four random items."""
         if rng.random() < 0.5:
             return self.permuted_candidates(item, rng)
         items = [self.items[k] for k in rng.integers(len(self.items), size=len(LETTERS))]
         return add_letters([self.random_frame(other, rng) for other in items])
 
     def random_frame(self, item: SelectionItem, rng: np.random.Generator) -> tuple[str, int]:
-        """A frame of an item's candidates or prefix."""
+        """Return a random frame of an item's candidates or prefix."""
         frames = [(c.scene_id, c.frame) for c in item.candidates]
         frames += [(item.scene_id, f) for f in self.prefix_frames(item)]
         return frames[rng.integers(len(frames))]
@@ -297,7 +299,7 @@ KINDS: dict[str, tuple[Callable[..., Question | None], int]] = {
     "later": (QuestionBuilder.later, 1),
     "match": (QuestionBuilder.match, 1),
 }
-"""The kinds of questions: their method, and how often they are asked per item and epoch."""
+"""The kinds of questions: their method, and how many samples an item has of them."""
 
 
 def add_letters(frames: list[tuple[str, int]]) -> list[Picture]:
@@ -311,7 +313,7 @@ def format_place(letter: str, phrase: str, place: str | None) -> str:
 
 
 def visible_regions(scene: Scene, frame: int) -> dict[str, str]:
-    """The region of each visible object of a frame, by the object's phrase."""
+    """Return the region of each visible object of a frame, by the object's noun phrase."""
     return {
         o.noun_phrase: object_region(scene, frame, k)
         for k, o in enumerate(scene.objects)
@@ -320,7 +322,7 @@ def visible_regions(scene: Scene, frame: int) -> dict[str, str]:
 
 
 def describe_frame(scene: Scene, frame: int) -> str:
-    """The visible objects of a frame and their regions, from the top-left to the bottom-right."""
+    """State each visible object's region in a sentence, from the top-left to the bottom-right."""
     order = [region for row in REGIONS for region in row]
     places = [(order.index(region), o) for o, region in visible_regions(scene, frame).items()]
     sentences = [f"The {phrase} is {order[place]}." for place, phrase in sorted(places)]
@@ -330,24 +332,24 @@ def describe_frame(scene: Scene, frame: int) -> str:
 def visible_objects(
     scene: Scene, frame: int
 ) -> Iterator[tuple[int, tuple[float, float], tuple[str, ...]]]:
-    """The clearly visible objects of a frame: index, place as shares of width and height, words."""
+    """Yield index, place (shares of width and height) and words of each clearly visible object."""
     places = scene.image_positions[frame] / np.asarray(scene.image_size)
-    visible = scene.in_view[frame] & (scene.visible_fraction[frame] > CLEAR)
+    visible = scene.in_view[frame] & (scene.visible_fraction[frame] > CLEARLY_VISIBLE)
     for k in np.flatnonzero(visible):
         yield int(k), tuple(places[k].tolist()), tuple(scene.objects[k].noun_phrase.split())
 
 
 def find_moved_frames(scene: Scene, start: int) -> list[int]:
-    """The frames after `start` in which an object in view has moved by more than MOVED."""
+    """Return frames after `start` where an object in view has moved more than MIN_DISPLACEMENT."""
     displacement = scene.image_positions[start + 1 :] - scene.image_positions[start]
-    far = np.hypot(*np.moveaxis(displacement, -1, 0)) > MOVED * scene.image_size[0]
+    far = np.hypot(*np.moveaxis(displacement, -1, 0)) > MIN_DISPLACEMENT * scene.image_size[0]
     in_view = scene.in_view[start + 1 :] & scene.in_view[start]
     return (start + 1 + np.flatnonzero((far & in_view).any(axis=1))).tolist()
 
 
 def keep_regional_differences(predicates: Predicates) -> Predicates | None:
-    """Predicates with only the differences in regions and missing objects; None if a wrong
-    candidate has no such difference."""
+    """Return predicates with only the differences in regions and missing objects, or None if a
+    wrong candidate has no such difference."""
     candidates = []
     for c in predicates.candidates:
         differences = tuple(d for d in c.differences if d.kind in ("region", "missing"))

@@ -11,7 +11,7 @@ from data.store import Store
 
 
 def check_training(store: Store, queries: Sequence[RetrievalQuery], negatives: int) -> None:
-    """Raises UserError where a query repeats, refers to a test scene, or has fewer than
+    """Raises UserError if a query occurs twice, refers to a test scene, or has fewer than
     `negatives` hard negatives."""
     _refuse(store, "duplicate-record", _find_repeated("retrieval", queries))
     _refuse(store, "split-leak", _find_leaks(store, queries, "test"))
@@ -27,7 +27,7 @@ def check_training(store: Store, queries: Sequence[RetrievalQuery], negatives: i
 def check_test(
     store: Store, queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
 ) -> None:
-    """Raises UserError where there is no query, a query or frame repeats, a query refers to a
+    """Raises UserError if there is no query, a query or frame occurs twice, a query refers to a
     training scene, or the database lacks a target."""
     if not queries:
         raise UserError(
@@ -46,7 +46,7 @@ def check_test(
 
 
 def _find_leaks(store: Store, queries: Sequence[RetrievalQuery], other: str) -> list[str]:
-    """Describe the references of one split's queries to scenes of the other split."""
+    """Describe every reference of a query to a scene of the split `other`."""
     scenes = {*store.scene_ids(other), *(q.scene_id for q in store.retrieval(other))}
     return [
         f"query {q.query_id} of the {q.split} split refers to scene {f.scene_id} of the {other} "
@@ -64,9 +64,9 @@ def _find_repeated(table: str, records: Sequence[RetrievalQuery | FrameRef]) -> 
 
 def _refuse(store: Store, code: str, problems: Sequence[str], advice: str = "") -> None:
     if problems:
-        more = f" ({len(problems) - 1} more)" if len(problems) > 1 else ""
+        more = f" ({len(problems) - 1} more problems)" if len(problems) > 1 else ""
         raise UserError(
             f"{store.folder}: {problems[0]}{more}; {advice}delete this folder and build it again "
-            "with python -m data.build",
+            "with python -m data.build benchmark=NAME",
             code=code,
         )

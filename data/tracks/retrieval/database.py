@@ -1,10 +1,10 @@
-"""Databases of frames that retrieval ranks, without twins.
+"""Databases of frames that retrievers rank, without near-duplicates.
 
-Twins are frames that look alike: the same objects are visible, and none of them has moved by a
-pixel. The oracle decides this, so databases are built before any frame is rendered.
+Near-duplicates are frames in which the same objects are visible within a pixel of each other (twins
+in a benchmark's counts). They are found from the oracle, before any frame is rendered.
 
-The future-state queries have one source of frames, of which the standard test's database is a part,
-and the counterfactual queries have another (paper, Table 1 and "Query constructions").
+The database of the future-state queries contains that of the standard test; the counterfactual
+queries have another one (paper, Table 1 and "Query constructions").
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -22,16 +22,16 @@ from data.tracks.build_items import builder_name, cell_quotas
 from data.tracks.quota import named_rng, round_robin
 from data.world.displacement import on_screen_positions
 
-TWIN_DISTANCE = 1.0
-"""Frames are twins where no object's position differs by this much, px at 336 x 336."""
+DUPLICATE_DISTANCE = 1.0
+"""Near-duplicates differ by less than this in all coordinates of objects, px at 336 x 336."""
 VISIBLE_FRACTIONS = (0.02, 0.08)
-"""Minimum visible fractions of an object that counts as visible. Frames are twins if they agree
-under either bound, so that a fraction near one bound does not make twins differ."""
+"""Thresholds of the visible fraction of a visible object. Frames that agree under either threshold
+are near-duplicates, so that a fraction close to one threshold makes no difference."""
 
 
 @dataclass
 class UniqueFrames:
-    """Frames of which no two are twins, and the number of frames that were left out as twins."""
+    """A set of frames without near-duplicates. `left_out` counts the near-duplicates not added."""
 
     scene_of: Callable[[str], Scene]
     frames: dict[FrameRef, None] = field(default_factory=dict)
@@ -39,13 +39,15 @@ class UniqueFrames:
     _positions: dict[tuple, list[np.ndarray]] = field(default_factory=lambda: defaultdict(list))
 
     def add(self, frame: FrameRef) -> bool:
-        """Add a frame unless it or a twin of it is present, and return whether it was added."""
+        """Add a frame unless it or a near-duplicate is in the set; return whether it was added."""
         if frame in self.frames:
             return False
         appearances = list(_appearances(self.scene_of(frame.scene_id), frame.frame))
         for objects, positions in appearances:
             others = self._positions[objects]
-            if any(np.abs(other - positions).max(initial=0) < TWIN_DISTANCE for other in others):
+            if any(
+                np.abs(other - positions).max(initial=0) < DUPLICATE_DISTANCE for other in others
+            ):
                 self.left_out += 1
                 return False
         for objects, positions in appearances:
@@ -54,10 +56,10 @@ class UniqueFrames:
         return True
 
     def fill(self, names: list[str], wanted: int, seed: int) -> list[FrameRef]:
-        """Add `wanted` more frames of the scenes `names`, a random one of each scene in turn.
+        """Add `wanted` frames of the scenes `names`, a random frame of each scene in turn.
 
         Returns:
-            The added frames; fewer where the scenes have no more.
+            The added frames; fewer than `wanted` if the scenes have no more.
         """
 
         def new_frames(name: str) -> Iterator[FrameRef]:
@@ -69,9 +71,9 @@ class UniqueFrames:
 
 
 def _appearances(scene: Scene, frame: int) -> Iterable[tuple[tuple, np.ndarray]]:
-    """The visible objects of a frame and their positions, by each of `VISIBLE_FRACTIONS`."""
+    """Yield a frame's visible objects and their positions for each of `VISIBLE_FRACTIONS`."""
     visible = scene.visible_fraction[frame]
-    # NaN: the simulator's record has no visible fraction, only whether the object is in view.
+    # NaN means that the simulator records only whether the object is in view.
     visible = np.where(np.isnan(visible), 1.0, visible) * scene.in_view[frame]
     positions = on_screen_positions(scene)[0][frame]
     order = sorted(range(len(scene.objects)), key=lambda k: str(scene.objects[k]))
@@ -89,22 +91,23 @@ def make_databases(
     """Choose the frames of every database.
 
     Returns:
-        The queries whose target has no twin in its database, with the standard test marked; frames
-        by database; and counts of the queries and frames that were left out.
+        The queries whose target has no near-duplicate in its database, with the standard test
+        marked; frames by database; and counts of the queries and frames that were left out.
     """
-    unique, kept, twins = {}, {}, {}
+    unique, kept, dropped = {}, {}, {}
     for pool in POOLS:
         unique[pool] = UniqueFrames(scene_of)
-        kept[pool] = drop_twins(cfg, [q for q in queries if q.pool == pool], unique[pool])
-        twins[pool] = unique[pool].left_out
+        own = [q for q in queries if q.pool == pool]
+        kept[pool] = drop_duplicates(cfg, own, unique[pool])
+        dropped[pool] = unique[pool].left_out
     kept["future"] = mark_standard(kept["future"], cfg.retrieval.standard)
-    test, source = future_databases(cfg, kept["future"], scene_ids, unique["future"])
-    absent = counterfactual_database(cfg, kept["counterfactual"], unique["counterfactual"])
+    test, future = future_databases(cfg, kept["future"], scene_ids, unique["future"])
+    counterfactual = counterfactual_database(cfg, kept["counterfactual"], unique["counterfactual"])
     counts = {
-        "queries dropped, target has a twin": sum(twins.values()),
-        "frames left out, twins": sum(unique[p].left_out - twins[p] for p in POOLS),
+        "queries dropped, target has a twin": sum(dropped.values()),
+        "frames left out, twins": sum(unique[p].left_out - dropped[p] for p in POOLS),
     }
-    databases = {"test": test, "future": source, "counterfactual": absent}
+    databases = {"test": test, "future": future, "counterfactual": counterfactual}
     return [*kept["future"], *kept["counterfactual"]], databases, counts
 
 
@@ -114,8 +117,8 @@ def future_databases(
     scene_ids: dict[str, list[str]],
     unique: UniqueFrames,
 ) -> tuple[list[FrameRef], list[FrameRef]]:
-    """The standard test's database, of test scenes only, and the future-state queries' source,
-    which contains it."""
+    """Return the database of the standard test, which has frames of test scenes only, and the
+    database of all future-state queries, which contains it."""
     if not queries:
         return [], []
     track = cfg.retrieval
@@ -129,28 +132,27 @@ def future_databases(
 def counterfactual_database(
     cfg: BenchmarkConfig, queries: list[RetrievalQuery], unique: UniqueFrames
 ) -> list[FrameRef]:
-    """The source of the counterfactual queries.
+    """Return the database of the counterfactual queries.
 
-    It holds their targets, then their hard negatives (the factual frame of each query first), then
-    other frames of the counterfactual scenes. Test queries come before training queries, because
-    only they are ranked against this source.
+    It contains their targets, then their hard negatives (the factual frames of all queries first),
+    then other frames of the counterfactual scenes. The hard negatives of test queries come before
+    those of training queries, because only test queries are evaluated on this database.
     """
     wanted = cfg.retrieval.counterfactual_source
     ranked = sorted(queries, key=lambda q: q.split != "test")
-    for of_rank in zip(*(q.hard_negatives for q in ranked), strict=True):
-        for frame in of_rank:
-            if len(unique.frames) < wanted:
-                unique.add(frame)
-    absent = sorted({q.target.scene_id for q in queries})
-    unique.fill(absent, wanted - len(unique.frames), cfg.seed)
+    for frame in chain.from_iterable(zip(*(q.hard_negatives for q in ranked), strict=True)):
+        if len(unique.frames) < wanted:
+            unique.add(frame)
+    scenes = sorted({q.target.scene_id for q in queries})
+    unique.fill(scenes, wanted - len(unique.frames), cfg.seed)
     return list(unique.frames)
 
 
-def drop_twins(
+def drop_duplicates(
     cfg: BenchmarkConfig, queries: list[RetrievalQuery], unique: UniqueFrames
 ) -> list[RetrievalQuery]:
-    """Queries up to their quotas whose target is not a twin of another target, because both frames
-    would be right answers. The test split has precedence."""
+    """Return queries up to their quotas, without those whose target is a near-duplicate of another
+    query's target: both frames would be right answers. Test queries are kept first."""
     quotas, kept, chosen = cell_quotas(cfg), Counter(), set()
     for query in sorted(queries, key=lambda q: q.split != "test"):
         cell = builder_name(query.builder), query.split
@@ -162,8 +164,8 @@ def drop_twins(
 
 
 def mark_standard(queries: list[RetrievalQuery], total: int) -> list[RetrievalQuery]:
-    """Mark `total` test queries as the standard test: the first ones of each builder, with equal
-    counts."""
+    """Mark `total` test queries as the standard test: the first queries of each builder, in equal
+    numbers."""
     builders = sorted({q.builder for q in queries if q.split == "test"})
     standard: set[str] = set()
     for k, builder in enumerate(builders):

@@ -1,7 +1,7 @@
 """The six future-state builders: a prefix, a question and the target frame.
 
-Two builders are anchored in time and four in a collision. One second is 25 frames, and the clip
-ends at its last frame.
+The questions of two builders state a time, and those of four refer to a collision. One second is
+25 frames. The end of the clip is the last frame of the scene.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from data.tracks.selection.time import spell_seconds
 from data.world.events import collision_frames
 
 EVENTS_PER_SCENE = 3
-"""Largest number of events of a scene that builder 3 uses."""
+"""Maximum number of events of a scene that builder 3 uses."""
 ONE_PER_SCENE = (4, 5, 6)
-"""Builders that use one event of a scene (paper, retrieval construction)."""
+"""Builders that make at most one query per scene (paper, retrieval construction)."""
 NEXT_COLLISION = "Which frame shows the scene at the moment of the next collision?"
 AFTER_COLLISION = (
     "The observation ends at a collision. Which frame shows the scene 1 second after that "
@@ -44,14 +44,14 @@ def _clock(scene: Scene) -> Iterator[TimedQuestion]:
 
 def _next_event(scene: Scene) -> Iterator[TimedQuestion]:
     for event in collision_frames(scene)[:EVENTS_PER_SCENE]:
-        # The prefix ends before the event, which is the target.
+        # The target is the event, and the prefix ends 1 to 6 frames before it.
         for stop in range(event - 1, event - 7, -1):
             if stop >= FPS and _is_next(scene, stop, event):
                 yield NEXT_COLLISION, stop - FPS, stop, event
 
 
 def _around_event(lead: int, text: str, scene: Scene) -> Iterator[TimedQuestion]:
-    """The prefix ends `lead` frames before an event, and the target is one second later."""
+    """Yield questions whose prefix ends `lead` frames before an event and 1 s before the target."""
     for event in collision_frames(scene):
         stop = event - lead
         if stop >= FPS and stop + FPS < scene.frames and (not lead or _is_next(scene, stop, event)):
@@ -74,7 +74,7 @@ BUILDERS: dict[int, Callable[[Scene], Iterator[TimedQuestion]]] = {
 
 
 def make_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
-    """Make the queries of one builder, and count the dropped ones; see `fill_query_quota`."""
+    """Make the queries of one builder, and count those dropped; see `fill_query_quota`."""
 
     def queries_of(scene: Scene) -> Iterator[RetrievalQuery]:
         for question, start, stop, target in BUILDERS[builder](scene):

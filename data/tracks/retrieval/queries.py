@@ -1,4 +1,4 @@
-"""Functions that all builders of queries share: filling a quota, and hard negatives."""
+"""Functions that all builders of queries share: they fill a quota and choose hard negatives."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from data.world.displacement import cross_scene_displacement, frame_displacement
 OFFSETS = (16, 32, 48)
 """Preferred offsets of hard negatives from the target, in frames on either side."""
 DENSE_STEP = 4
-"""Step in frames of the denser grid for targets whose preferred offsets do not suffice."""
+"""Step in frames of the grid from which hard negatives are chosen if `OFFSETS` do not suffice."""
 
 
 def fill_query_quota(
@@ -28,11 +28,12 @@ def fill_query_quota(
     Scenes take turns in a seeded order: each gives one query before any gives a second one.
 
     Args:
-        queries_of: Returns the queries that a scene allows, without their wrong-time negatives.
+        queries_of: Function that returns all queries about a scene, for `add_hard_negatives`.
+        one_per_scene: Whether a scene gives at most one query.
 
     Returns:
-        The queries, and the number that were dropped because too few distinguishable hard
-        negatives exist.
+        The queries, and the number of queries that were dropped because they have too few
+        distinguishable hard negatives.
     """
 
     def attempts(
@@ -67,12 +68,13 @@ def fill_query_quota(
 def add_hard_negatives(
     query: RetrievalQuery, cell: CellInputs, rng: np.random.Generator
 ) -> RetrievalQuery | None:
-    """Complete a query's hard negatives with wrong-time frames of its target's scene.
+    """Complete a query's hard negatives with other frames of its target's scene.
 
-    All of them differ from the target and from each other by `cell.min_displacement`.
+    The added frames differ from the target, from each other and from the hard negatives that the
+    query already has by at least `cell.min_displacement`.
 
     Returns:
-        The query, or None where there are too few such frames.
+        The query, or None if there are too few such frames.
     """
     scene, target = cell.scene_of(query.target.scene_id), query.target.frame
     displacements = frame_displacements(scene)

@@ -1,4 +1,4 @@
-"""Selection items with distractors that differ visibly from the target."""
+"""Makes selection items with distractors that differ visibly from the target."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from data.world.displacement import (
 )
 
 BUILDERS_VERSION = "5"
-"""Version of the item and query builders. Increase it when a change makes the same scenes yield
-other items or queries."""
+"""Version of the code that makes items and queries. Increase it when a change gives other items or
+queries for the same scenes."""
 
 Pool = tuple[Iterable[Candidate], int]
-"""Possible distractors, best first, and the maximum number of them to use."""
+"""Possible distractors in order of preference, and the maximum number of them to use."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Timing:
     event: int | None = None
 
     def outside_prefix(self, frames: Iterable[int]) -> list[int]:
-        """Return the frames that are outside the prefix: a model could recognise the others."""
+        """Return the frames outside the prefix; a model would recognise frames from inside it."""
         return [int(f) for f in frames if not self.start <= f <= self.stop]
 
 
@@ -44,8 +44,8 @@ class Family:
 
     Attributes:
         cells: How to construct the items of each subtype.
-        timings: Returns the timings that items of a subtype can have in a scene.
-        make_item: Makes the item of a subtype at one of these timings, or returns None.
+        timings: Function that returns the timings that items of a subtype can have in a scene.
+        make_item: Function that makes the item of a subtype at one of these timings, or None.
     """
 
     cells: Mapping[str, Any]
@@ -58,10 +58,10 @@ class DistractorPicker:
     """Makes items whose candidates differ visibly from each other.
 
     Attributes:
-        min_displacement: Between any two candidates, at least one object must move by this many px
-            at 336 x 336.
+        min_displacement: Between any two candidates, the position of at least one object must
+            differ by this many px at 336 x 336.
         scene_ids: Scenes of the split; cross-scene distractors come from these.
-        scene_of: Loads a scene by its id.
+        scene_of: Function that loads a scene by its id.
         dropped: Number of timings for which fewer than three distractors were found.
     """
 
@@ -85,18 +85,18 @@ class DistractorPicker:
         """Make an item from the first distractors of each pool that differ by `min_displacement`.
 
         Args:
-            about: Indices of objects, of which at least one must move between two frames of the
-                scene; None for all objects. Frames of other scenes may differ in any object.
-            fields: The question and the construction axes that apply.
+            about: Indices of the objects whose positions count in frames of the item's scene; None
+                for all objects. In frames of other scenes, all objects count.
+            fields: The question, and the other fields of the item that apply to its family.
 
         Returns:
             An item whose first candidate is the target (`data.tracks.quota.fill_quota` shuffles
-            them), or None if fewer than three candidates differ enough.
+            the candidates), or None if fewer than three distractors differ enough.
         """
         chosen = [Candidate(scene.scene_id, timing.target)]
         for k, (pool, count) in enumerate(pools):
             # Stop if the remaining pools cannot complete the item.
-            if len(chosen) + sum(most for _, most in pools[k:]) < 4:
+            if len(chosen) + sum(limit for _, limit in pools[k:]) < 4:
                 break
             fitting = (
                 candidate
@@ -105,7 +105,7 @@ class DistractorPicker:
                     self._displacement(candidate, c, about) >= self.min_displacement for c in chosen
                 )
             )
-            # `fitting` is lazy, so each candidate is also compared with those of this loop.
+            # `fitting` is lazy, so it also compares each candidate with those chosen in this loop.
             for candidate in islice(fitting, min(count, 4 - len(chosen))):
                 chosen.append(candidate)
         if len(chosen) < 4:
@@ -129,28 +129,28 @@ class DistractorPicker:
         )
 
     def sample_scenes(self, scene: Scene, rng: np.random.Generator, count: int) -> list[Scene]:
-        """Sample about `count` other scenes of the split. Scenes that share more objects with
+        """Sample up to `count` + 1 other scenes of the split. Scenes that share more objects with
         `scene` come first."""
         names = rng.choice(self.scene_ids, min(count + 1, len(self.scene_ids)), replace=False)
         scenes = [self.scene_of(str(name)) for name in names if name != scene.scene_id]
         return sorted(scenes, key=lambda s: -len({*scene.objects} & {*s.objects}))
 
     def _displacement(
-        self, one: FrameRef, two: FrameRef, about: tuple[int, ...] | None = None
+        self, a: FrameRef, b: FrameRef, about: tuple[int, ...] | None = None
     ) -> float:
-        scene = self.scene_of(one.scene_id)
-        if one.scene_id == two.scene_id:
-            return float(frame_displacements(scene, about)[one.frame, two.frame])
-        return cross_scene_displacement(scene, one.frame, self.scene_of(two.scene_id), two.frame)
+        scene = self.scene_of(a.scene_id)
+        if a.scene_id == b.scene_id:
+            return float(frame_displacements(scene, about)[a.frame, b.frame])
+        return cross_scene_displacement(scene, a.frame, self.scene_of(b.scene_id), b.frame)
 
 
 def balance_in_time(
     pool: Iterable[Candidate], target: int, rng: np.random.Generator
 ) -> tuple[Pool, Pool, Pool]:
-    """Return frames before the target, of which 0 to 3 (a random number) are used, frames after it
-    for the rest, and all frames, in case too few of the others differ enough.
+    """Divide a pool so that a random number (0 to 3) of the distractors precedes the target.
 
-    Otherwise the order of the candidates in time would reveal the answer.
+    The pools are frames before the target, frames after it, and all frames in case these are too
+    few. Without this, the candidates' order in time would often reveal the target.
     """
     pool = list(pool)
     earlier = int(rng.integers(4))
@@ -162,13 +162,13 @@ def balance_in_time(
 def visible_objects(scene: Scene, timing: Timing) -> tuple[int, ...]:
     """Return the indices of the objects that are on screen in at least one frame of the prefix.
 
-    Within a scene only these may distinguish candidates: a model cannot predict that another object
-    enters.
+    Only these objects may distinguish candidates of one scene, because a model cannot predict that
+    another object will enter.
     """
     on_screen = on_screen_positions(scene)[1][timing.start : timing.stop + 1]
     return tuple(np.flatnonzero(on_screen.any(axis=0)).tolist())
 
 
 def scene_candidates(scene: Scene, frames: Iterable[int], source: str) -> Iterator[Candidate]:
-    """Yield frames of a scene as candidates of one source."""
+    """Yield frames of a scene as candidates with this `source`."""
     return (Candidate(scene.scene_id, int(frame), source) for frame in frames)

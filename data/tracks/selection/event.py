@@ -1,4 +1,4 @@
-"""The event family: which frame shows the scene at, or just after, a collision.
+"""The event family: items whose target shows the scene at, or just after, a collision.
 
 Framing *future*: the prefix ends `gap` frames before the collision, and the target is the frame of
 the collision. Framing *contact*: the prefix ends at the collision, and the target is `gap` frames
@@ -32,7 +32,7 @@ TAIL = 10
 OFFSETS = (16, 32, 48)
 """Offsets of same-scene distractors from the target, in frames on either side."""
 CROSS_SCENES = 24
-"""Number of scenes to sample for cross-scene distractors."""
+"""Number of other scenes to sample for cross-scene distractors."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ CELLS = {
     "contact_offset": EventCell("contact", "same_offset", 10),
     "contact_match": EventCell("contact", "same_obj_match", 10),
 }
-"""The paper's seven subtypes (paper, Table "The seven event-anchored subtypes")."""
+"""Cells by subtype (paper, Table "The seven event-anchored subtypes")."""
 
 
 def timings(subtype: str, scene: Scene) -> list[Timing]:
@@ -93,8 +93,8 @@ def make_item(
 def _wrong_frames(
     cell: EventCell, scene: Scene, timing: Timing, rng: np.random.Generator
 ) -> Iterable[int]:
-    """Return frames outside the prefix: for same_offset those at `OFFSETS` from the target in
-    random order, else all frames, the most similar to the target first."""
+    """Return frames outside the prefix that are not the target: for same_offset, those at `OFFSETS`
+    from the target in random order; otherwise all, with the most similar to the target first."""
     target = timing.target
     if cell.distractors == "same_offset":
         pool = [f for o in OFFSETS for f in (target - o, target + o) if 0 <= f < scene.frames]

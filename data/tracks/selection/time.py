@@ -1,4 +1,4 @@
-"""The time family: which frame shows the scene one or two seconds after the prefix ends."""
+"""The time family: items whose target shows the scene one or two seconds after the prefix."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def make_item(
 ) -> SelectionItem | None:
     """Make an item whose distractors are other frames after the prefix.
 
-    The question and the subtype state the seconds from the prefix to the target, rounded down.
+    The item's question and subtype state the whole seconds from the prefix to the target of the
+    timing; the argument `subtype` is not used.
     """
     horizon = timing.target - timing.stop
     seconds = horizon // SELECTION_SECOND

@@ -1,10 +1,10 @@
-"""The window family: which frame shows the scene a short horizon after the prefix.
+"""The window family: items whose target is a few frames (the horizon) after the prefix.
 
-A cell has a group (of events, see `window_group`), a window family, a horizon in frames and a
-difficulty. The window family selects the objects that an item is about, among the objects on screen
-in the prefix (A: all, B: the pair of the next collision, C: the object that moves most). Similarity
-and the minimum displacement are computed for these objects only. Distractors of hard items are the
-frames most similar to the target; those of easy items are random frames of the less similar half.
+A cell has a group of events (see `window_group`), a window family, a horizon in frames and a
+difficulty. The window family selects the objects of the item, among the objects on screen in the
+prefix (A: all, B: the pair of the next collision, C: the object that moves most). Similarity and
+minimum displacement are computed for these objects only. Distractors of hard items are the frames
+most similar to the target; those of easy items are random frames of the less similar half.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CELLS = {
 
 
 def timings(subtype: str, scene: Scene) -> list[Timing]:
-    """Return all timings with the horizon of the cell. `make_item` rejects other groups."""
+    """Return all timings with the horizon of the cell; `make_item` then checks the group."""
     horizon = CELLS[subtype].horizon
     stops = range(PREFIX_FRAMES - 1, scene.frames - horizon)
     return [Timing(stop - PREFIX_FRAMES + 1, stop, stop + horizon) for stop in stops]
@@ -56,8 +56,8 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 def make_item(
     subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: DistractorPicker
 ) -> SelectionItem | None:
-    """Make an item at a timing; None if the timing has another group, or if none of the objects
-    that the item is about is on screen in the prefix."""
+    """Make an item at a timing. Returns None also if the timing belongs to another group, or if no
+    object of `subject_objects` is on screen in the prefix."""
     cell = CELLS[subtype]
     if window_group(scene, timing.start, timing.stop, cell.horizon) != cell.group:
         return None
@@ -70,7 +70,7 @@ def make_item(
     frames = np.array(timing.outside_prefix(similar[similar != timing.target]))
     source = "same_near"
     if cell.difficulty == "easy":
-        # Shuffle: the most different frames are consecutive, so the target would stand out.
+        # Shuffled, because the least similar frames are consecutive and the target would stand out.
         frames, source = rng.permutation(frames[len(frames) // 2 :]), "same_far"
     return picker.make_item(
         scene,
@@ -86,9 +86,9 @@ def make_item(
 
 
 def subject_objects(cell: WindowCell, scene: Scene, timing: Timing) -> tuple[int, ...] | None:
-    """Return the indices of the objects that an item is about; None for all objects.
+    """Return the indices of the objects that the window family selects; None for all objects.
 
-    The tuple is empty if no collision follows (B) or no object on screen moves (C).
+    The tuple is empty if no collision occurs up to the target (B), or nothing on screen moves (C).
     """
     stop, target = timing.stop, timing.target
     if cell.window_family == "A":

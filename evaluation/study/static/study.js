@@ -1,6 +1,7 @@
 "use strict";
 
-// A question appears when all of its media are loaded and the server knows it; then both clocks start.
+// A question appears when all of its media are loaded and the server has recorded this. At that
+// moment both clocks start: the server's and the browser's.
 
 const page = document.querySelector("main.question");
 const form = document.querySelector("main form");
@@ -9,14 +10,14 @@ const video = document.querySelector("video");
 
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 
-// Repeat a request until the server answers: it may be down for a while.
+// Repeat a request until the server responds, because it may be down for a while.
 async function fetchUntilAnswered(address, options) {
   for (;;) {
     try {
       const response = await fetch(address, options);
       if (response.status < 500) return response;
     } catch (error) {
-      // Unreachable: repeat as after a server error.
+      // The server is unreachable: try again, as after a server error.
     }
     status.textContent = "The study cannot be reached. Trying again…";
     await pause(1500);
@@ -46,7 +47,7 @@ async function load(element) {
 
 function play() {
   video.currentTime = 0;
-  // Browsers that save power refuse; the button remains.
+  // A browser that saves power may refuse to play; the annotator can use the button.
   video.play().catch(() => {});
 }
 

@@ -1,4 +1,4 @@
-"""An export holds the benchmark: `datasets` loads from it the store's records and frames."""
+"""`datasets` loads from an export the same records and frames that the store contains."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def exported(micro_store: Store, tmp_path_factory) -> Path:
-    """The small benchmark with images, in several files a split."""
+    """An export of the small benchmark with images, in several files per split."""
     folder = tmp_path_factory.mktemp("exports") / "micro"
     with pytest.MonkeyPatch.context() as small:
         small.setattr(huggingface, "GROUP_IMAGES", 64)
@@ -101,7 +101,7 @@ def test_a_killed_export_resumes_and_gives_the_same_bytes(
     folder = tmp_path / "copy" / "micro"
     shutil.copytree(micro_store.folder, folder)
     damaged = Store(folder, micro_store.manifest)
-    # A test scene: every shard of the training items is written by then.
+    # The scene is a test scene, so all shards of training items are written before it is read.
     broken = folder / "scenes" / f"{damaged.scene_ids('test')[0]}.npz"
     whole = broken.read_bytes()
     broken.write_bytes(whole[: len(whole) // 2])

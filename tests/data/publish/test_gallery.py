@@ -1,4 +1,4 @@
-"""A gallery shows the benchmark's items and queries as the store holds them."""
+"""A gallery shows items and queries of the benchmark with the frames that the store contains."""
 
 from __future__ import annotations
 

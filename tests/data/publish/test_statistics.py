@@ -1,4 +1,4 @@
-"""Statistics and baselines, on scenes for which they are known."""
+"""Statistics and the accuracy of baselines, on scenes for which both are known."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def accuracy(items: list, store: SimpleNamespace) -> dict[str, float]:
     return {name: np.mean([score[name] for score in scores]) for name in BASELINES}
 
 
-def test_constant_velocity_is_right_where_velocities_are_constant() -> None:
+def test_velocity_baseline_is_right_where_velocities_are_constant() -> None:
     assert accuracy(*synthetic_store())["velocity"] == 1
 
 
@@ -58,7 +58,7 @@ def test_nearest_and_farthest_compare_with_the_last_observed_frame() -> None:
     assert scores["first"] == np.mean([i.answer == 0 for i in items])
 
 
-def test_a_tie_counts_its_share() -> None:
+def test_a_baseline_that_ties_scores_the_share_of_the_tied_candidates() -> None:
     items, _ = synthetic_store(4)
     still = synthetic.scene([(0, 0)], [(0, 0)])
     store = SimpleNamespace(scene=lambda _: still, manifest=STANDARD)

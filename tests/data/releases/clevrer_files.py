@@ -13,13 +13,11 @@ from tests.data.releases.pictures import picture
 
 
 def clevrer_annotation(index: int = 0, frames: int = 128) -> dict[str, Any]:
-    """A cube at rest at the origin, and a sphere that rolls along y and out of view."""
+    """An annotation: a cube rests at the origin, and a sphere rolls along y and out of view."""
 
     def states(f: int) -> list[dict[str, Any]]:
-        still, zero = (
-            {"location": [0.0, 0.0, 0.0], "orientation": [0.3, -0.5, 1.1]},
-            [0.0, 0.0, 0.0],
-        )
+        zero = [0.0, 0.0, 0.0]
+        still = {"location": zero, "orientation": [0.3, -0.5, 1.1]}
         rolling = {"location": [0.5, 0.05 * f - 1, 0.2], "orientation": [-0.25 * f, 0.0, 0.0]}
         still |= {"velocity": zero, "angular_velocity": zero}
         rolling |= {"velocity": [0.0, 1.25, 0.0], "angular_velocity": [-6.25, 0.0, 0.0]}
@@ -43,6 +41,7 @@ def clevrer_annotation(index: int = 0, frames: int = 128) -> dict[str, Any]:
 def write_clevrer_scene(
     folder: Path, record: Any, index: int = 0, video_frames: int = 128
 ) -> tuple[Path, Path]:
+    """Write an annotation, a record or its text, and a video. Return the paths of both files."""
     span = f"{index // 1000 * 1000:05d}-{index // 1000 * 1000 + 1000:05d}"
     annotation = folder / f"annotation_train/annotation_{span}/annotation_{index:05d}.json"
     annotation.parent.mkdir(parents=True, exist_ok=True)

@@ -18,8 +18,11 @@ ARRAYS = (
 
 
 def movi_example(contacts: list[tuple[float, int, int, float, float]] | None = None) -> dict:
-    """Three objects that fall, the last out of view; `contacts` are (frame, instance, instance,
-    height, vertical share of the normal)."""
+    """Three falling objects, the last of which is never visible.
+
+    Args:
+        contacts: Tuples of a frame, two instances, a height, and the z component of the normal.
+    """
     s = np.arange(1, 25) / 12
     x = np.stack([np.zeros(24), 1 + s, -1 - s])
     z = np.stack([5 - 0.5 * 9.81 * s**2] * 3)

@@ -12,15 +12,17 @@ from PIL import Image
 from tests.data.releases.pictures import picture, png
 
 IDS = (16_777_217, 3, 16_777_216)
-"""Unsorted object ids, two of which are equal as float32."""
+"""Unsorted object ids, two of which are equal when rounded to float32."""
 COLORS = np.array([[200, 10, 30], [20, 220, 90], [1, 2, 3]], np.uint8)
+"""Colours of the objects in the segmentation images."""
 
 
 def physion_trial(frames: int = 60) -> dict[str, Any]:
-    """Three objects at rest on the floor, with y up.
+    """Three objects at rest on the floor; the y axis points up.
 
-    For each frame, `pairs` lists the ids in contact, `states` their states, `environment` the ids
-    that touch walls or floor, and `points` the (normal, point) of these contacts.
+    `pairs` has for each frame the pairs of ids in contact, and `states` the state of each contact.
+    `environment` has for each frame the ids that touch a wall or the floor, and `points` the normal
+    and the point of each of these contacts. `hidden` has the indices of hidden objects by frame.
     """
     places = np.tile(np.float32([[-1, 0.5, 0], [0, 0.5, 1], [1, 0.5, 0]]), (frames, 1, 1))
     return {
@@ -45,7 +47,13 @@ PROJECTION = [[1.5, 0, 0, 0], [0, 2, 0, 0], [0, 0, -1.002, -0.2], [0, 0, -1, 0]]
 def write_physion(
     path: Path, trial: dict[str, Any], states: bool = True, suffix: str = "", first: int = 0
 ) -> Path:
-    """Write a trial; later versions have `suffix` and `first`, and early ones have no `states`."""
+    """Write a trial.
+
+    Args:
+        states: Write the states of contacts, which files of early versions lack.
+        suffix: End of the keys of images and cameras in files of later versions.
+        first: Number of the first frame; 1 in files of later versions.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
         static = file.create_group("static")

@@ -1,4 +1,4 @@
-"""Benchmarks over another simulator's release: invalid records are logged and left out."""
+"""Benchmarks are built from the releases of other simulators; invalid records are left out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def movi(tmp_path_factory) -> Path:
-    """Twelve scenes, one of them damaged; two objects touch at a different frame in each."""
+    """A release of twelve scenes, one of them damaged. Two objects touch in each, at five frames in
+    turn."""
     folder = tmp_path_factory.mktemp("releases") / "movi_a"
     for k in range(12):
         example = movi_example([(12.0 + k % 5, 0, 1, 1.0, 0.0)])

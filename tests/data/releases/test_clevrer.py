@@ -30,7 +30,7 @@ def test_a_scene_has_the_values_of_its_annotation(tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.velocities[40, 1], [0, 1.25, 0])
     np.testing.assert_allclose(scene.angular_velocities[40, 1], [-6.25, 0, 0])
     np.testing.assert_allclose(scene.image_positions[:, 0], np.tile([240, 160], (128, 1)))
-    # The flag is the annotation's, whatever the camera would see.
+    # in_view is read from the annotation instead of being computed from the camera.
     assert scene.in_view[:, 1].tolist() == [f < 90 for f in range(128)]
     assert (scene.visible_fraction[:, 0] == 1).sum() < 128
 
@@ -61,7 +61,7 @@ DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
     "a frame without an object": (
         lambda r: r["motion_trajectory"][9]["objects"].pop(0), "frame 9"
     ),
-    "a frame less": (lambda r: r["motion_trajectory"].pop(), "127"),
+    "one frame too few": (lambda r: r["motion_trajectory"].pop(), "127"),
     "an unknown shape": (lambda r: r["object_property"][0].update(shape="cone"), "0.shape"),
     "a collision with an unknown object": (
         lambda r: r["collision"][0].update(object_ids=[0, 5]), "[0, 5]"
@@ -80,8 +80,9 @@ def test_an_annotation_without_the_published_layout_is_refused(tmp_path: Path, d
 
 
 def test_a_broken_annotation_is_refused(tmp_path: Path) -> None:
-    cut = json.dumps(clevrer_annotation())[:4000]
-    for text, code in (("", "damaged-file"), (cut, "damaged-file"), ("[]", "invalid-record")):
+    truncated = json.dumps(clevrer_annotation())[:4000]
+    damaged = (("", "damaged-file"), (truncated, "damaged-file"), ("[]", "invalid-record"))
+    for text, code in damaged:
         path, _ = write_clevrer_scene(tmp_path, text, 10800)
         with raises_user_error(code, contains="annotation_10800.json"):
             clevrer.read_scene(path, tmp_path, "test")

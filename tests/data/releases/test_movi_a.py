@@ -1,4 +1,5 @@
-"""MoVi-A's two formats give the same scene, and contact points become events."""
+"""Both formats of MoVi-A give the same scene, contacts become collisions and landings, and invalid
+files are refused."""
 
 from __future__ import annotations
 
@@ -46,7 +47,7 @@ def test_a_scene_has_the_published_values(read_format, tmp_path: Path) -> None:
     assert [o.noun_phrase for o in scene.objects] == [
         "large red metal cube", "small cyan rubber sphere", "small red metal cylinder",
     ]  # fmt: skip
-    # Video frame 0 is a twelfth of a second after the physics begins.
+    # Frame 0 of the video shows the scene 1/12 s after the simulation begins.
     fallen = 5 - 9.81 / 2 * (np.arange(1, 25) / 12) ** 2
     np.testing.assert_allclose(scene.positions[:, 0, 2], fallen, rtol=1e-5)
     np.testing.assert_allclose(scene.positions[:, 1, 0], 1 + np.arange(1, 25) / 12, rtol=1e-5)
@@ -69,17 +70,23 @@ def test_contact_points_become_one_contact_of_a_pair(read_format, tmp_path: Path
     assert read_format(tmp_path, many).collisions == (Collision(9, (0, 1)),)
 
 
-@pytest.mark.parametrize(("time", "raw", "cut"), [(9.0, 8, 9), (9.05, 9, 9), (0.4, 0, 0)])
-def test_a_contact_is_at_the_first_frame_after_it(tmp_path: Path, time, raw, cut) -> None:
-    """Frame i shows scene frame i + 1. After a truncated time, only the next frame is certainly not
-    before the contact."""
+@pytest.mark.parametrize(
+    ("time", "by_folder", "by_record"), [(9.0, 8, 9), (9.05, 9, 9), (0.4, 0, 0)]
+)
+def test_a_collision_is_the_first_frame_not_before_its_contact(
+    tmp_path: Path, time, by_folder, by_record
+) -> None:
+    """Times of contacts count the simulation's frames, and frame i of the video shows the
+    simulation's frame i + 1. TFRecords truncate the times, so that only the next frame is certainly
+    not before the contact."""
     contact = [(time, 0, 1, 0.5, 0.0)]
-    assert from_folder(tmp_path / "a", contact).collisions == (Collision(raw, (0, 1)),)
-    assert from_record(tmp_path / "b", contact).collisions == (Collision(cut, (0, 1)),)
+    assert from_folder(tmp_path / "a", contact).collisions == (Collision(by_folder, (0, 1)),)
+    assert from_record(tmp_path / "b", contact).collisions == (Collision(by_record, (0, 1)),)
 
 
 def test_contacts_with_the_floor_are_landings_not_collisions(read_format, tmp_path: Path) -> None:
-    """-1 is the floor or an object that is never visible, whose contacts are above or beside."""
+    """Instance -1 is the floor or an object that is never visible. Contacts with such an object are
+    above the floor or have a nearly horizontal normal."""
     contacts = [
         (12.3, 0, -1, 0.001, -1.0),
         (12.35, 0, -1, 0.001, -1.0),
@@ -96,7 +103,8 @@ def test_contacts_with_the_floor_are_landings_not_collisions(read_format, tmp_pa
 def test_events_at_the_first_and_past_the_last_frame_are_dropped(
     read_format, tmp_path: Path
 ) -> None:
-    """An object that is on the floor in the first frame does not land, whatever it does later."""
+    """An object that touches the floor in the first frame has no landing, even after a later
+    fall."""
     floor = [(0.5, 2), (9.5, 2), (9.5, 1), (24.3, 0)]
     contacts = [(24.05, 0, 1, 0.5, 0.0), *((frame, k, -1, 0.0, 1.0) for frame, k in floor)]
     scene = read_format(tmp_path, contacts)
@@ -162,9 +170,9 @@ def test_missing_and_damaged_files_of_a_folder_are_named(tmp_path: Path) -> None
 
 RECORD_DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
     "no positions": (lambda f: f.pop("instances/positions"), "'instances/positions'"),
-    "a value less": (lambda f: f["instances/positions"].pop(), "215"),
+    "one value too few": (lambda f: f["instances/positions"].pop(), "215"),
     "MoVi-B's shapes": (lambda f: f["instances/shape_label"].__setitem__(1, 9), "shape_label"),
-    "a frame less": (lambda f: f["video"].pop(), "23"),
+    "one frame too few": (lambda f: f["video"].pop(), "23"),
 }  # fmt: skip
 
 
@@ -179,18 +187,18 @@ def test_a_record_without_the_published_layout_is_refused(tmp_path: Path, defect
         movi_a.read_scene(path, tmp_path, "test")
 
 
-def test_records_before_a_cut_or_damage_are_read(tmp_path: Path) -> None:
+def test_records_before_a_truncated_or_damaged_record_are_read(tmp_path: Path) -> None:
     features = movi_features(movi_example())
     shard = write_tfrecord(tmp_path / SHARD, [features] * 3)
     whole = shard.read_bytes()
-    for cut in (len(whole) - 500, len(whole) * 2 // 3 + 5):
-        shard.write_bytes(whole[:cut])
+    for length in (len(whole) - 500, len(whole) * 2 // 3 + 5):
+        shard.write_bytes(whole[:length])
         *good, bad = movi_a.list_scenes(tmp_path)
         assert [movi_a.read_scene(path, tmp_path, "test").frames for path in good] == [24, 24]
         with raises_user_error("damaged-file", contains=f"{SHARD}: record 2"):
             movi_a.read_scene(bad, tmp_path, "test")
+    # A byte of the first record's length, and the first tag of its protocol buffer.
     for byte in (5, tfrecord.HEADER):
-        # The length of the first record, and the first tag of its protocol buffer.
         shard.write_bytes(whole[:byte] + bytes([whole[byte] ^ 1]) + whole[byte + 1 :])
         with raises_user_error("damaged-file", contains=f"{SHARD}: record 0"):
             movi_a.read_scene(movi_a.list_scenes(tmp_path)[0], tmp_path, "test")

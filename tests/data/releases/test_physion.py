@@ -1,4 +1,4 @@
-"""Physion's raw trials: axes, cameras and views, and the three kinds of event."""
+"""Physion's raw trials are read: axes, cameras, visibility, three kinds of event, and defects."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ def test_up_is_z_and_a_fall_is_down(tmp_path: Path) -> None:
 
 
 def test_rotations_agree_with_angular_velocities(tmp_path: Path) -> None:
-    """A rotation in TDW's axes moves the same points in ours, at the velocity w x r."""
+    """After the axes of Physion's simulator are converted to ours, a rotation still moves a point
+    to its (converted) position, at the cross product of angular velocity and position."""
     trial = physion_trial()
     spin = np.array([0.3, -0.8, 0.5])
     turns = Rotation.from_rotvec(np.outer(np.arange(60) / 30, spin))
@@ -71,11 +72,11 @@ def test_centres_are_projected_by_the_recorded_camera(tmp_path: Path) -> None:
     looking[:3, 3] = [0, -1, -4]
     trial["camera"] = (looking, trial["camera"][1])
     trial["positions"][:] = [[0, 1, 0], [1, 2, 0], [0, 1, -9]]
-    seen = read(tmp_path, trial).image_positions[0]
-    np.testing.assert_allclose(seen[0], [24, 16])
-    # One to the right and one up, four away, of focal lengths 1.5 and 2 half images: 3/8 and 1/2.
-    np.testing.assert_allclose(seen[1], [24 * (1 + 3 / 8), 16 * (1 - 1 / 2)], rtol=1e-6)
-    assert np.isfinite(seen).all()
+    projected = read(tmp_path, trial).image_positions[0]
+    np.testing.assert_allclose(projected[0], [24, 16])
+    # The point is 1 to the right, 1 up and 4 away; the focal lengths are 1.5 and 2 half images.
+    np.testing.assert_allclose(projected[1], [24 * (1 + 3 / 8), 16 * (1 - 1 / 2)], rtol=1e-6)
+    assert np.isfinite(projected).all()
 
 
 def test_an_object_is_in_view_if_its_colour_is_visible(tmp_path: Path) -> None:
@@ -97,11 +98,14 @@ def test_camera_suffixes_and_first_frames_of_later_versions_are_read(tmp_path: P
     assert images[0].getpixel((1, 1)) == (60, 60, 60)
 
 
-# A1
+# Subtype A1: two objects come into contact.
 
 
-def touch(trial: dict, first: int, last: int, pair: list[int], enters: bool = True) -> None:
-    """Add a contact of a pair from frame `first` to `last`."""
+def add_contact(trial: dict, first: int, last: int, pair: list[int], enters: bool = True) -> None:
+    """Add a contact of a pair from frame `first` to `last`, and its exit in the next frame.
+
+    With `enters=False`, the contact has begun before `first`.
+    """
     for frame in range(first, last + 2):
         state = b"enter" if enters and frame == first else b"stay" if frame <= last else b"exit"
         trial["pairs"][frame].append(pair)
@@ -110,33 +114,34 @@ def touch(trial: dict, first: int, last: int, pair: list[int], enters: bool = Tr
 
 def test_a_collision_is_the_first_contact_that_a_pair_enters(tmp_path: Path) -> None:
     trial = physion_trial()
-    touch(trial, 20, 24, [C, A])
-    touch(trial, 40, 44, [A, C])
-    touch(trial, 22, 30, [B, C])
-    touch(trial, 25, 26, [A, 99])
-    touch(trial, 28, 29, [B, B])
+    add_contact(trial, 20, 24, [C, A])
+    add_contact(trial, 40, 44, [A, C])
+    add_contact(trial, 22, 30, [B, C])
+    add_contact(trial, 25, 26, [A, 99])
+    add_contact(trial, 28, 29, [B, B])
     assert read(tmp_path, trial).collisions == (Collision(20, (0, 2)), Collision(22, (1, 2)))
 
 
 @pytest.mark.parametrize("enters", [True, False])
 def test_pairs_in_contact_from_the_start_are_left_out(tmp_path: Path, enters: bool) -> None:
     trial = physion_trial()
-    touch(trial, 0, 10, [A, B], enters)
-    touch(trial, 30, 35, [B, A])
-    touch(trial, 33, 35, [B, C])
+    add_contact(trial, 0, 10, [A, B], enters)
+    add_contact(trial, 30, 35, [B, A])
+    add_contact(trial, 33, 35, [B, C])
     assert read(tmp_path, trial).collisions == (Collision(33, (1, 2)),)
 
 
 def test_without_states_a_collision_is_a_pair_first_listed_later(tmp_path: Path) -> None:
     trial = physion_trial()
-    # The physics may start after the first frame, so contacts at rest are listed a little later.
-    touch(trial, 1, 50, [A, B])
-    touch(trial, 20, 22, [B, C])
-    touch(trial, 30, 32, [C, B])
+    # The simulation may start after the first frame, so contacts of objects at rest may be listed
+    # from a later frame on.
+    add_contact(trial, 1, 50, [A, B])
+    add_contact(trial, 20, 22, [B, C])
+    add_contact(trial, 30, 32, [C, B])
     assert read(tmp_path, trial, states=False).collisions == (Collision(20, (1, 2)),)
 
 
-# A2
+# Subtype A2: an object at rest begins to move.
 
 
 ONSETS = {
@@ -157,7 +162,7 @@ def test_a_motion_onset_is_the_first_frame_away_from_rest(tmp_path: Path, motion
     assert find_motion_onsets(read(tmp_path, trial)) == onsets
 
 
-# A3
+# Subtype A3: an object lands.
 
 UP, SIDE = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
 
@@ -171,7 +176,7 @@ def test_a_landing_is_the_first_floor_contact_after_a_flight(tmp_path: Path) -> 
         if frame not in range(30, 50):
             trial["environment"][frame].append(C)
             trial["points"][frame].append((UP, (1.1, 0.001, 0.0)))
-    # A bounce lands once.
+    # The object bounces: it loses contact for one frame.
     trial["environment"][27], trial["points"][27] = [], []
     assert read(tmp_path, trial).landings == (Landing(25, 0), Landing(50, 2))
 
@@ -188,14 +193,14 @@ def test_walls_shelves_and_ceilings_are_not_the_ground(tmp_path: Path, normal, p
 
 def test_any_contact_ends_a_flight(tmp_path: Path) -> None:
     trial = physion_trial()
-    touch(trial, 20, 28, [A, B])
+    add_contact(trial, 20, 28, [A, B])
     for frame in (31, 40):
         trial["environment"][frame], trial["points"][frame] = [A], [(UP, (-1.0, 0.0, 0.0))]
     assert read(tmp_path, trial).landings == (Landing(40, 0),)
 
 
 def test_a_contact_point_is_assigned_to_the_nearest_object(tmp_path: Path) -> None:
-    """A lands while C, also after a flight, touches a wall high above the floor."""
+    """Both A and C were in flight. A touches the floor while C touches a wall high above it."""
     trial = physion_trial()
     trial["environment"][30] = [C, A]
     trial["points"][30] = [(SIDE, (1.2, 0.9, 0.0)), (UP, (-0.9, 0.0, 0.1))]
@@ -209,7 +214,7 @@ def delete(path: str) -> Callable[[h5py.File], None]:
     return lambda file: file.__delitem__(path)
 
 
-def put(path: str, data: object) -> Callable[[h5py.File], None]:
+def replace_dataset(path: str, data: object) -> Callable[[h5py.File], None]:
     def change(file: h5py.File) -> None:
         del file[path]
         file.create_dataset(path, data=data)
@@ -222,11 +227,23 @@ DEFECTS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
     "no image": (delete("frames/0007/images/_img"), "/frames/0007/images/_img"),
     "a missing frame": (delete("frames/0007"), "0007"),
     "no frames": (delete("frames"), "/frames"),
-    "an object less": (put("frames/0007/objects/positions", np.zeros((2, 3))), "(3, 3)"),
-    "transposed axes": (put("frames/0007/objects/rotations", np.ones((4, 3))), "(4, 3)"),
-    "NaN positions": (put("frames/0007/objects/positions", np.full((3, 3), np.nan)), "positions"),
-    "half a pair": (put("frames/0007/collisions/object_ids", [3]), "collisions/object_ids"),
-    "a model less": (put("static/model_names", [b"bowl"]), "1 models"),
+    "one object too few": (
+        replace_dataset("frames/0007/objects/positions", np.zeros((2, 3))),
+        "(3, 3)",
+    ),
+    "transposed axes": (
+        replace_dataset("frames/0007/objects/rotations", np.ones((4, 3))),
+        "(4, 3)",
+    ),
+    "NaN positions": (
+        replace_dataset("frames/0007/objects/positions", np.full((3, 3), np.nan)),
+        "positions",
+    ),
+    "half a pair": (
+        replace_dataset("frames/0007/collisions/object_ids", [3]),
+        "collisions/object_ids",
+    ),
+    "one model name too few": (replace_dataset("static/model_names", [b"bowl"]), "1 models"),
 }
 
 
@@ -244,10 +261,10 @@ def test_files_that_are_cut_off_or_damaged_are_refused(tmp_path: Path) -> None:
     path = write_physion(tmp_path / "roll" / "0000.hdf5", physion_trial(12))
     whole = path.read_bytes()
     with h5py.File(path) as file:
-        header = h5py.h5o.get_info(file["frames/0007"].id).addr
+        address = h5py.h5o.get_info(file["frames/0007"].id).addr
     damaged = [whole[: int(kept * len(whole))] for kept in (0, 0.01, 0.3, 0.6, 0.99)]
-    # HDF5 raises a KeyError for an object whose header is overwritten.
-    damaged.append(whole[:header] + b"\xff" * 16 + whole[header + 16 :])
+    # h5py raises a KeyError for an object whose header is overwritten.
+    damaged.append(whole[:address] + b"\xff" * 16 + whole[address + 16 :])
     for content in damaged:
         path.write_bytes(content)
         with raises_user_error("damaged-file", contains="0000.hdf5"):

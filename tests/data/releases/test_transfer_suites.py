@@ -1,4 +1,4 @@
-"""Laws of the transfer suites' items: frames of the prefix, the target and the distractors."""
+"""Selection items of transfer suites: the frames of the prefix, the target and the distractors."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.selection import event, time
 from data.world.events import find_motion_onsets
 
-LEAST = 12.0
+MIN_DISPLACEMENT = 12.0
 SCENARIOS = ("Collide", "Drop", "Roll")
 
 
 def scene_of_suite(suite: str, k: int, frames: int, fps: float) -> Scene:
-    """Two objects; the second rests until the first hits it at a random frame, in some scenes too
-    early for a prefix. Every second scene has the same appearances."""
+    """Two objects, of which the second rests until the first hits it at a random frame.
+
+    In some scenes the hit is too early for a prefix. The appearances of the objects alternate
+    between two sets from one scene to the next.
+    """
     rng = np.random.default_rng(k)
     hit = int(rng.integers(6, 20) if suite.endswith("movi_a") else rng.integers(11, frames - 20))
     t = np.arange(frames)
@@ -68,7 +71,9 @@ def items_of(
     suite: str, family: str, subtype: str, scenes: dict[str, Scene]
 ) -> list[SelectionItem]:
     scene_ids = {"train": [], "test": list(scenes)}
-    cell = CellInputs(scene_ids, scenes.__getitem__, Quota(0, 24), seed=0, min_displacement=LEAST)
+    cell = CellInputs(
+        scene_ids, scenes.__getitem__, Quota(0, 24), seed=0, min_displacement=MIN_DISPLACEMENT
+    )
     return fill_quota(subtype, TRANSFER_SUITES[suite][family], cell)[0]
 
 
@@ -81,8 +86,8 @@ CELLS = [
 
 
 def cells(*words: str) -> pytest.MarkDecorator:
-    """Parametrize a test by the cells of a suite or family, with their fixtures `suite` and
-    `items`."""
+    """Parametrize a test by the cells whose suite, family and subtype include all `words`. The
+    fixtures `suite` and `items` depend on the cell."""
     chosen = [c for c in CELLS if set(words) <= set(c)]
     return pytest.mark.parametrize("cell", chosen, ids="/".join)
 
@@ -118,7 +123,7 @@ def test_distractors_are_of_the_scene_and_of_other_scenes(suite: str, items: lis
         assert len(others) == (2 if suite.endswith("movi_a") else 1)
         own = [c.frame for c in item.candidates if c.scene_id == item.scene_id]
         assert min(own) > item.prefix_stop
-        assert item.min_displacement >= LEAST
+        assert item.min_displacement >= MIN_DISPLACEMENT
         if suite.endswith("physion"):
             assert min(own) == item.target_frame
             scenarios = {SCENES[suite][c.scene_id].scenario for c in item.candidates}

@@ -1,4 +1,4 @@
-"""The frame cache: exact archives, and a bounded number of decoded frames in memory."""
+"""The frame cache: archives are exact, and decoded frames take a bounded amount of memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from data.render.frame_cache import FrameReader, load_frames, render_frames, sav
 
 
 def test_decoded_frames_are_bounded_for_any_access_pattern(micro_store, monkeypatch) -> None:
-    """One frame in twelve is read repeatedly; the other eleven are evicted."""
+    """Frame 0 of each scene is read repeatedly; the other eleven are read once and evicted."""
     bound = 24 * 192 * 128 * 3
     monkeypatch.setattr(frame_cache, "CACHE_BYTES", bound)
     reader = FrameReader(micro_store)
@@ -20,7 +20,7 @@ def test_decoded_frames_are_bounded_for_any_access_pattern(micro_store, monkeypa
         for other in scene_ids:
             reader.array(other, 0)
     decoded = reader._decoded.values()
-    # A view would keep the array that it is a view of.
+    # A view of a larger array would keep that array in memory.
     assert all(pixels.base is None for pixels in decoded)
     assert sum(pixels.nbytes for pixels in decoded) <= bound
 
@@ -55,7 +55,9 @@ def test_archive_round_trip_is_exact(tmp_path) -> None:
     assert load_frames(tmp_path / "missing.zip") == {}
 
 
-@pytest.mark.parametrize("damage", [lambda w: w[:40], lambda w: w[:60] + b"x" + w[61:]])
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:40], lambda data: data[:60] + b"x" + data[61:]]
+)
 def test_damaged_archive_is_logged_and_ignored(tmp_path, caplog, damage) -> None:
     path = tmp_path / "a.zip"
     save_frames({5: np.full((8, 8, 3), 9, np.uint8)}, path)

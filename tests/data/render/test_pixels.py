@@ -1,4 +1,4 @@
-"""Pixels: visibility agrees with Bullet's mask, and appearances are distinguishable."""
+"""Rendered pixels: visibility agrees with Bullet's mask, and appearances are distinguishable."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FRAMES = [0, 10, 15, 20, 60, 100]
 
 def test_visibility_agrees_with_bullets_mask(scene: Scene) -> None:
     renderer = BulletRenderer(240, 160)  # renders at 480 x 320, the oracle's image size
-    # Objects out of view, fully visible and partly hidden, so that the test can fail.
+    # These frames have objects out of view, fully visible and partly hidden.
     fractions = scene.visible_fraction[FRAMES]
     assert not scene.in_view[FRAMES].all()
     assert (fractions == 1).any()
@@ -54,7 +54,7 @@ def test_visibility_agrees_with_bullets_mask(scene: Scene) -> None:
 
 
 def alone(scene: Scene, k: int) -> Scene:
-    """A scene with only its object k."""
+    """A copy of the scene with only object k."""
     arrays = {name: getattr(scene, name)[:, k : k + 1] for name in Scene.ARRAYS}
     name = f"{scene.scene_id}-only-{k}"
     return replace(scene, scene_id=name, objects=(scene.objects[k],), collisions=(), **arrays)
@@ -76,23 +76,28 @@ def test_rendering_is_independent_of_the_previous_scene(scene: Scene) -> None:
 
 
 def crop(appearance: SceneObject, place: tuple[float, float], yaw: float) -> np.ndarray:
-    """Pixels and mask of one object in an empty scene, at the tiny preset's frame size."""
+    """Render one object in an empty scene at the tiny preset's frame size, and crop it.
+
+    Returns:
+        (H, W, 4) RGB on a black background, and the share of each pixel that the object covers,
+        from 0 to 255.
+    """
     height = 0.18 if appearance.shape == "cube" else 0.2
     position = np.array([[[*place, height]]], np.float32)
     turn = np.array([[[0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]]], np.float32)
     none = np.zeros((1, 1, 3), np.float32)
     in_view = np.ones((1, 1), bool)
-    one = Scene(
+    scene = Scene(
         f"{appearance}{place}{yaw}", "train", (appearance,), (), position, turn, none, none,
         none[..., :2], in_view, in_view.astype(np.float32),
     )  # fmt: skip
     renderer = get_renderer("bullet", 192, 128)
-    renderer.pose(one, 0)
+    renderer.pose(scene, 0)
     pixels, mask = renderer.capture()
     is_object = (mask >= 0)[..., None]
-    fine = np.dstack([pixels[..., :3] * is_object, is_object])
-    small = fine.reshape(128, 2, 192, 2, 4).mean(axis=(1, 3))
-    pixels, cover = small[..., :3], small[..., 3]
+    oversampled = np.dstack([pixels[..., :3] * is_object, is_object])
+    averaged = oversampled.reshape(128, 2, 192, 2, 4).mean(axis=(1, 3))
+    pixels, cover = averaged[..., :3], averaged[..., 3]
     rows, columns = np.nonzero(cover > 0.5)
     box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
     return np.dstack([pixels[box], 255 * cover[box]])
@@ -103,13 +108,15 @@ def features(picture: np.ndarray, attribute: str) -> np.ndarray:
     rgb, cover = picture[..., :3], picture[..., 3]
     if attribute == "color":
         return rgb[cover > 250].mean(axis=0) / 255
-    light = small(rgb.max(axis=-1) / rgb.max())
+    brightness = shrink(rgb.max(axis=-1) / rgb.max())
     if attribute == "material":
-        return light
-    return np.concatenate([light, small(cover / 255), [8 * cover.shape[0] / cover.shape[1]]])
+        return brightness
+    aspect_ratio = cover.shape[0] / cover.shape[1]
+    return np.concatenate([brightness, shrink(cover / 255), [8 * aspect_ratio]])
 
 
-def small(values: np.ndarray) -> np.ndarray:
+def shrink(values: np.ndarray) -> np.ndarray:
+    """Resize an image to 16 x 16 and flatten it."""
     return np.asarray(Image.fromarray(values.astype(np.float32)).resize((16, 16))).ravel()
 
 
@@ -130,10 +137,11 @@ def crops() -> list[tuple[int, SceneObject, np.ndarray]]:
 
 @pytest.mark.parametrize("attribute", ["color", "material", "shape"])
 def test_appearances_are_distinguishable_at_the_tiny_size(crops, attribute) -> None:
-    """A nearest-neighbour classifier generalises to other positions."""
+    """A nearest-neighbour classifier recognises an attribute at positions that it was not fitted
+    on."""
     groups = defaultdict(list)
     for place, appearance, picture in crops:
-        # Materials are compared within a shape and colour.
+        # Objects of different materials are compared only if their shape and colour are equal.
         group = (appearance.shape, appearance.color) if attribute == "material" else ()
         name, vector = getattr(appearance, attribute), features(picture, attribute)
         groups[group].append((place % 2 == 0, name, vector))

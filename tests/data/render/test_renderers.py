@@ -1,4 +1,4 @@
-"""Laws of the renderers: one interface, deterministic pixels, and errors where one cannot run."""
+"""Renderers: imports, shadows, memory, and the errors of a renderer that cannot run."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ def test_versions_need_no_renderer_package() -> None:
 
 
 def test_shadow_is_confined_to_its_box() -> None:
-    """For objects on screen, at its edges, far away and behind the camera."""
+    """Tested for objects on screen, at its edges, far away and behind the camera."""
     floor = Floor(STANDARD_VIEW.camera.sized(192, 128), STANDARD_VIEW.light)
     width, height = 192, 128
     rng = np.random.default_rng(0)
     for spread in (1.0, 3.0, 8.0):
         positions = rng.uniform(-spread, spread, (6, 3)).astype(np.float32)
         everywhere = np.tile([0, 0, width, height], (6, 1))
-        boxes = floor.shadows(positions)
+        boxes = floor.shadow_boxes(positions)
         shade = floor.shade(positions, boxes)
         np.testing.assert_array_equal(shade, floor.shade(positions, everywhere))
     middle = np.zeros((1, 3), np.float32)
-    darker = floor.shade(middle, floor.shadows(middle)) < floor.shade(middle[:0], boxes[:0])
+    darker = floor.shade(middle, floor.shadow_boxes(middle)) < floor.shade(middle[:0], boxes[:0])
     assert 0 < darker.mean() < 0.5
 
 
@@ -71,7 +71,7 @@ def test_blender_without_its_module_is_an_error(monkeypatch: pytest.MonkeyPatch)
 def test_crash_of_blender_names_the_frame(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A fake worker that renders one frame, by the protocol, and exits."""
+    """A fake worker follows the protocol, returns one frame and exits at the next request."""
     dying = tmp_path / "dying.py"
     png = tmp_path / "frame.png"
     Image.new("RGB", (48, 32), "red").save(png)

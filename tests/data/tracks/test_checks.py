@@ -1,4 +1,5 @@
-"""`check_test` refuses missing, repeated, unanswerable and leaking test queries, and names one."""
+"""`check_test` refuses missing and repeated test queries, queries without their target, and queries
+of training scenes, and names one of them."""
 
 from __future__ import annotations
 

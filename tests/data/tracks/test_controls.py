@@ -1,4 +1,4 @@
-"""Controls change one property of an item and keep all others."""
+"""Controls change one property of an item, its question or its prefix, and keep all others."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def test_matched_pair_differs_only_in_its_anchor(benchmark_store) -> None:
     for by_event, by_time in zip(items[::2], items[1::2], strict=True):
         assert (by_event.family, by_time.family) == ("event", "time")
         assert by_event.question != by_time.question
-        for axis in SHARED_FIELDS:
-            assert getattr(by_event, axis) == getattr(by_time, axis)
+        for field in SHARED_FIELDS:
+            assert getattr(by_event, field) == getattr(by_time, field)
         events = [c.frame for c in benchmark_store.scene(by_event.scene_id).collisions]
         assert by_event.target_frame == min(e for e in events if e > by_event.prefix_stop)
         assert by_event.prefix_stop - by_event.prefix_start + 1 == 26

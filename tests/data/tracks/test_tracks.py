@@ -1,4 +1,4 @@
-"""Laws of a built benchmark: items and queries agree with the oracle."""
+"""Items, queries and databases of a built benchmark agree with the oracle and with the paper."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def items(benchmark_store: Store) -> list[SelectionItem]:
 
 
 @pytest.fixture(scope="module")
-def least(benchmark_store: Store) -> float:
-    """The minimum displacement between two candidates, px."""
+def min_displacement(benchmark_store: Store) -> float:
+    """The minimum displacement between two candidates, px at 336 x 336."""
     return benchmark_store.manifest["config"]["selection"]["min_displacement"]
 
 
@@ -43,8 +43,8 @@ def test_every_cell_has_items_and_letters_are_balanced(benchmark_store, items) -
     track = benchmark_store.manifest["config"]["selection"]
     cells = {(f, cell) for f in ("event", "time", "window") for cell in track[f]}
     assert {(i.family, i.subtype) for i in items} == cells
-    for cell in {(i.subtype, i.split) for i in items}:
-        letters = Counter(i.answer for i in items if (i.subtype, i.split) == cell)
+    for cell_and_split in {(i.subtype, i.split) for i in items}:
+        letters = Counter(i.answer for i in items if (i.subtype, i.split) == cell_and_split)
         assert max(letters.values()) - min(letters[k] for k in range(4)) <= 1
     assert len({i.item_id for i in items}) == len(items)
 
@@ -57,7 +57,9 @@ def test_items_and_queries_have_the_split_of_their_scene(benchmark_store, items)
         assert record.scene_id in (train if record.split == "train" else test)
 
 
-def test_candidates_differ_by_the_minimum_displacement(benchmark_store, items, least) -> None:
+def test_candidates_differ_by_the_minimum_displacement(
+    benchmark_store, items, min_displacement
+) -> None:
     for item in items:
         gaps = []
         for a, b in combinations(item.candidates, 2):
@@ -67,7 +69,7 @@ def test_candidates_differ_by_the_minimum_displacement(benchmark_store, items, l
                 assert gap == pytest.approx(frame_displacements(scene)[a.frame, b.frame])
             gaps.append(gap)
         assert item.min_displacement == pytest.approx(min(gaps), rel=1e-5)
-        assert min(gaps) >= least
+        assert min(gaps) >= min_displacement
 
 
 def test_event_items_match_a_collision(benchmark_store, items) -> None:
@@ -81,7 +83,7 @@ def test_event_items_match_a_collision(benchmark_store, items) -> None:
         assert item.target_frame <= 127 - 10
 
 
-def test_event_distractors_match_their_source(benchmark_store, items, least) -> None:
+def test_event_distractors_match_their_source(benchmark_store, items, min_displacement) -> None:
     split = {s: set(benchmark_store.scene_ids(s)) for s in ("train", "test")}
     for item in (i for i in items if i.family == "event"):
         scene = benchmark_store.scene(item.scene_id)
@@ -96,7 +98,8 @@ def test_event_distractors_match_their_source(benchmark_store, items, least) -> 
         if item.distractors == "same_offset":
             assert {abs(c.frame - item.target_frame) for c in wrong} <= {16, 32, 48}
         if item.distractors == "same_obj_match":
-            # Every more similar frame on the same side of the target is too close to a candidate.
+            # A frame on the same side of the target that is more similar than the distractors is
+            # not a candidate because it differs too little from one.
             score = object_match_scores(scene, item.target_frame)
             gaps = frame_displacements(scene, visible_objects(scene, timing(item)))
             chosen = [c.frame for c in item.candidates]
@@ -105,7 +108,8 @@ def test_event_distractors_match_their_source(benchmark_store, items, least) -> 
                 closest = min((score[f] for f in side), default=0)
                 nearer = timing(item).outside_prefix(np.flatnonzero(score < closest))
                 for frame in (f for f in nearer if (f < item.target_frame) == early):
-                    assert frame == item.target_frame or gaps[frame, chosen].min() < least
+                    is_too_close = gaps[frame, chosen].min() < min_displacement
+                    assert frame == item.target_frame or is_too_close
 
 
 def test_time_items_count_26_frames_per_second(items) -> None:
@@ -126,36 +130,38 @@ def test_window_items_match_their_group_and_horizon(benchmark_store, items) -> N
         assert item.subtype == f"{group}_{family}_h{item.horizon}_{item.difficulty}"
 
 
-def test_candidates_of_b_and_c_differ_in_their_subjects(benchmark_store, items, least) -> None:
+def test_candidates_of_window_families_b_and_c_differ_in_their_subjects(
+    benchmark_store, items, min_displacement
+) -> None:
     counts = Counter()
     for item in (i for i in items if i.window_family in ("B", "C")):
         scene = benchmark_store.scene(item.scene_id)
         cell = window.CELLS[item.subtype]
-        about = window.subject_objects(cell, scene, timing(item))
+        subjects = window.subject_objects(cell, scene, timing(item))
         visible = visible_objects(scene, timing(item))
         if item.window_family == "B":
             assert item.group in ("G2", "G4")
             pairs = {c.objects for c in scene.collisions
                      if item.prefix_stop < c.frame <= item.target_frame}  # fmt: skip
-            assert about in pairs
-            about = tuple(k for k in about if k in visible)
+            assert subjects in pairs
+            subjects = tuple(k for k in subjects if k in visible)
         else:
             assert item.group != "G4"
-            assert len(about) == 1
-        gaps = frame_displacements(scene, about)
+            assert len(subjects) == 1
+        gaps = frame_displacements(scene, subjects)
         for a, b in combinations(item.candidates, 2):
-            assert gaps[a.frame, b.frame] >= least
+            assert gaps[a.frame, b.frame] >= min_displacement
         counts[item.window_family] += 1
     assert min(counts["B"], counts["C"]) > 2
 
 
-def test_candidates_differ_in_a_visible_object(benchmark_store, items, least) -> None:
+def test_candidates_differ_in_a_visible_object(benchmark_store, items, min_displacement) -> None:
     for item in items:
         scene = benchmark_store.scene(item.scene_id)
         gaps = frame_displacements(scene, visible_objects(scene, timing(item)))
         same = [c.frame for c in item.candidates if c.scene_id == item.scene_id]
         assert timing(item).outside_prefix(same) == same
-        assert all(gaps[a, b] >= least for a, b in combinations(same, 2))
+        assert all(gaps[a, b] >= min_displacement for a, b in combinations(same, 2))
 
 
 def test_rank_of_the_target_in_time_is_balanced(items) -> None:
@@ -176,13 +182,13 @@ def test_hard_distractors_are_more_similar_than_easy_ones(benchmark_store, items
 
 
 def test_displacement_across_scenes_with_different_objects_is_the_diagonal(benchmark_store) -> None:
-    one, two = (benchmark_store.scene(s) for s in benchmark_store.scene_ids("train")[:2])
-    assert one.objects != two.objects
-    assert cross_scene_displacement(one, 60, two, 60) == pytest.approx(336 * 2**0.5)
-    assert cross_scene_displacement(one, 60, one, 60) == 0
+    scene, other = (benchmark_store.scene(s) for s in benchmark_store.scene_ids("train")[:2])
+    assert scene.objects != other.objects
+    assert cross_scene_displacement(scene, 60, other, 60) == pytest.approx(336 * 2**0.5)
+    assert cross_scene_displacement(scene, 60, scene, 60) == 0
 
 
-def test_builders_keep_to_their_events_per_scene(benchmark_store) -> None:
+def test_builders_use_at_most_their_number_of_events_per_scene(benchmark_store) -> None:
     queries = benchmark_store.retrieval()
     assert {q.builder for q in queries} == set(range(1, 7))
     for builder in range(1, 7):
@@ -228,35 +234,37 @@ def test_hard_negatives_are_wrong_time_frames_of_the_scene(benchmark_store) -> N
         assert min(gaps[a, b] for a, b in combinations(frames, 2)) >= 12
 
 
-def test_counterfactual_targets_differ_from_the_factual_scene(benchmark_store, least) -> None:
+def test_counterfactual_targets_differ_from_the_factual_scene(
+    benchmark_store, min_displacement
+) -> None:
     queries = benchmark_store.retrieval(pool="counterfactual")
     assert {q.split for q in queries} == {"train", "test"}
     for q in queries:
-        scene, absent = benchmark_store.scene(q.scene_id), benchmark_store.scene(q.target.scene_id)
+        scene, other = benchmark_store.scene(q.scene_id), benchmark_store.scene(q.target.scene_id)
         k = [o.noun_phrase for o in scene.objects].index(q.removed_object)
         assert q.target.scene_id == f"{q.scene_id}-without-{k}"
-        assert absent.objects == scene.objects[:k] + scene.objects[k + 1 :]
-        assert absent.split == scene.split == q.split
+        assert other.objects == scene.objects[:k] + scene.objects[k + 1 :]
+        assert other.split == scene.split == q.split
         assert q.removed_object in q.question
-        # The object is in view at the prefix's end, and has had no contact.
+        # The object is in view at the end of the prefix, and has had no contact until then.
         assert scene.in_view[q.prefix_stop, k]
         first = min(c.frame for c in scene.collisions if k in c.objects)
         assert q.prefix_stop < first
         kept = [i for i in range(len(scene.objects)) if i != k]
         before = slice(0, first)
-        np.testing.assert_array_equal(scene.positions[before, kept], absent.positions[before])
-        assert removal_displacement(scene, absent, k)[q.target.frame] >= least
-        assert removal_displacement(scene, absent, k)[: q.prefix_stop].max() == 0
+        np.testing.assert_array_equal(scene.positions[before, kept], other.positions[before])
+        assert removal_displacement(scene, other, k)[q.target.frame] >= min_displacement
+        assert removal_displacement(scene, other, k)[: q.prefix_stop].max() == 0
         assert (q.target.frame - q.prefix_stop) % FPS == 0
-        factual, *others = q.hard_negatives
+        factual, *wrong_time = q.hard_negatives
         assert factual == FrameRef(q.scene_id, q.target.frame)
-        assert {n.scene_id for n in others} == {absent.scene_id}
-        for one, two in combinations([q.target, *q.hard_negatives], 2):
-            ends = [(benchmark_store.scene(f.scene_id), f.frame) for f in (one, two)]
-            assert cross_scene_displacement(*ends[0], *ends[1]) >= least
+        assert {n.scene_id for n in wrong_time} == {other.scene_id}
+        for pair in combinations([q.target, *q.hard_negatives], 2):
+            a, b = ((benchmark_store.scene(f.scene_id), f.frame) for f in pair)
+            assert cross_scene_displacement(*a, *b) >= min_displacement
 
 
-def test_databases_contain_targets_and_no_twins(benchmark_store) -> None:
+def test_databases_contain_targets_and_no_identical_frames(benchmark_store) -> None:
     frames = FrameReader(benchmark_store)
     queries_of = {
         "test": benchmark_store.standard_test(),
@@ -292,7 +300,7 @@ def test_counterfactual_database_contains_factual_frames(benchmark_store) -> Non
         assert others <= {*test, *train}, "the database has other frames, but lacks factual ones"
 
 
-def test_twins_are_frames_without_motion(benchmark_store) -> None:
+def test_frames_without_motion_are_twins(benchmark_store) -> None:
     scene = benchmark_store.scene(benchmark_store.scene_ids("test")[0])
     first = {n: np.repeat(getattr(scene, n)[:1], scene.frames, axis=0) for n in scene.ARRAYS}
     still = replace(scene, **first)

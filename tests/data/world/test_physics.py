@@ -1,4 +1,5 @@
-"""Laws of the simulation: reproducible, physical, and local."""
+"""Simulated scenes are reproducible and follow the laws of motion; removing an object changes only
+the objects that it reaches."""
 
 from __future__ import annotations
 
@@ -49,7 +50,7 @@ def test_collision_of_two_spheres_conserves_momentum() -> None:
     ]
     motion = shared_simulator().simulate(bodies, frames=40)
     (hit,) = motion.collisions
-    # The gap is 1 unit minus two radii, at about 2 units per second.
+    # The gap is 1 unit minus two radii of 0.2, and the speed is about 2 units per second.
     assert hit.frame / FPS == pytest.approx(0.6 / 2, abs=0.06)
     before = motion.velocities[hit.frame - 1].sum(axis=0)
     after = motion.velocities[hit.frame].sum(axis=0)
@@ -79,14 +80,15 @@ def test_removing_an_object_does_not_affect_untouched_objects(index: int) -> Non
         other = simulate_without("other", "train", bodies, removed)
         kept = [k for k in range(len(factual.objects)) if k != removed]
         reached = touched_by(factual, removed)
-        for now, before in enumerate(kept):
-            until = min(reached.get(before, factual.frames), reached_in(other, now, reached, kept))
-            same = factual.positions[:until, before] == other.positions[:until, now]
-            assert same.all(), (removed, before)
+        for k, original in enumerate(kept):
+            in_factual = reached.get(original, factual.frames)
+            until = min(in_factual, reached_in(other, k, reached, kept))
+            same = factual.positions[:until, original] == other.positions[:until, k]
+            assert same.all(), (removed, original)
 
 
 def touched_by(scene: Scene, start: int) -> dict[int, int]:
-    """The frame of each object's first contact with `start`, directly or through others."""
+    """The frame at which `start` first affects each object, directly or through other objects."""
     reached = {start: 0}
     for collision in scene.collisions:
         for one, two in (collision.objects, collision.objects[::-1]):
@@ -96,7 +98,8 @@ def touched_by(scene: Scene, start: int) -> dict[int, int]:
 
 
 def reached_in(scene: Scene, index: int, reached: dict[int, int], kept: list[int]) -> int:
-    """The frame of an object's first contact in the counterfactual with one whose path changed."""
+    """The first frame at which an object of the counterfactual scene collides with an object whose
+    path may have changed; the number of frames if there is none."""
     changed = {kept.index(k) for k in reached if k in kept}
     for collision in scene.collisions:
         if changed & set(collision.objects):
@@ -107,7 +110,7 @@ def reached_in(scene: Scene, index: int, reached: dict[int, int], kept: list[int
 
 
 @pytest.mark.parametrize("index", range(6))
-def test_incremental_motion_equals_a_joint_simulation(index: int) -> None:
+def test_motion_of_objects_added_one_by_one_equals_a_joint_simulation(index: int) -> None:
     bodies, motion = sample_bodies(11, index, LIMITS)
     together = shared_simulator().simulate(bodies)
     assert np.array_equal(together.states, motion.states)

@@ -1,4 +1,4 @@
-"""Stand-ins for transfer suites: falls and bounces, projection, and items."""
+"""Stand-ins for transfer suites: falls and bounces, projection, views, items, and settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from conf.compose import compose
 from conf.schema import BenchmarkConfig, BuildCommand, Quota, RetrievalTrackConfig, SelectionConfig
-from data.build import check_names, ensure_items
+from data.build import check_quota_names, ensure_items
 from data.parallel import Workers
 from data.records import Scene, SceneObject
 from data.render.bullet import OVERSAMPLING, BulletRenderer
@@ -109,7 +109,7 @@ def test_rendered_objects_are_at_the_oracles_positions(scenes: tuple[str, list[S
 
 @pytest.fixture(scope="module", params=SUITES)
 def store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Store:
-    """A store of the preset with fewer scenes and items."""
+    """A benchmark of the preset's stand-in, with fewer scenes and items than the preset."""
     cfg = compose("data.build", BuildCommand, [f"benchmark=standin_{request.param}"]).benchmark
     cfg.scenes = 30
     for quotas in (cfg.selection.event, cfg.selection.time):
@@ -153,7 +153,7 @@ def test_invalid_standin_settings_are_refused(changes: dict[str, Any], key: str)
     assert key in problem
 
 
-def test_family_that_a_suite_lacks_is_refused() -> None:
+def test_quota_of_a_family_that_the_suite_lacks_is_refused() -> None:
     window = SelectionConfig(window={"G1_A_h8_easy": Quota(test=1)})
     with raises_user_error("unknown-option", contains="benchmark.selection.window"):
-        check_names(replace(standin_config("movi_a"), selection=window))
+        check_quota_names(replace(standin_config("movi_a"), selection=window))

@@ -1,4 +1,4 @@
-"""Embeddings on disk: read back byte for byte, resumed after a kill, never taken damaged."""
+"""Embeddings on disk: read back byte for byte, resumed after a kill, and refused if damaged."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from evaluation.embedders import cache
 from evaluation.embedders.cache import EmbeddingCache
 from tests.user_errors import raises_user_error
 
-ABOUT = {"weights": "ab12", "image_size": 96}
+SETTINGS = {"weights": "ab12", "image_size": 96}
 INPUTS = {f"scene-{k:03d}/{k}": k for k in range(2500)}
 
 
 class Model:
-    """Embeds a number, and records its inputs."""
+    """Embeds numbers and records them. The embeddings of the numbers in `bad` contain a NaN."""
 
     def __init__(self, bad: tuple[int, ...] = ()) -> None:
         self.inputs: list[int] = []
@@ -33,7 +33,7 @@ class Model:
 
 
 def filled(folder: Path) -> EmbeddingCache:
-    embeddings = EmbeddingCache(folder, "frame", ABOUT)
+    embeddings = EmbeddingCache(folder, "frame", SETTINGS)
     embeddings.complete(INPUTS, Model(), 64)
     return embeddings
 
@@ -42,7 +42,7 @@ def test_embeddings_are_computed_once_and_read_back_byte_for_byte(tmp_path) -> N
     model = Model()
     expected = Model()(list(INPUTS.values()))
     for _ in range(2):
-        embeddings = EmbeddingCache(tmp_path, "frame", ABOUT)
+        embeddings = EmbeddingCache(tmp_path, "frame", SETTINGS)
         embeddings.complete(INPUTS, model, 64)
         assert embeddings.rows(list(INPUTS)).tobytes() == expected.tobytes()
         assert embeddings.width == 8
@@ -61,7 +61,7 @@ def test_parts_hold_each_requested_embedding_once(tmp_path) -> None:
 def test_only_new_inputs_are_embedded(tmp_path) -> None:
     filled(tmp_path)
     model = Model()
-    embeddings = EmbeddingCache(tmp_path, "frame", ABOUT)
+    embeddings = EmbeddingCache(tmp_path, "frame", SETTINGS)
     embeddings.complete({"new/1": 9001, **INPUTS, "new/2": 9002}, model, 64)
     assert model.inputs == [9001, 9002]
     repeated = ["new/2", "new/1", "new/2"]
@@ -69,7 +69,7 @@ def test_only_new_inputs_are_embedded(tmp_path) -> None:
 
 
 def test_rows_of_several_lengths_are_padded_with_zeros(tmp_path) -> None:
-    embeddings = EmbeddingCache(tmp_path, "query", ABOUT)
+    embeddings = EmbeddingCache(tmp_path, "query", SETTINGS)
     embeddings.complete({"q1": 1, "q3": 3, "q2": 2}, lambda some: np.ones((1, some[0])), 1)
     assert embeddings.rows(["q2", "q1"]).tolist() == [[1, 1, 0], [1, 0, 0]]
 
@@ -77,14 +77,14 @@ def test_rows_of_several_lengths_are_padded_with_zeros(tmp_path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from tests.evaluation.embedders.test_cache import ABOUT, INPUTS, Model
+from tests.evaluation.embedders.test_cache import SETTINGS, INPUTS, Model
 from evaluation.embedders.cache import EmbeddingCache
 class Dying(Model):
     def __call__(self, some):
         if len(self.inputs) >= 1300:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().__call__(some)
-EmbeddingCache(Path(sys.argv[1]), "frame", ABOUT).complete(INPUTS, Dying(), 64)
+EmbeddingCache(Path(sys.argv[1]), "frame", SETTINGS).complete(INPUTS, Dying(), 64)
 """
 
 
@@ -94,7 +94,7 @@ def test_a_kill_costs_one_batch(tmp_path) -> None:
     ended = subprocess.run(command, cwd=root, capture_output=True, timeout=120)
     assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
     model = Model()
-    embeddings = EmbeddingCache(tmp_path, "frame", ABOUT)
+    embeddings = EmbeddingCache(tmp_path, "frame", SETTINGS)
     embeddings.complete(INPUTS, model, 64)
     assert model.inputs == list(INPUTS.values())[1344:]
     assert np.array_equal(embeddings.rows(list(INPUTS)), Model()(list(INPUTS.values())))
@@ -105,14 +105,14 @@ def test_a_damaged_file_is_named(tmp_path, damage) -> None:
     path = filled(tmp_path).path
     path.write_bytes(damage(path.read_bytes()))
     with raises_user_error("damaged-file", contains=path.name):
-        EmbeddingCache(tmp_path, "frame", ABOUT).complete({"new/1": 1}, Model(), 64)
+        EmbeddingCache(tmp_path, "frame", SETTINGS).complete({"new/1": 1}, Model(), 64)
 
 
 def test_a_non_finite_embedding_is_named_and_not_stored(tmp_path) -> None:
-    queries = EmbeddingCache(tmp_path, "query", ABOUT)
+    queries = EmbeddingCache(tmp_path, "query", SETTINGS)
     with raises_user_error("non-finite-embedding", contains="query scene-003/3 and 1 more"):
         queries.complete(INPUTS, Model(bad=(3, 9)), 64)
-    embeddings = EmbeddingCache(tmp_path, "frame", ABOUT)
+    embeddings = EmbeddingCache(tmp_path, "frame", SETTINGS)
     with raises_user_error("non-finite-embedding", contains="frame scene-700/700"):
         embeddings.complete(INPUTS, Model(bad=(700,)), 64)
     model = Model()
@@ -121,7 +121,7 @@ def test_a_non_finite_embedding_is_named_and_not_stored(tmp_path) -> None:
 
 
 def test_two_processes_may_fill_one_file(tmp_path) -> None:
-    first, second = (EmbeddingCache(tmp_path, "frame", ABOUT) for _ in range(2))
+    first, second = (EmbeddingCache(tmp_path, "frame", SETTINGS) for _ in range(2))
     model = Model()
 
     def embed(some: list[int]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The structured record and its schema."""
+"""The structured record: its parser, its instruction and its JSON schema."""
 
 import json
 import random
@@ -59,7 +59,7 @@ def random_record(rng: random.Random) -> Record:
 
 
 def test_a_record_is_valid_exactly_if_its_schema_accepts_it():
-    """For all records that differ from a valid one in one field."""
+    """Checked on many records that differ from a valid record in one field."""
     validator = Draft202012Validator(schema(bound=False))
     Draft202012Validator.check_schema(schema())
     values = [None, True, -0.1, 1.1, 0, 1, "", "A", "e", "none", "N", {}, [], {"A": 1}, "0.5"]
@@ -97,5 +97,5 @@ def test_a_response_without_exactly_one_json_record_is_invalid(raw):
 def test_prompt_and_schema_have_the_fields_of_the_record_in_its_order():
     names = [f.name for f in fields(Record)]
     assert list(FIELDS) == list(schema()["properties"]) == schema()["required"] == names
-    at = [instruction().index(f'"{name}"') for name in names]
-    assert at == sorted(at)
+    positions = [instruction().index(f'"{name}"') for name in names]
+    assert positions == sorted(positions)

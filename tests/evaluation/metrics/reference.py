@@ -1,4 +1,4 @@
-"""Reference implementations that the metrics are compared with."""
+"""Reference implementations, with which tests compare the metrics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def scene_interval(
     seed: int,
     resamples: int = 2000,
 ) -> tuple[float, float]:
-    """The 95% percentile interval of a statistic of the rows of resampled scenes."""
+    """Return the 95% percentile bootstrap interval of a statistic, by resampling scenes."""
     rows = [np.flatnonzero(np.asarray(scenes) == scene) for scene in np.unique(scenes)]
     sampled = np.random.default_rng(seed).integers(len(rows), size=(resamples, len(rows)))
     results = [statistic(values[np.concatenate([rows[i] for i in picks])]) for picks in sampled]
@@ -25,13 +25,14 @@ def scene_interval(
 
 
 def count_ranks(scores: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count the frames above each target and the others tied with it; 0 for a NaN target score."""
+    """Count the frames above each target, and the other frames with its score. Both are 0 if the
+    target's score is NaN."""
     greater, equal = count_above_and_equal(scores, target_scores(scores, targets))
     return greater, np.maximum(equal - 1, 0)
 
 
 def matrix_metrics(scores: np.ndarray, targets: np.ndarray, ks: Sequence[int]) -> dict[str, float]:
-    """Ranking metrics of a score matrix (queries, frames) and its target columns (queries,)."""
+    """Return the ranking metrics of scores (queries, frames); `targets` are columns (queries,)."""
     scores = np.asarray(scores)
     valid = ~np.isnan(target_scores(scores, targets))
     return ranking_metrics(*count_ranks(scores, targets), valid, np.shape(scores)[1], ks)
@@ -40,7 +41,7 @@ def matrix_metrics(scores: np.ndarray, targets: np.ndarray, ks: Sequence[int]) -
 def ranking_metrics(
     greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
 ) -> dict[str, float]:
-    """Summarize `query_metrics` over all queries, misses included."""
+    """Return the means of `query_metrics` over all queries, and the median of `median_rank`."""
     measures = query_metrics(greater, tied, valid, frames, ks)
     return {
         name: float((np.median if name == "median_rank" else np.mean)(values))

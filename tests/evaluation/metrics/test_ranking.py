@@ -11,12 +11,13 @@ KS = (1, 2, 3, 10)
 
 
 def tied_scores(queries=40, frames=30, levels=6, seed=0):
+    """Return random scores with many ties, and the column of each query's target."""
     rng = np.random.default_rng(seed)
     scores = rng.integers(levels, size=(queries, frames)).astype(np.float32)
     return scores, rng.integers(frames, size=queries)
 
 
-def enumerated(row, target, ks):
+def metrics_by_enumeration(row, target, ks):
     """Return the metrics of one query, averaged over every order of the tied frames."""
     orders = [
         sorted(range(len(row)), key=lambda i, order=order: (-row[i], order[i]))
@@ -32,7 +33,7 @@ def test_metrics_with_ties_are_averaged_over_all_orders():
     for _ in range(12):
         row, target = rng.integers(3, size=6), int(rng.integers(6))
         metrics = matrix_metrics(row[None], np.array([target]), KS)
-        for key, value in enumerated(row, target, KS).items():
+        for key, value in metrics_by_enumeration(row, target, KS).items():
             assert metrics[key] == pytest.approx(value)
 
 
@@ -45,7 +46,7 @@ def test_constant_scores_give_chance_accuracy():
     assert metrics["tie_rate"] == 1
 
 
-def test_order_of_frames_and_queries_does_not_matter():
+def test_metrics_do_not_depend_on_the_order_of_frames_and_queries():
     scores, target = tied_scores()
     columns = np.random.default_rng(2).permutation(scores.shape[1])
     rows = np.random.default_rng(3).permutation(len(target))
@@ -55,18 +56,18 @@ def test_order_of_frames_and_queries_does_not_matter():
 
 
 @pytest.mark.parametrize("block", [1, 7, 30])
-def test_blockwise_metrics_equal_those_of_the_whole_matrix(block):
+def test_blockwise_metrics_equal_those_of_the_full_matrix(block):
     scores, target = tied_scores()
     scores[3, 4] = scores[5, target[5]] = np.nan
-    own = target_scores(scores, target)
-    counts = [count_above_and_equal(scores[:, i : i + block], own) for i in range(0, 30, block)]
+    of_target = target_scores(scores, target)
+    blocks = [scores[:, i : i + block] for i in range(0, 30, block)]
+    counts = [count_above_and_equal(columns, of_target) for columns in blocks]
     greater = sum(g for g, _ in counts)
     tied = np.maximum(sum(e for _, e in counts) - 1, 0)
-    by_frame = ranking_metrics(greater, tied, ~np.isnan(own), 30, KS)
+    valid = ~np.isnan(of_target)
+    by_frame = ranking_metrics(greater, tied, valid, 30, KS)
     parts = [count_ranks(scores[i : i + block], target[i : i + block]) for i in range(0, 40, block)]
-    by_query = ranking_metrics(
-        *map(np.concatenate, zip(*parts, strict=True)), ~np.isnan(own), 30, KS
-    )
+    by_query = ranking_metrics(*map(np.concatenate, zip(*parts, strict=True)), valid, 30, KS)
     assert by_frame == by_query == matrix_metrics(scores, target, KS)
 
 

@@ -1,4 +1,4 @@
-"""Paired comparisons of two runs, against definitions and an independent library."""
+"""Paired comparisons of two runs agree with definitions and with SciPy."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_differences_are_those_of_the_accuracies(items) -> None:
     found = {p.of: p for p in compare_runs(items, left, right, NAMES, seed=0)}
     assert list(found) == [*FAMILIES, "macro", "all"]
     one, two = (
-        accuracy_by_family([i.family for i in items], [of[i.item_id] for i in items])
-        for of in (left, right)
+        accuracy_by_family([i.family for i in items], [credits[i.item_id] for i in items])
+        for credits in (left, right)
     )
     for name, p in found.items():
         if name == "macro":
@@ -58,19 +58,19 @@ def test_differences_are_those_of_the_accuracies(items) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_p_equals_the_exact_binomial_test(items, seed) -> None:
+def test_the_p_value_equals_that_of_the_exact_binomial_test(items, seed) -> None:
     left, right = random_credits(items, seed), random_credits(items, seed + 100, 0.3 + 0.1 * seed)
     for p in compare_runs(items, left, right, NAMES, seed=0):
         if p.of == "macro":
             continue
-        of = [i.item_id for i in items if p.of in (i.family, "all")]
-        assert p.only_left == sum(left[i] > right[i] for i in of)
-        assert p.only_right == sum(left[i] < right[i] for i in of)
-        coin = binomtest(p.only_left, p.only_left + p.only_right)
-        assert p.p == pytest.approx(coin.pvalue)
+        ids = [i.item_id for i in items if p.of in (i.family, "all")]
+        assert p.only_left == sum(left[i] > right[i] for i in ids)
+        assert p.only_right == sum(left[i] < right[i] for i in ids)
+        binomial = binomtest(p.only_left, p.only_left + p.only_right)
+        assert p.p == pytest.approx(binomial.pvalue)
 
 
-def test_swapped_sides_change_the_signs_and_equal_sides_do_not_differ(items) -> None:
+def test_swapped_runs_have_opposite_differences_and_equal_runs_have_none(items) -> None:
     left, right = random_credits(items, 0, 0.7), random_credits(items, 1)
     forward = compare_runs(items, left, right, NAMES, seed=3)
     backward = compare_runs(items, right, left, NAMES[::-1], seed=3)
@@ -82,7 +82,7 @@ def test_swapped_sides_change_the_signs_and_equal_sides_do_not_differ(items) -> 
         assert p.of == "macro" or (p.only_left, p.only_right, p.p) == (0, 0, 1)
 
 
-def test_copies_of_a_scenes_items_do_not_narrow_the_interval(items) -> None:
+def test_repeated_items_of_a_scene_do_not_narrow_the_interval(items) -> None:
     left, right = random_credits(items, 0), random_credits(items, 1)
     widths = []
     for count in (1, 4):
@@ -92,7 +92,8 @@ def test_copies_of_a_scenes_items_do_not_narrow_the_interval(items) -> None:
             for copy in range(count)
         ]
         sides = [
-            {i.item_id: of[i.item_id.rpartition("-")[0]] for i in copies} for of in (left, right)
+            {i.item_id: credits[i.item_id.rpartition("-")[0]] for i in copies}
+            for credits in (left, right)
         ]
         p = compare_runs(copies, *sides, NAMES, seed=0)[-1]
         widths.append(p.high - p.low)
@@ -101,7 +102,7 @@ def test_copies_of_a_scenes_items_do_not_narrow_the_interval(items) -> None:
     assert widths[0] == pytest.approx(2 * 1.96 * differences.std() / len(items) ** 0.5, rel=0.1)
 
 
-def test_ties_count_for_the_side_with_more_credit(items) -> None:
+def test_items_with_ties_count_for_the_run_with_more_credit(items) -> None:
     few = [item for item in items if item.family == "time"][:3]
     left = dict(zip([i.item_id for i in few], (0.5, 1.0, 0.25), strict=True))
     right = dict(zip([i.item_id for i in few], (0.0, 0.5, 1.0), strict=True))
@@ -110,13 +111,13 @@ def test_ties_count_for_the_side_with_more_credit(items) -> None:
     assert p.difference == pytest.approx((0.5 + 0.5 - 0.75) / 3)
 
 
-def test_runs_over_other_items_are_refused_with_the_difference(items) -> None:
+def test_runs_over_different_items_are_refused_and_the_items_are_named(items) -> None:
     left, right = random_credits(items[:40], 0), random_credits(items[2:41], 0)
     with raises_user_error("different-items", contains=("2 only in select/a", "time-40")):
         compare_runs(items[:40], left, right, ("select/a", "select/b"), seed=0)
 
 
-def test_anchors_compare_the_questions_of_a_pair(benchmark_store) -> None:
+def test_the_two_questions_of_matched_anchor_pairs_are_compared(benchmark_store) -> None:
     matched = benchmark_store.selection(suite=MATCHED_ANCHOR)
     by_family = {i.item_id: float(i.family == "event") for i in matched}
     [p] = compare_anchors(matched[::-1], by_family, seed=0)
@@ -126,7 +127,7 @@ def test_anchors_compare_the_questions_of_a_pair(benchmark_store) -> None:
     assert p.p == pytest.approx(0.5 ** (p.n - 1))
 
 
-def test_comparisons_survive_json_and_fit_a_page(items) -> None:
+def test_comparisons_can_be_read_from_json_and_fit_a_page(items) -> None:
     found = compare_runs(
         items, random_credits(items, 0), random_credits(items, 1), ("unchanged", "shuffled"), 0
     )

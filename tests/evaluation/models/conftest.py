@@ -26,17 +26,17 @@ from models.retriever import embedder
 from tests.tiny_models import SMALL
 from train.student import dataset
 
-WHOLE = {"quantization": "none", "lora": LoraConfig(rank=0)}
+NO_LORA = {"quantization": "none", "lora": LoraConfig(rank=0)}
 STUDENT = StudentConfig(
-    name="small", architecture=SMALL, image_size=96, max_length=1500, max_new_tokens=12, **WHOLE
+    name="small", architecture=SMALL, image_size=96, max_length=1500, max_new_tokens=12, **NO_LORA
 )
 RETRIEVER = RetrieverConfig(
-    name="small", architecture=SMALL, image_size=96, widths=[64, 32], **WHOLE
+    name="small", architecture=SMALL, image_size=96, widths=[64, 32], **NO_LORA
 )
 
 
 def finish(folder: Path, settings: object, metrics: dict | None = None) -> None:
-    """Write what a command's entry writes for a finished run."""
+    """Write the files that `conf.entry` writes into the folder of a finished run."""
     OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
     (folder / "metrics.json").write_text(json.dumps(metrics or {}))
     (folder / "run.json").write_text('{"started": "2026-01-01", "earlier_starts": []}')
@@ -48,7 +48,8 @@ def new_run(folder: Path, *overrides: str) -> Run:
 
 
 def tear(log: Path) -> tuple[str, str]:
-    """Cut off the last third of a log, as a kill may; return the complete and the torn text."""
+    """Cut off the last third of a log, as if the process had been killed while it wrote. Return the
+    complete text and the torn text."""
     complete = log.read_text()
     torn = complete[: len(complete) * 2 // 3]
     log.write_text(torn)
@@ -56,7 +57,7 @@ def tear(log: Path) -> tuple[str, str]:
 
 
 def check_resumed(log: Path, complete: str, torn: str) -> None:
-    """Check that a log kept its torn text and got the missing lines."""
+    """Check that a resumed run kept the torn text of a log and appended the missing lines."""
     assert log.read_text().startswith(f"{torn}\n")
     lines = [*complete.splitlines(), torn.rpartition("\n")[2]]
     assert sorted(log.read_text().splitlines()) == sorted(lines)
@@ -68,7 +69,7 @@ def save_retriever(
     """Write a finished run of train.contrastive."""
     texts = embedder.tokenizer_texts(store.retrieval("train"), cfg)
     model = embedder.load_retriever(cfg, "fp32", texts, folder / "untrained")
-    # The cosines of a new model differ by fp32's noise only.
+    # With its initial weights, the model embeds all inputs almost equally.
     noise = torch.Generator().manual_seed(0)
     for weight in model.parameters():
         weight.data += 0.1 * torch.randn(weight.shape, generator=noise)

@@ -1,5 +1,8 @@
-"""Tiny models of every kind of released embedder: the real architectures with random weights,
-tokenizers and processors, in folders like those of their authors."""
+"""Tiny models of every kind of released embedder.
+
+They have the real architectures with random weights, tokenizers and processors, and are written to
+folders with the files of the released models.
+"""
 
 from __future__ import annotations
 
@@ -31,36 +34,36 @@ from transformers import (
 from evaluation.embedders.languagebind import LanguageBindVideo
 from models.tiny_qwen3_vl import CHAT_TEMPLATE, SPECIAL_TOKENS
 
-SIZE, TIMES = 56, 4
+IMAGE_SIZE, CLIP_FRAMES = 56, 4
 TOWER = {
     "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2,
 }  # fmt: skip
-VISION = {**TOWER, "image_size": SIZE, "patch_size": 14}
-LETTERS = sorted(pre_tokenizers.ByteLevel.alphabet())
+VISION = {**TOWER, "image_size": IMAGE_SIZE, "patch_size": 14}
+ALPHABET = sorted(pre_tokenizers.ByteLevel.alphabet())
 
 
 def clip(folder: Path) -> Path:
     torch.manual_seed(0)
     tokenizer = clip_tokenizer()
     CLIPModel(clip_config(tokenizer)).save_pretrained(folder)
-    size = {"height": SIZE, "width": SIZE}
-    images = CLIPImageProcessor(size={"shortest_edge": SIZE}, crop_size=size)
+    size = {"height": IMAGE_SIZE, "width": IMAGE_SIZE}
+    images = CLIPImageProcessor(size={"shortest_edge": IMAGE_SIZE}, crop_size=size)
     CLIPProcessor(images, tokenizer).save_pretrained(folder)
     return folder
 
 
 def clip_tokenizer() -> CLIPTokenizer:
-    tokens = [*LETTERS, *(f"{letter}</w>" for letter in LETTERS)]
+    tokens = [*ALPHABET, *(f"{character}</w>" for character in ALPHABET)]
     tokens += ["<|startoftext|>", "<|endoftext|>"]
     return CLIPTokenizer(vocab={token: k for k, token in enumerate(tokens)}, merges=[])
 
 
-def clip_config(tokenizer: CLIPTokenizer, **of_vision: object) -> CLIPConfig:
+def clip_config(tokenizer: CLIPTokenizer, **vision: object) -> CLIPConfig:
     text = {
         **TOWER, "vocab_size": len(tokenizer), "max_position_embeddings": 77,
         "bos_token_id": tokenizer.bos_token_id, "eos_token_id": tokenizer.eos_token_id,
     }  # fmt: skip
-    return CLIPConfig(text_config=text, vision_config={**VISION, **of_vision}, projection_dim=24)
+    return CLIPConfig(text_config=text, vision_config={**VISION, **vision}, projection_dim=24)
 
 
 def siglip2(folder: Path) -> Path:
@@ -70,16 +73,17 @@ def siglip2(folder: Path) -> Path:
     tokenizer = Siglip2Tokenizer(vocab={token: k for k, token in enumerate(tokens)}, merges=[])
     text = {**TOWER, "vocab_size": len(tokenizer), "max_position_embeddings": 64}
     SiglipModel(SiglipConfig(text_config=text, vision_config=VISION)).save_pretrained(folder)
-    images = SiglipImageProcessor(size={"height": SIZE, "width": SIZE})
+    images = SiglipImageProcessor(size={"height": IMAGE_SIZE, "width": IMAGE_SIZE})
     SiglipProcessor(images, tokenizer).save_pretrained(folder)
     return folder
 
 
 def languagebind(videos: Path, images: Path) -> tuple[Path, Path]:
-    """The config files have a model type of their own, and there is no processor file."""
+    """Write a video model and an image model. Their config files have model types that transformers
+    does not know, and there is no processor file."""
     torch.manual_seed(0)
     tokenizer = clip_tokenizer()
-    config = clip_config(tokenizer, add_time_attn=True, num_frames=TIMES)
+    config = clip_config(tokenizer, add_time_attn=True, num_frames=CLIP_FRAMES)
     video = LanguageBindVideo(config)
     for layer in video.vision_model.encoder.layers:
         torch.nn.init.normal_(layer.temporal_embedding)
@@ -95,14 +99,14 @@ def languagebind(videos: Path, images: Path) -> tuple[Path, Path]:
 
 
 def vlm2vec(base: Path, adapters: Path) -> Path:
-    """Adapters over a Qwen2-VL, saved with the processor."""
+    """Write a Qwen2-VL to `base`, and adapters over it with the processor to `adapters`."""
     torch.manual_seed(0)
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     tokenizer.decoder = decoders.ByteLevel()
     trainer = trainers.BpeTrainer(
-        vocab_size=len(SPECIAL_TOKENS) + len(LETTERS), special_tokens=list(SPECIAL_TOKENS),
-        initial_alphabet=LETTERS, show_progress=False,
+        vocab_size=len(SPECIAL_TOKENS) + len(ALPHABET), special_tokens=list(SPECIAL_TOKENS),
+        initial_alphabet=ALPHABET, show_progress=False,
     )  # fmt: skip
     tokenizer.train_from_iterator([], trainer)
     fast = PreTrainedTokenizerFast(

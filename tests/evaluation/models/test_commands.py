@@ -50,8 +50,8 @@ def test_a_student_is_measured_resumed_and_reported(
     # A killed run generates only the missing responses, and its results are the same.
     log = run.folder / "answers.jsonl"
     complete, torn = tear(log)
-    heads = [json.loads(line) for line in complete.splitlines()[:2]]
-    settings = {head["mode"]: head["asked"] for head in heads}
+    headers = [json.loads(line) for line in complete.splitlines()[:2]]
+    settings = {header["mode"]: header["asked"] for header in headers}
     items = micro_store.selection("test")
     assert 0 < len(ResponseLog(log, settings, items).responses) < 16
     select.main.__wrapped__(cfg, run)
@@ -67,8 +67,8 @@ def test_a_student_is_measured_resumed_and_reported(
     assert all(a.right == (a.letter == letters[a.item_id]) for a in responses.values())
     log.write_text(complete)
     # Responses of other weights are not reused.
-    others = {mode: {**of_mode, "model": "another"} for mode, of_mode in settings.items()}
-    assert not ResponseLog(log, others, items).responses
+    other_model = {mode: {**values, "model": "another"} for mode, values in settings.items()}
+    assert not ResponseLog(log, other_model, items).responses
 
     shutil.copytree(trained_student, tmp_path / "sft" / "run")
     page = new_run(tmp_path / "report" / "run")
@@ -118,15 +118,15 @@ def test_a_run_that_cannot_be_measured_is_refused(trained_student, tmp_path, dam
 
 def test_a_model_is_not_tested_on_its_training_scenes(trained_student, micro) -> None:
     cfg = SelectCommand(model=str(trained_student))
-    unseen = {"seed": 1, "test_share": 0.9}
-    for same in ({}, unseen, {"scenes": 99}, {"test_share": 0.01}):
-        benchmark = replace(micro, **same)
+    other_scenes = {"seed": 1, "test_share": 0.9}
+    for allowed in ({}, other_scenes, {"scenes": 99}, {"test_share": 0.01}):
+        benchmark = replace(micro, **allowed)
         assert resolve_model(cfg, benchmark, SftCommand, "student")[0] == trained_student
     with raises_user_error("training-scenes-tested", contains="test_share=0.9"):
         resolve_model(cfg, replace(micro, test_share=0.9), SftCommand, "student")
-    # Another seed splits the same release anew.
     release = replace(micro, simulator="clevrer", folder="/release")
     check_unseen("model", release, replace(release, folder="/other", seed=1))
+    # With another seed, the same release is split differently.
     with raises_user_error("training-scenes-tested", contains="seed=1"):
         check_unseen("model", release, replace(release, seed=1))
 
@@ -137,20 +137,20 @@ def test_settings_that_a_trained_model_cannot_use_are_refused(
     cfg = SelectCommand(
         model=str(trained_student), student=StudentConfig(name="x", temperature=0.7, frames=2)
     )
-    typed = ("modes=[answer]", "student.temperature=0.7")
-    _, settings = resolve_model(cfg, micro, SftCommand, "student", typed)
+    overrides = ("modes=[answer]", "student.temperature=0.7")
+    _, settings = resolve_model(cfg, micro, SftCommand, "student", overrides)
     assert settings.student.temperature == 0.7
-    # Settings that were not typed come from the run.
+    # Settings without an override come from the run.
     assert settings.student.frames == STUDENT.frames != 2
     for refused in ("student=qwen3_vl_8b", "student.lora.rank=8", "++train.regime=cot"):
         with raises_user_error("unused-setting", contains="student.temperature"):
-            resolve_model(cfg, micro, SftCommand, "student", (*typed, refused))
+            resolve_model(cfg, micro, SftCommand, "student", (*overrides, refused))
     matcher = EmbedderConfig(model=str(trained_retriever))
-    resolve = (matcher, micro, ContrastiveCommand, "retriever")
-    resolve_model(*resolve, ("student.frames=2", "matcher.model=RUN"), "matcher.model")
+    arguments = (matcher, micro, ContrastiveCommand, "retriever")
+    resolve_model(*arguments, ("student.frames=2", "matcher.model=RUN"), "matcher.model")
     for refused in ("matcher=clip", "matcher.retriever.image_size=64"):
         with raises_user_error("unused-setting", contains="matcher.train"):
-            resolve_model(*resolve, (refused,), "matcher.model")
+            resolve_model(*arguments, (refused,), "matcher.model")
 
 
 def test_a_limit_spreads_over_the_families(micro_store) -> None:

@@ -34,7 +34,8 @@ def test_constrained_decoding_yields_records_only(
     assert len(constrained) == 4
     for row in constrained:
         assert parse_choice(row["text"]).letter == row["letter"]
-        # A random model may fill the texts up to the token limit, also with control characters.
+        # A model with random weights may write texts up to the token limit, which cuts the record,
+        # and control characters, which `strict` would refuse.
         if not row["cut"]:
             record = json.loads(row["text"], strict=False)
             jsonschema.validate(record, schema())

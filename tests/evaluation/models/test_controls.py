@@ -1,4 +1,4 @@
-"""Controls are compared with the unchanged items, by the real command and a real server."""
+"""evaluation.select under controls and on matched-anchor pairs, with a local chat server."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_candidate_only_is_compared_with_the_unchanged_items(
     assert "answer: unchanged (left) less candidate_only (right)" in text
     assert "any base (answer, candidate_only)" in text
 
-    # The same command requests nothing and has the same results.
+    # The same command sends no requests when it is run again, and has the same results.
     server.requests.clear()
     assert select.main.__wrapped__(cfg, Run("x", tmp_path)) == metrics
     assert not server.requests
@@ -84,11 +84,12 @@ def test_responses_of_other_runs_are_reused(command, micro_store, start_server, 
     assert not any(
         p["type"] == "video_url" for request in server.requests for p in parts_of(request)
     )
-    # From then on they are in its own log. Other settings need other responses.
+    # The reused responses were copied into the log of the second run.
     shutil.rmtree(tmp_path / "select" / "x")
     server.requests.clear()
     assert select.main.__wrapped__(control, Run("y", folder(tmp_path, "y"))) == metrics
     assert not server.requests
+    # Responses to other settings are not reused.
     other = replace(control, student=replace(STUDENT, max_new_tokens=30), modes=["record"])
     select.main.__wrapped__(other, Run("z", folder(tmp_path, "z")))
     assert len(server.requests) == 24
@@ -109,19 +110,19 @@ def test_the_questions_of_a_matched_pair_are_compared(benchmark_store, tmp_path)
     ]
     _, result = write_report(choices, items, "any", 0, tmp_path, MATCHED_ANCHOR, build="any")
     controls = json.loads((tmp_path / "report.json").read_text())["controls"]
-    truth = [by_event.letter for by_event, _ in pair_items(items)]
+    letters = [by_event.letter for by_event, _ in pair_items(items)]
     matched = [p for p in controls if p["left"] == "event"]
     assert [p["mode"] for p in matched] == ["answer", "answer, candidate_only"]
     for p in matched:
-        assert (p["right"], p["of"], p["n"]) == ("time", "all", len(truth))
-        assert (p["only_left"], p["only_right"]) == (truth.count("A"), truth.count("B"))
+        assert (p["right"], p["of"], p["n"]) == ("time", "all", len(letters))
+        assert (p["only_left"], p["only_right"]) == (letters.count("A"), letters.count("B"))
         assert p["left_accuracy"] == result.families["event"].value
         assert p["right_accuracy"] == result.families["time"].value
     # Equal responses have no difference.
     assert {p["difference"] for p in controls if p["left"] != "event"} == {0}
 
 
-def test_a_limit_keeps_pairs_whole(benchmark_store) -> None:
+def test_a_limit_selects_complete_pairs(benchmark_store) -> None:
     items = benchmark_store.selection(suite=MATCHED_ANCHOR)
     assert len(items) == 2 * len(pair_items(items))
     few = select.limit_items(items, 3, 0)

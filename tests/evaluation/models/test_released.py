@@ -1,4 +1,4 @@
-"""Released embedders, each on its real architecture."""
+"""Released embedders, as tiny models of their real architectures."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def presets(tmp_path_factory) -> dict[str, RetrieverConfig]:
         },
     }  # fmt: skip
     shared = {
-        "quantization": "none", "lora": LoraConfig(rank=0), "image_size": released.SIZE,
-        "frames": released.TIMES, "widths": [32],
+        "quantization": "none", "lora": LoraConfig(rank=0), "image_size": released.IMAGE_SIZE,
+        "frames": released.CLIP_FRAMES, "widths": [32],
     }  # fmt: skip
     return {
         name: RetrieverConfig(name=name, **{**shared, **own, "model": str(own["model"])})
@@ -70,7 +70,7 @@ def presets(tmp_path_factory) -> dict[str, RetrieverConfig]:
 
 @pytest.fixture(scope="module")
 def frames(micro_store) -> FrameReader:
-    return FrameReader(micro_store, released.SIZE)
+    return FrameReader(micro_store, released.IMAGE_SIZE)
 
 
 def load(preset: RetrieverConfig):
@@ -82,15 +82,17 @@ def test_an_embedding_is_independent_of_its_batch(kind, presets, frames, micro_s
     encoder, queries = load(presets[kind]), micro_store.standard_test()[:4]
     targets = [q.target for q in queries]
     for embed in (
-        lambda some: encoder.queries(some, frames),
-        lambda some: encoder.texts([q.question for q in some]),
+        lambda some: encoder.embed_queries(some, frames),
+        lambda some: encoder.embed_texts([q.question for q in some]),
     ):
         together = embed(queries)
         alone = np.concatenate([embed([query]) for query in queries])
         np.testing.assert_allclose(together, alone, atol=1e-5)
         np.testing.assert_allclose(np.linalg.norm(together, axis=1), 1, atol=1e-5)
-    together = encoder.frames(targets, frames)
-    np.testing.assert_allclose(together[::-1], encoder.frames(targets[::-1], frames), atol=1e-5)
+    together = encoder.embed_frames(targets, frames)
+    np.testing.assert_allclose(
+        together[::-1], encoder.embed_frames(targets[::-1], frames), atol=1e-5
+    )
     assert len(np.unique(together.round(5), axis=0)) == len(set(targets))
 
 
@@ -108,34 +110,34 @@ def test_a_query_is_the_sum_of_its_prefix_and_its_question(
         truncation=True, return_tensors="pt",
     )  # fmt: skip
     with torch.no_grad():
-        # The model's own forward gives unit embeddings.
-        found = model(input_ids=inputs["input_ids"], pixel_values=inputs["pixel_values"])
-    mean = unit_rows(found.image_embeds.mean(0, keepdim=True).numpy())
-    expected = unit_rows(mean + found.text_embeds.numpy())
+        # The embeddings that the model's `forward` returns have length 1.
+        output = model(input_ids=inputs["input_ids"], pixel_values=inputs["pixel_values"])
+    mean = unit_rows(output.image_embeds.mean(0, keepdim=True).numpy())
+    expected = unit_rows(mean + output.text_embeds.numpy())
     encoder = load(preset)
-    np.testing.assert_allclose(encoder.queries([query], frames), expected, atol=1e-4)
-    np.testing.assert_allclose(encoder.texts([query.question]), found.text_embeds, atol=1e-4)
+    np.testing.assert_allclose(encoder.embed_queries([query], frames), expected, atol=1e-4)
+    np.testing.assert_allclose(encoder.embed_texts([query.question]), output.text_embeds, atol=1e-4)
 
 
 def test_languagebind_without_attention_over_time_is_clip(presets, frames, micro_store) -> None:
     preset, query = presets["languagebind"], micro_store.standard_test()[0]
     video = LanguageBindVideo.from_pretrained(preset.model)
-    pixels = torch.randn(2 * released.TIMES, 3, released.SIZE, released.SIZE)
+    pixels = torch.randn(2 * released.CLIP_FRAMES, 3, released.IMAGE_SIZE, released.IMAGE_SIZE)
     plain = CLIPModel(video.config).eval()
     loaded = plain.load_state_dict(video.state_dict(), strict=False)
     assert not loaded.missing_keys
     with torch.no_grad():
-        timed = video.eval().get_image_features(pixels).pooler_output
-        # Each of its two clips by itself.
-        one = video.get_image_features(pixels[released.TIMES :]).pooler_output
-        torch.testing.assert_close(timed[released.TIMES :], one)
+        with_time = video.eval().get_image_features(pixels).pooler_output
+        # A clip does not attend over the frames of another clip.
+        second_clip = video.get_image_features(pixels[released.CLIP_FRAMES :]).pooler_output
+        torch.testing.assert_close(with_time[released.CLIP_FRAMES :], second_clip)
         for layer in video.vision_model.encoder.layers:
             layer.temporal_embedding.zero_()
             layer.temporal_attn.out_proj.weight.zero_()
             layer.temporal_attn.out_proj.bias.zero_()
-        still = video.get_image_features(pixels).pooler_output
-        torch.testing.assert_close(still, plain.get_image_features(pixels).pooler_output)
-    assert (timed - still).abs().max() > 1e-3
+        without_time = video.get_image_features(pixels).pooler_output
+        torch.testing.assert_close(without_time, plain.get_image_features(pixels).pooler_output)
+    assert (with_time - without_time).abs().max() > 1e-3
 
     # The order of frames matters, and a short prefix repeats some frames.
     encoder = load(preset)
@@ -147,7 +149,9 @@ def test_languagebind_without_attention_over_time_is_clip(presets, frames, micro
     assert spread(8, 4) == [0, 2, 5, 7]
 
 
-def test_vlm2vec_reads_bare_media_tokens_at_text_positions(presets, frames, micro_store) -> None:
+def test_vlm2vec_reads_media_at_text_positions_without_start_tokens(
+    presets, frames, micro_store
+) -> None:
     preset, query = presets["vlm2vec"], micro_store.standard_test()[0]
     base = json.loads((Path(preset.model) / "adapter_config.json").read_text())
     plain = Qwen2VLForConditionalGeneration.from_pretrained(base["base_model_name_or_path"])
@@ -159,19 +163,22 @@ def test_vlm2vec_reads_bare_media_tokens_at_text_positions(presets, frames, micr
     video = processor(
         text=[f"<|video_pad|> {INSTRUCTIONS['query_instruction']} {query.question}"], videos=[clip],
         do_sample_frames=False, video_metadata=[times], return_tensors="pt",
-        videos_kwargs={"size": {"shortest_edge": 28 * 28, "longest_edge": 8 * released.SIZE**2}},
+        videos_kwargs={
+            "size": {"shortest_edge": 28 * 28, "longest_edge": 8 * released.IMAGE_SIZE**2}
+        },
     )  # fmt: skip
     image = processor(
         text=[f"<|image_pad|> {INSTRUCTIONS['frame_instruction']}"],
         images=[frames.image(query.scene_id, prefix[0])], return_tensors="pt",
     )  # fmt: skip
     encoder, frame = load(preset), FrameRef(query.scene_id, prefix[0])
-    embedded = encoder.queries([query], frames), encoder.frames([frame], frames)
+    embedded = encoder.embed_queries([query], frames), encoder.embed_frames([frame], frames)
     for inputs, embedding in zip((video, image), embedded, strict=True):
-        flat = torch.arange(inputs["input_ids"].shape[1]).expand(3, 1, -1)
+        # Equal positions in time, height and width, as text has them.
+        positions = torch.arange(inputs["input_ids"].shape[1]).expand(3, 1, -1)
         with torch.no_grad():
-            found = model(**inputs, position_ids=flat, output_hidden_states=True)
-        last = unit_rows(found.hidden_states[-1][:, -1].numpy())
+            output = model(**inputs, position_ids=positions, output_hidden_states=True)
+        last = unit_rows(output.hidden_states[-1][:, -1].numpy())
         np.testing.assert_allclose(embedding, last, atol=1e-4)
 
 
@@ -204,16 +211,16 @@ def test_the_nearest_candidate_is_chosen_and_embeddings_are_computed_once(
     )
     report = measure(similarity, SimilarityCommand, preset, "first")
     items, encoder = micro_store.selection("test"), load(preset)
-    query_rows = encoder.queries(items, frames).astype(float)
-    candidates = np.stack([encoder.frames(list(item.candidates), frames) for item in items])
+    query_rows = encoder.embed_queries(items, frames).astype(float)
+    candidates = np.stack([encoder.embed_frames(list(item.candidates), frames) for item in items])
     scores = np.einsum("id,icd->ic", query_rows, candidates)
     right = scores.argmax(1) == [item.answer for item in items]
     (row,) = report["rows"]
     assert (row["name"], row["mode"], row["n"]) == ("clip", "similarity", len(items))
     assert row["micro"]["value"] == pytest.approx(right.mean())
-    for family, found in row["families"].items():
-        of = [item.family == family for item in items]
-        assert found["value"] == pytest.approx(right[of].mean())
+    for family, accuracy in row["families"].items():
+        in_family = [item.family == family for item in items]
+        assert accuracy["value"] == pytest.approx(right[in_family].mean())
     assert set(report["subtypes"]["clip"]) == {f"{i.family}/{i.subtype}" for i in items}
     chosen = report["positions"]["clip"]["chosen"]
     assert chosen == {x: int((scores.argmax(1) == k).sum()) for k, x in enumerate(LETTERS)}
@@ -223,7 +230,7 @@ def test_the_nearest_candidate_is_chosen_and_embeddings_are_computed_once(
     text = (tmp_path / "first" / "report.txt").read_text()
     assert "SigLIP 2" in text
     assert all(subtype in text for subtype in report["subtypes"]["clip"])
-    # A second evaluation loads no model: without its configuration none could be loaded.
+    # A second evaluation loads no model: without config.json, the model could not be loaded.
     (tmp_path / "clip" / "config.json").unlink()
     assert measure(similarity, SimilarityCommand, preset, "second") == report
 
@@ -249,8 +256,8 @@ def test_a_tie_is_not_a_choice() -> None:
     assert right == (credits == 1).tolist()
 
 
-def without(part: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / part).unlink()
+def delete_file(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
 
 
 def drop_weight(folder: Path) -> None:
@@ -262,10 +269,10 @@ def drop_weight(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "codes"),
     [
-        (without("model.safetensors"), ["unloadable-model"]),
-        (without("config.json"), ["unloadable-model"]),
-        (without("tokenizer.json"), ["unloadable-model", "incomplete-model"]),
-        (without("processor_config.json"), ["unloadable-model", "incomplete-model"]),
+        (delete_file("model.safetensors"), ["unloadable-model"]),
+        (delete_file("config.json"), ["unloadable-model"]),
+        (delete_file("tokenizer.json"), ["unloadable-model", "incomplete-model"]),
+        (delete_file("processor_config.json"), ["unloadable-model", "incomplete-model"]),
         (drop_weight, ["incomplete-model"]),
         (lambda folder: (folder / "config.json").write_text("{"), ["unloadable-model"]),
     ],

@@ -29,7 +29,8 @@ from tests.user_errors import raises_user_error
 
 @pytest.fixture
 def measure(tmp_path, trained_retriever, micro, micro_store) -> Callable[..., dict]:
-    """Measures a copy of the run on a copy of the store; returns the report without the times."""
+    """A function that evaluates a copy of the run on a copy of the store, and returns the report
+    without the times."""
     shutil.copytree(trained_retriever, tmp_path / "run")
     shutil.copytree(micro_store.folder, tmp_path / "store" / "micro")
     shutil.rmtree(tmp_path / "store" / "micro" / EMBEDDINGS, ignore_errors=True)
@@ -68,8 +69,8 @@ def test_ranks_follow_the_definition_and_embeddings_are_computed_once(
     trained, _ = embedders(tmp_path / "run", store, tmp_path)
     query_rows = trained.embed_queries(queries).rows([q.query_id for q in queries])
     frame_rows = trained.embed_frames(database).rows([f.name for f in database])
-    # The library's own embeddings are equal, and the report follows from them, in whatever order
-    # frames fall that fp32 hardly distinguishes from the target.
+    # The library computes equal embeddings, and the measures follow from them. Frames that score
+    # within 1e-6 of the target may rank before or after it.
     model = SentenceTransformer(str(tmp_path / "run" / "retriever"), device="cpu")
     inputs = [embedder.query_input(q, frames, RETRIEVER) for q in queries]
     np.testing.assert_allclose(model.encode(inputs, prompt_name="query"), query_rows, atol=1e-5)
@@ -86,32 +87,32 @@ def test_ranks_follow_the_definition_and_embeddings_are_computed_once(
         best = np.mean(1 / (1 + (scores > own + 1e-6).sum(1)))
         assert best - worst < 0.2 * best, "the frames are too similar to show anything"
         assert worst - 1e-9 <= row["mrr"]["value"] <= best + 1e-9
-    # Differences are those of the rows, and the rows follow from the written ranks.
+    # The reported differences follow from the rows, and the rows from the ranks in ranks.jsonl.
     overall = {(r["name"], r["width"]): r for r in first["rows"] if r["builder"] is None}
     ranks = list(read_json_lines(tmp_path / "one" / "ranks.jsonl"))
     assert [r["query_id"] for r in ranks] == 2 * [q.query_id for q in queries]
     for k, pair in enumerate(first["differences"]):
         left, right = (overall[pair[side], pair["width"]] for side in ("left", "right"))
         assert "untrained" not in pair["left"]
-        for name, found in pair["measures"].items():
+        for name, reported in pair["measures"].items():
             key = name.replace("@", "_")
             difference = left[key]["value"] - right[key]["value"]
-            assert found["value"] == pytest.approx(difference, abs=1e-12)
-        of_left = [line for line in ranks if line["by"] == pair["left"]]
-        before, tied = (np.array([line[w][k] for line in of_left]) for w in ("before", "tied"))
-        found = np.ones(len(of_left), bool)
-        measures = ranking_metrics(before, tied, found, len(database), [1])
+            assert reported["value"] == pytest.approx(difference, abs=1e-12)
+        left_ranks = [row for row in ranks if row["by"] == pair["left"]]
+        before, tied = (np.array([r[key][k] for r in left_ranks]) for key in ("before", "tied"))
+        valid = np.ones(len(left_ranks), bool)
+        measures = ranking_metrics(before, tied, valid, len(database), [1])
         assert measures["mrr"] == pytest.approx(left["mrr"]["value"])
     assert [pair["width"] for pair in first["differences"]] == RETRIEVER.widths
     assert (tmp_path / "one" / "retrieval.png").stat().st_size > 10_000
     text = (tmp_path / "one" / "report.txt").read_text()
     assert all(f"builder {q.builder} " in text for q in queries)
 
-    # A second evaluation loads no model: without its configuration none could be loaded.
+    # A second evaluation loads no model: without config.json, none could be loaded.
     (tmp_path / "run" / "retriever" / "config.json").unlink()
     (tmp_path / "run" / "untrained" / "config.json").unlink()
     assert measure("two") == first
-    # Another precision needs other embeddings.
+    # Another precision needs other embeddings, for which the model cannot be loaded.
     config = OmegaConf.load(tmp_path / "run" / "config.yaml")
     config.train.precision = "fp32"
     OmegaConf.save(config, tmp_path / "run" / "config.yaml")
@@ -144,11 +145,11 @@ def test_a_multi_vector_retriever_is_measured_by_late_interaction(
     assert measure("two") == first
 
 
-def test_a_batch_beyond_memory_is_named(measure, monkeypatch) -> None:
+def test_running_out_of_memory_names_the_batch(measure, monkeypatch) -> None:
     def run_out(*_: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    monkeypatch.setattr(joint_encoder.JointEncoder, "queries", run_out)
+    monkeypatch.setattr(joint_encoder.JointEncoder, "embed_queries", run_out)
     with raises_user_error("out-of-memory", contains="batch"):
         measure()
 
@@ -174,8 +175,8 @@ def test_the_key_of_embeddings_depends_on_all_of_their_inputs(
     trained, untrained = embedders(trained_retriever, store, tmp_path, "fp32")
     database = store.database()[:2]
 
-    def path_of(changed: Embedder) -> Path:
-        embeddings = changed.embed_frames(database)
+    def path_of(variant: Embedder) -> Path:
+        embeddings = variant.embed_frames(database)
         assert embeddings.rows([f.name for f in database]).shape == (2, 64)
         return embeddings.path
 
@@ -214,7 +215,7 @@ def test_an_edited_processor_changes_the_key(
     for part in ("retriever", "untrained"):
         path = tmp_path / "run" / part / name
         path.write_text(path.read_text() + "\n")
-    changed = [now != then for now, then in zip(keys(), before, strict=True)]
+    changed = [new != old for new, old in zip(keys(), before, strict=True)]
     assert changed == [changes_key, changes_key]
 
 
@@ -224,12 +225,12 @@ def test_long_texts_in_small_batches_have_the_same_embeddings(
 ) -> None:
     texts = ["The red cube rests.", *("It moves on. " * k for k in (40, 3, 1, 20, 2))]
     encoder = embedders(trained_retriever, micro_store, trained_retriever)[0].encoder
-    expected, batches = encoder.texts(texts), []
+    expected, batches = encoder.embed_texts(texts), []
     encode = encoder._encode
     monkeypatch.setattr(encoder, "_encode", lambda *a: batches.append(a[0]) or encode(*a))
     longest = max(map(len, encoder._model.tokenizer(texts)["input_ids"]))
     for pairs, sizes in ((3 * longest**2, [3, 3]), (1, [1] * 6), (6 * longest**2, [6])):
         monkeypatch.setattr(joint_encoder, "MAX_TOKEN_PAIRS", pairs)
         batches.clear()
-        np.testing.assert_allclose(encoder.texts(texts), expected, atol=1e-5)
+        np.testing.assert_allclose(encoder.embed_texts(texts), expected, atol=1e-5)
         assert [len(batch) for batch in batches] == sizes

@@ -1,4 +1,4 @@
-"""A served model gets the frames and the times that a local model gets."""
+"""A model on a server: its requests, its responses, and the values that identify it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def frames(micro_store):
     return FrameReader(micro_store, STUDENT.image_size)
 
 
-def at(*servers, **changes) -> ServerConfig:
+def config_of(*servers, **changes) -> ServerConfig:
+    """The settings of a client of servers."""
     settings = {"concurrency": 3, "unreachable_timeout": 5.0, "timeout": 10.0, **changes}
     return ServerConfig(url=[s.url for s in servers], model="served", **settings)
 
@@ -48,17 +49,19 @@ def open_log(tmp_path, items) -> ResponseLog:
 
 
 def responder(server, frames, cfg=STUDENT, mode="record", control=None, seed=0):
-    """The function that generates responses in a mode."""
+    """The function that generates the responses of a served base in a mode."""
     model = ServedModel(SelectCommand(student=cfg, server=server, seed=seed), None, cfg)
     return partial(model.respond, mode, partial(item_sample, "cot", frames, cfg, control, mode))
 
 
-def test_requests_hold_the_frames_and_times_of_a_sample(
+def test_requests_contain_the_frames_and_times_of_a_sample(
     items, frames, start_server, tmp_path
 ) -> None:
     server = start_server(lambda _: FULL)
     log = open_log(tmp_path, items)
-    answers = collect_responses(items, "record", responder(at(server, concurrency=1), frames), log)
+    answers = collect_responses(
+        items, "record", responder(config_of(server, concurrency=1), frames), log
+    )
     assert [a.letter for a in answers] == ["C"] * 8
     assert [a.right for a in answers] == [i.letter == "C" for i in items]
     assert {a.valid for a in answers} == {True}
@@ -92,12 +95,12 @@ def test_constrained_requests_have_the_schema_and_a_seed_per_item(
     server = start_server(lambda _: FULL)
     responses = []
     for seed in (0, 0, 1):
-        respond = responder(at(server), frames, THINKING, "constrained", seed=seed)
+        respond = responder(config_of(server), frames, THINKING, "constrained", seed=seed)
         respond(items[:2], responses.extend)
     answers = [score_response(item, "constrained", text) for item, text in responses]
     assert [(a.letter, a.valid) for a in answers] == [("C", True)] * 6
-    format_ = server.requests[0]["response_format"]
-    assert format_["json_schema"]["schema"] == schema()
+    response_format = server.requests[0]["response_format"]
+    assert response_format["json_schema"]["schema"] == schema()
     sampling = {key: server.requests[0][key] for key in ("temperature", "top_p", "top_k")}
     assert sampling == {"temperature": 0.6, "top_p": 0.95, "top_k": 20}
     assert server.requests[0]["chat_template_kwargs"] == {"enable_thinking": True}
@@ -105,9 +108,9 @@ def test_constrained_requests_have_the_schema_and_a_seed_per_item(
     assert seeds[0] == seeds[1] != seeds[2]
     assert len(set(seeds[0])) == 2
 
-    # Unlimited sampling is requested explicitly.
+    # Sampling without top_p and top_k is requested explicitly.
     unlimited = replace(STUDENT, temperature=0.7, top_p=1.0, top_k=0)
-    responder(at(server), frames, unlimited)(items[:1], lambda _: None)
+    responder(config_of(server), frames, unlimited)(items[:1], lambda _: None)
     assert (server.requests[-1]["top_p"], server.requests[-1]["top_k"]) == (1.0, -1)
 
 
@@ -131,7 +134,7 @@ def test_a_thought_is_not_parsed_as_the_answer(reply, thinking, text, items) -> 
 
 
 def test_malformed_responses_are_stored_and_scored(items, frames, start_server, tmp_path) -> None:
-    hostile = iter(
+    replies = iter(
         [
             "x" * 1_000_000,
             "{" * 300_000,
@@ -143,72 +146,74 @@ def test_malformed_responses_are_stored_and_scored(items, frames, start_server, 
             FULL,
         ]
     )
-    server = start_server(lambda _: next(hostile))
+    server = start_server(lambda _: next(replies))
     log = open_log(tmp_path, items)
-    answers = collect_responses(items, "record", responder(at(server, concurrency=1), frames), log)
+    answers = collect_responses(
+        items, "record", responder(config_of(server, concurrency=1), frames), log
+    )
     assert [a.letter for a in answers] == [None, None, "B", None, None, None, None, "C"]
     assert answers[4].reason == "cut off"
     stored = open_log(tmp_path, items).responses
     assert [stored[a.item_id, "record"] for a in answers] == answers
 
 
-def test_responses_survive_a_server_that_dies(items, frames, start_server, tmp_path) -> None:
+def test_responses_before_a_server_fails_are_kept(items, frames, start_server, tmp_path) -> None:
     first = start_server(lambda _: FULL if len(first.requests) < 4 else 500)
     log = open_log(tmp_path, items)
-    dying = responder(at(first, unreachable_timeout=0.2, concurrency=1), frames)
+    dying = responder(config_of(first, unreachable_timeout=0.2, concurrency=1), frames)
     with raises_user_error("no-server", contains="server.url"):
         collect_responses(items, "record", dying, log)
     before = (tmp_path / "answers.jsonl").read_text()
     assert len(log.responses) == 3
     second = start_server(lambda _: FULL)
     log = open_log(tmp_path, items)
-    assert len(collect_responses(items, "record", responder(at(second), frames), log)) == 8
+    assert len(collect_responses(items, "record", responder(config_of(second), frames), log)) == 8
     assert len(second.requests) == 5
     assert (tmp_path / "answers.jsonl").read_text().startswith(before)
 
 
 def test_a_server_that_refuses_clips_is_named(items, frames, start_server) -> None:
-    words = "served is not a multimodal model"
+    reason = "served is not a multimodal model"
 
     def refuse(request):
         clip = any(p["type"] == "video_url" for p in request["messages"][0]["content"])
-        return {"status": 400, "message": words} if clip else "Hello."
+        return {"status": 400, "message": reason} if clip else "Hello."
 
     server = start_server(refuse)
-    with raises_user_error("server-refuses", contains=(server.url, words)):
-        responder(at(server), frames)(items, lambda _: None)
+    with raises_user_error("server-refuses", contains=(server.url, reason)):
+        responder(config_of(server), frames)(items, lambda _: None)
 
 
-def test_an_item_that_a_server_refuses_is_named(items, frames, start_server) -> None:
-    # A blank canary is much shorter than any item.
+def test_a_server_that_refuses_an_item_is_reported(items, frames, start_server) -> None:
+    # The request for an item is much longer than a canary, whose frames are small and blank.
     def refuse(request):
         long = len(json.dumps(request)) > 10_000
         return {"status": 400, "message": "prompt is too long"} if long else "Hello."
 
     server = start_server(refuse)
     with raises_user_error("no-response", contains="prompt is too long"):
-        responder(at(server, concurrency=1), frames)(items, lambda _: None)
+        responder(config_of(server, concurrency=1), frames)(items, lambda _: None)
 
 
-def test_the_origin_of_a_served_model(start_server) -> None:
+def test_a_server_reports_the_origin_of_its_models(start_server) -> None:
     server = start_server(lambda _: FULL)
-    assert served_origin(at(server)) == {"root": "weights", "parent": None}
-    adapter = replace(at(server), model="adapter")
+    assert served_origin(config_of(server)) == {"root": "weights", "parent": None}
+    adapter = replace(config_of(server), model="adapter")
     assert served_origin(adapter) == {"root": "lora", "parent": "weights"}
     with raises_user_error("unknown-model", contains=("server.model=other", "served, adapter")):
-        served_origin(replace(at(server), model="other"))
+        served_origin(replace(config_of(server), model="other"))
     server.stop()
     with raises_user_error("no-server", contains="http://127"):
-        served_origin(at(server))
+        served_origin(config_of(server))
 
 
 def test_a_revision_identifies_weights_that_a_server_does_not_describe(
     start_server, caplog
 ) -> None:
     caplog.set_level("INFO")
-    cfg = SelectCommand(student=STUDENT, server=at(start_server(lambda _: FULL)))
+    cfg = SelectCommand(student=STUDENT, server=config_of(start_server(lambda _: FULL)))
     unpinned, pinned = (
-        ServedModel(cfg, None, replace(STUDENT, revision=rev)).revision for rev in (None, "c0ffee")
+        ServedModel(cfg, None, replace(STUDENT, revision=rev)).identity for rev in (None, "c0ffee")
     )
     assert unpinned != pinned
     assert "student.revision=COMMIT" in caplog.text
@@ -220,29 +225,29 @@ def test_requests_carry_the_api_key(items, frames, start_server, tmp_path, monke
     log = open_log(tmp_path, items)
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     for request in (
-        lambda: served_origin(at(server)),
-        lambda: collect_responses(items, "record", responder(at(server), frames), log),
+        lambda: served_origin(config_of(server)),
+        lambda: collect_responses(items, "record", responder(config_of(server), frames), log),
     ):
         with raises_user_error("invalid-api-key", contains=(server.url, "OPENAI_API_KEY")):
             request()
     monkeypatch.setenv("OPENAI_API_KEY", "secret")
-    assert served_origin(at(server))["root"] == "weights"
-    answers = collect_responses(items, "record", responder(at(server), frames), log)
+    assert served_origin(config_of(server))["root"] == "weights"
+    answers = collect_responses(items, "record", responder(config_of(server), frames), log)
     assert [a.letter for a in answers] == ["C"] * 8
 
 
 def test_a_student_and_its_base_are_not_confused(start_server, tmp_path) -> None:
     server = start_server(lambda _: FULL)
-    cfg = SelectCommand(server=replace(at(server), model=None), student=STUDENT)
+    cfg = SelectCommand(server=replace(config_of(server), model=None), student=STUDENT)
     with raises_user_error("missing-server-model", contains="server.model=NAME"):
         ServedModel(cfg, tmp_path, STUDENT)
-    adapter = replace(cfg, server=replace(at(server), model="adapter"))
+    adapter = replace(cfg, server=replace(config_of(server), model="adapter"))
     with raises_user_error("adapter-without-run", contains="model=RUN"):
         ServedModel(adapter, None, STUDENT)
 
 
 def test_adapters_over_an_unquantised_base_are_warned_of(start_server, tmp_path, caplog) -> None:
-    cfg = SelectCommand(server=replace(at(start_server(lambda _: FULL)), model="adapter"))
+    cfg = SelectCommand(server=replace(config_of(start_server(lambda _: FULL)), model="adapter"))
     ServedModel(cfg, tmp_path, replace(STUDENT, quantization="none"))
     assert not caplog.text
     ServedModel(cfg, tmp_path, STUDENT)
@@ -251,8 +256,8 @@ def test_adapters_over_an_unquantised_base_are_warned_of(start_server, tmp_path,
 
 def test_servers_of_two_models_with_one_name_are_refused(start_server) -> None:
     one, same, other = (start_server(lambda _: FULL) for _ in range(3))
-    server = replace(at(one), url=[one.url, same.url])
-    assert served_origin(server) == served_origin(at(one))
+    server = replace(config_of(one), url=[one.url, same.url])
+    assert served_origin(server) == served_origin(config_of(one))
     other.root = "others"
     with raises_user_error("different-models", contains=(one.url, other.url)):
         served_origin(replace(server, url=[one.url, same.url, other.url]))
@@ -264,6 +269,7 @@ def test_the_key_of_a_response_depends_on_all_of_its_inputs() -> None:
     ):
         return response_settings(mode, regime, cfg, seed, {"weights": rev}, benchmark, control)
 
+    # Without sampling, the seed has no effect.
     assert settings() == settings(seed=1)
     other = [
         settings("constrained"),
@@ -284,8 +290,8 @@ def test_the_key_of_a_response_depends_on_all_of_its_inputs() -> None:
 def test_the_command_measures_a_served_model(micro, micro_store, start_server, tmp_path) -> None:
     server = start_server(lambda r: FULL if "response_format" in r else "I cannot tell.")
     cfg = SelectCommand(
-        benchmark=micro, student=STUDENT, server=at(server), store=str(micro_store.folder.parent),
-        limit=6,
+        benchmark=micro, student=STUDENT, server=config_of(server),
+        store=str(micro_store.folder.parent), limit=6,
     )  # fmt: skip
     metrics = select.main.__wrapped__(cfg, Run("x", tmp_path))
     assert metrics["record_parse_rate"] == 0

@@ -1,4 +1,4 @@
-"""Two-stage retrieval: the texts that are written, and how a frozen encoder matches them."""
+"""Two-stage retrieval: the texts that a model writes, and how a frozen encoder matches them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from evaluation.retrieval.standard_test import load_standard_test
 from evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
 from tests.evaluation.metrics.reference import matrix_metrics
 from tests.evaluation.models import released
-from tests.evaluation.models.conftest import STUDENT, WHOLE, check_resumed, new_run, tear
+from tests.evaluation.models.conftest import NO_LORA, STUDENT, check_resumed, new_run, tear
 from tests.user_errors import raises_user_error
 
 SERVED = StudentConfig(name="any", model="any", image_size=96, max_new_tokens=40)
@@ -49,13 +49,13 @@ def clip(tmp_path_factory) -> RetrieverConfig:
     folder = released.clip(tmp_path_factory.mktemp("released") / "clip")
     return RetrieverConfig(
         name="clip", encoder="dual", model=str(folder), widths=[24, 12],
-        image_size=released.SIZE, frames=released.TIMES, **WHOLE,
+        image_size=released.IMAGE_SIZE, frames=released.CLIP_FRAMES, **NO_LORA,
     )  # fmt: skip
 
 
 @pytest.fixture
 def store(tmp_path, micro_store) -> Store:
-    """A copy, which the command may write to."""
+    """A copy of the store, to which the command may write."""
     return open_store(shutil.copytree(micro_store.folder, tmp_path / "store" / "micro"))
 
 
@@ -70,11 +70,12 @@ def matcher(clip, store, tmp_path) -> Embedder:
 
 @pytest.fixture
 def rank(store, matcher) -> Callable[..., Ranks]:
-    """Ranks the standard test by texts of its queries and captions of its frames."""
+    """A function that ranks the standard test by texts for its queries and captions of its
+    frames."""
     queries, database = load_standard_test(store)
 
-    def rank(route: str, of_queries: list[str], captions: list[str] = ()) -> Ranks:
-        texts = {ROUTES[route].mode: dict(zip((q.name for q in queries), of_queries, strict=True))}
+    def rank(route: str, query_texts: list[str], captions: list[str] = ()) -> Ranks:
+        texts = {ROUTES[route].mode: dict(zip((q.name for q in queries), query_texts, strict=True))}
         texts["caption"] = dict(zip((f.name for f in database), captions, strict=False))
         return rank_by_text(ROUTES[route], matcher, texts, queries, database)
 
@@ -95,16 +96,16 @@ def rank(store, matcher) -> Callable[..., Ranks]:
         (" \n", ""),
     ],
 )
-def test_the_predicted_state_of_a_response_is_matched(text, state) -> None:
+def test_the_part_of_a_response_about_the_target_is_matched(text, state) -> None:
     assert future_text(text) == state
 
 
-def test_texts_rank_by_their_scores_and_a_missing_text_is_a_miss(rank, store, matcher) -> None:
+def test_ranks_follow_from_the_scores_and_an_empty_text_is_a_miss(rank, store, matcher) -> None:
     queries, database = load_standard_test(store)
     texts = [f"The scene after {q.question} {k}" for k, q in enumerate(queries)]
     found = rank("predict_image", texts)
     encoder = matcher.encoder
-    scores = encoder.texts(texts) @ encoder.frames(database, matcher.frames).T
+    scores = encoder.embed_texts(texts) @ encoder.embed_frames(database, matcher.frames).T
     targets = np.array([database.index(q.target) for q in queries])
     expected = matrix_metrics(scores, targets, [10])
     row = retrieval_results("micro", "x", found, queries, 0)[0]
@@ -122,7 +123,7 @@ def test_texts_rank_by_their_scores_and_a_missing_text_is_a_miss(rank, store, ma
         rank("predict_image", [""] * len(queries))
 
 
-def test_captions_match_by_their_words(rank, store) -> None:
+def test_a_text_is_matched_to_the_caption_with_the_same_words(rank, store) -> None:
     queries, database = load_standard_test(store)
     captions = [f"Frame {f.name}." for f in database]
     texts = [f"Frame {q.target.name}." for q in queries]
@@ -132,7 +133,7 @@ def test_captions_match_by_their_words(rank, store) -> None:
     # Frames with the same caption tie.
     same = rank("predict_caption", texts, ["A frame."] * len(captions))
     assert (same.tied == len(database) - 1).all()
-    # A target without a caption is a miss; another frame without one changes nothing.
+    # A query whose target has no caption is a miss. The frame still counts in the database.
     first = captions.index(texts[0])
     captions[first] = ""
     missing = rank("predict_caption", texts, captions)
@@ -148,7 +149,8 @@ def test_a_matcher_without_a_text_tower_is_refused(clip, tmp_path) -> None:
 
 @pytest.fixture
 def measure(tmp_path, micro, store, clip) -> Callable[..., tuple[dict, dict]]:
-    """Runs the command; returns its metrics and its report, without the times."""
+    """A function that runs the command, and returns its metrics and its report without the
+    times."""
 
     def run_command(name: str = "one", *overrides: str, **settings) -> tuple[dict, dict]:
         run = new_run(tmp_path / name, *overrides)
@@ -175,7 +177,7 @@ def test_a_students_texts_serve_every_matcher(
 ) -> None:
     folder = Path(shutil.copytree(trained_student, tmp_path / "sft"))
     routes = ["cot_text", "predict_caption", "predict_image"]
-    # Greedy responses of a random model are all alike.
+    # With random weights, greedy decoding gives every response the same text.
     overrides = ("student.temperature=1.0", "student.top_k=50")
     settings = {
         "model": str(folder), "routes": routes,
@@ -204,7 +206,7 @@ def test_a_students_texts_serve_every_matcher(
     assert measure("two", *overrides, **settings, batch=5) == (metrics, report)
     check_resumed(log, complete, torn)
 
-    # Another matcher loads no student: without its configuration none could be loaded.
+    # With another matcher, the student is not loaded: without config.json, it could not be loaded.
     (folder / "student" / "config.json").unlink()
     other = EmbedderConfig(retriever=replace(clip, name="narrow", widths=[12]))
     again, _ = measure("three", *overrides, **settings, matcher=other)

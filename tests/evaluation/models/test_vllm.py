@@ -1,4 +1,4 @@
-"""A real vLLM server with a small Qwen3-VL gets the frames and ids that a local model gets."""
+"""A real vLLM server with a small Qwen3-VL: it receives the same inputs as a local model."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ STUDENT = StudentConfig(
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory, micro_store):
-    """A base on disk. Its processor has sizes of its own, as a released one has, and normalises
-    images otherwise than clips, as the tiny base's does."""
+    """A base on disk. Its processor has other image sizes than the preset, like a released one, and
+    normalises images differently from clips, like that of the tiny base."""
     folder = tmp_path_factory.mktemp("base")
     model, processor = loading.load_base(
         STUDENT, "fp32", lambda: dataset.tokenizer_corpus(micro_store, [])
@@ -53,7 +53,7 @@ def cfg(base):
 
 @pytest.fixture(scope="module")
 def adapters(cfg, tmp_path_factory):
-    """The adapters of a student over that base, whose responses differ from the base's."""
+    """Adapters over that base, random and large enough to change its responses."""
     folder = tmp_path_factory.mktemp("student")
     torch.manual_seed(0)
     trained = replace(cfg, lora=LoraConfig(rank=4))
@@ -65,7 +65,7 @@ def adapters(cfg, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def merged(cfg, adapters, tmp_path_factory):
-    """The same student merged into its base, as `train.export` writes it."""
+    """These adapters merged into the base, as `train.export` merges them."""
     folder = tmp_path_factory.mktemp("merged")
     model, processor = loading.load_base(cfg, "fp32", list)
     loading.write_model(loading.merge_adapters(model, adapters, "none", "fp32"), processor, folder)
@@ -112,7 +112,7 @@ def test_constrained_responses_of_a_served_model_are_records(
     metrics = select.main.__wrapped__(settings, Run("served", tmp_path))
     rows = list(read_json_lines(tmp_path / "answers.jsonl"))
     assert rows[0]["asked"]["model"]["root"] == cfg.model
-    # A random model may fill the texts up to the token limit; the choice precedes them.
+    # A model with random weights may write texts up to the token limit. The choice precedes them.
     assert metrics["constrained_parse_rate"] == 1
     for row in [r for r in rows if r.get("mode") == "constrained"][1:]:
         found = parse_choice(row["text"])
@@ -139,7 +139,7 @@ def test_concurrent_sampled_responses_depend_on_their_own_seeds(
         return {row["item_id"]: row["text"] for row in rows if "item_id" in row}
 
     texts = answers("first")
-    # The prompts of concurrent requests exceed the tokens of one step of the server.
+    # So many concurrent requests have more prompt tokens than the server processes in one step.
     assert len(texts) >= command.server.concurrency
     assert len(set(texts.values())) > len(texts) // 2
     assert answers("again") == texts
@@ -172,7 +172,7 @@ def served_scores(server, model, cfg, store, item) -> tuple[list[int], list[floa
 
 
 def local_scores(folder, cfg, store, item) -> np.ndarray:
-    """The log-probability of every first token, by the classes of transformers."""
+    """The log-probability of every first token, computed with transformers alone."""
     sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
     processor = AutoProcessor.from_pretrained(folder)
     loading.pin_sizes(processor, cfg.image_size, cfg.frames)

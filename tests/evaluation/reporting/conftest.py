@@ -1,4 +1,4 @@
-"""Runs over the small benchmark, measured once."""
+"""Finished runs on the benchmark `micro`, which are written once."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=al
 
 @pytest.fixture(scope="session")
 def measured(tmp_path_factory, micro, micro_store) -> Path:
-    """checkpoints/ with a released base, students of three regimes (two with hostile responses), a
-    similarity scorer, and a retriever that is measured directly and in two stages."""
+    """checkpoints/ with runs of a released base, of students of three regimes (two of them respond
+    with `HOSTILE`), of an embedder on items, and of a retriever, directly and in two stages."""
     root = tmp_path_factory.mktemp("checkpoints")
     select_run(root, micro_store, micro, "base", always_a, mode="record")
     for regime in ("answer_only", "cot", "cot_no_candidate_analysis"):
@@ -41,12 +41,12 @@ def measured(tmp_path_factory, micro, micro_store) -> Path:
 
 @pytest.fixture
 def runs(measured, tmp_path) -> Path:
-    """A copy to damage."""
+    """A copy of `measured` that a test may change."""
     shutil.copytree(measured, tmp_path / "checkpoints")
     return tmp_path / "checkpoints"
 
 
 @pytest.fixture
 def report(runs, micro_store) -> Callable[..., Path]:
-    """Report these runs with some settings, and return the report's folder."""
+    """Return a function that reports `runs` with given settings and returns the report's folder."""
     return partial(run_report, runs, micro_store.folder.parent)

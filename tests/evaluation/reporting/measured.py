@@ -1,4 +1,4 @@
-"""Finished runs as the commands write them, of models whose responses a test chooses."""
+"""Write the folders of finished runs, of models whose responses a test determines."""
 
 from __future__ import annotations
 
@@ -29,11 +29,7 @@ from data.records import SelectionItem
 from data.store import Store
 from evaluation import report
 from evaluation.generators.response_log import score_response
-from evaluation.metrics.results import (
-    SIMILARITY,
-    compare_retrievers,
-    retrieval_results,
-)
+from evaluation.metrics.results import SIMILARITY, compare_retrievers, retrieval_results
 from evaluation.reporting.selection_report import Choices, write_report
 from evaluation.retrieval import nearest_candidate
 from evaluation.retrieval.exact_search import Ranks
@@ -55,6 +51,7 @@ def always_a(item: SelectionItem) -> str:
 def finish(
     folder: Path, settings: object, report: dict | None = None, metrics: dict | None = None
 ) -> None:
+    """Write the files that mark a run as finished."""
     folder.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
     if report is not None:
@@ -65,7 +62,7 @@ def finish(
 
 
 def trained_student(root: Path, benchmark, name: str, regime: str) -> None:
-    """A run of train.sft, without its weights."""
+    """Write a run of train.sft, without its weights."""
     folder = root / "sft" / name
     train = SftTrainConfig(regime=regime)
     settings = SftCommand(
@@ -87,8 +84,10 @@ def select_run(
     mode: str = "answer",
     suite: str | None = None,
 ) -> Path:
-    """A run of evaluation.select over `items` (null takes the test's); `model` is a run of
-    train.sft."""
+    """Write a run of evaluation.select on `items` (None: all test items), and return its folder.
+
+    `model` is the name of a run of train.sft; None measures a released base.
+    """
     items = store.selection("test") if items is None else items
     folder = root / "select" / name
     settings = SelectCommand(
@@ -116,8 +115,11 @@ def similarity_run(
     model: str | None = None,
     untrained: Sequence[float] = (0.5, 0.25, 0.125, 0),
 ) -> Path:
-    """A run of evaluation.similarity. The untrained retriever gives the candidates of every item
-    the scores `untrained`; `model`, a run of train.contrastive, always chooses the target."""
+    """Write a run of evaluation.similarity, and return its folder.
+
+    The untrained retriever gives the candidates of every item the scores `untrained`. If `model`,
+    the name of a run of train.contrastive, is given, that retriever always chooses the target.
+    """
     items = limit_items(store.selection("test"), limit, 0)
     settings = SimilarityCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name=name), limit=limit,
@@ -128,11 +130,11 @@ def similarity_run(
     if model is not None:
         scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
     choices, rows = [], []
-    for title, of in scores.items():
-        credits = nearest_candidate.credit_choices(of, answers)
-        letters = nearest_candidate.choose_letters(of)
+    for title, by_item in scores.items():
+        credits = nearest_candidate.credit_choices(by_item, answers)
+        letters = nearest_candidate.choose_letters(by_item)
         choices.append(Choices(title, SIMILARITY, None, credits, letters))
-        rows += nearest_candidate.score_rows(title, items, of)
+        rows += nearest_candidate.score_rows(title, items, by_item)
     folder = root / "similarity" / (model or name)
     finish(folder, settings)
     write_report(choices, items, store.name, 0, folder, build=store.identity)
@@ -143,21 +145,24 @@ def similarity_run(
 def retrieve_run(
     root: Path, store: Store, benchmark, name: str, frames: int = 60, kind: str = "retrieve"
 ) -> Path:
-    """A run of evaluation.retrieve of a trained retriever and of its untrained base."""
+    """Write a run of evaluation.retrieve, or of another `kind`, and return its folder.
+
+    It measured a trained retriever, whose training is also written, and its untrained base.
+    """
     trained = ContrastiveCommand(benchmark=benchmark, retriever=RetrieverConfig(name="small"))
     finish(root / "contrastive" / name, trained)
     queries = store.standard_test()
     rng = np.random.default_rng(0)
-    rows, found = [], {}
+    rows, ranked = [], {}
     for title in (name, "untrained small"):
         greater = rng.integers(frames, size=(2, len(queries)))
-        every = np.ones(len(queries), bool)
-        ranks = Ranks((64, 32), greater, np.zeros_like(greater), every, frames, frames, 0.5)
-        found[title] = ranks
+        found = np.ones(len(queries), bool)
+        ranks = Ranks((64, 32), greater, np.zeros_like(greater), found, frames, frames, 0.5)
+        ranked[title] = ranks
         rows += retrieval_results(store.name, title, ranks, queries, 0)
     report = {"rows": rows, "build": store.identity}
     if kind == "retrieve":
-        report["differences"] = compare_retrievers(found, queries, 0)
+        report["differences"] = compare_retrievers(ranked, queries, 0)
     settings = RetrieveCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name="small"),
         model=f"{root}/contrastive/{name}",
@@ -176,5 +181,5 @@ def run_report(root: Path, store: Path, **settings) -> Path:
 
 
 def read_table(folder: Path, name: str) -> str:
-    """A table of a report, in Markdown."""
+    """Return a table of a report as Markdown."""
     return (folder / "tables" / f"{name}.md").read_text()

@@ -24,7 +24,7 @@ def items(micro_store):
 
 @pytest.fixture(scope="module")
 def responses(items):
-    """Two models that answer at random."""
+    """The responses of two models that choose letters at random."""
     rng = np.random.default_rng(5)
     return {
         label: {
@@ -34,8 +34,8 @@ def responses(items):
     }
 
 
-def cells(items, responses):
-    """The ids by (family, subtype, model, correct)."""
+def ids_by_verdict(items, responses):
+    """Return the item ids by (family, subtype, model, whether the answer is correct)."""
     found = defaultdict(set)
     for item in items:
         for label, of_model in responses.items():
@@ -46,12 +46,13 @@ def cells(items, responses):
 
 def test_chosen_items_cover_correct_and_wrong_answers_of_every_subtype(items, responses):
     one = {"one": responses["one"]}
-    expected = cells(items, one)
+    expected = ids_by_verdict(items, one)
     chosen = item_browser.choose_items(items, one, len(expected), 0)
     assert len({i.item_id for i in chosen}) == len(chosen) == len(expected)
-    assert cells(chosen, one).keys() == expected.keys()
+    assert ids_by_verdict(chosen, one).keys() == expected.keys()
     both = item_browser.choose_items(items, responses, len(expected), 0)
-    assert len(cells(both, responses)) > 0.8 * len(cells(items, responses))
+    covered = len(ids_by_verdict(both, responses))
+    assert covered > 0.8 * len(ids_by_verdict(items, responses))
     assert item_browser.choose_items(items, responses, len(expected), 0) == both
     assert item_browser.choose_items(items, responses, len(expected), 1) != both
     everything = item_browser.choose_items(items, responses, 10**6, 0)
@@ -59,7 +60,7 @@ def test_chosen_items_cover_correct_and_wrong_answers_of_every_subtype(items, re
     assert item_browser.choose_items(items, responses, 0, 0) == []
 
 
-def test_every_frame_is_encoded_once_and_small(micro_store, items):
+def test_every_shown_frame_is_encoded_as_a_small_image(micro_store, items):
     few = [*items[:6], items[0]]
     frames, errors = item_browser.encode_frames(few, micro_store)
     assert errors == []
@@ -76,16 +77,16 @@ def test_every_frame_is_encoded_once_and_small(micro_store, items):
     assert entries[0]["candidates"][few[0].answer]["frame"] == target
 
 
-def test_missing_frames_are_reported_and_the_others_stay(micro_store, items, monkeypatch):
+def test_missing_frames_are_reported_and_the_others_are_encoded(micro_store, items, monkeypatch):
     lost = items[0].scene_id
     read = FrameReader.stack
 
-    def partly(self, scene_id, frames):
+    def read_unless_lost(self, scene_id, frames):
         if scene_id == lost:
             raise UserError(f"the video of {scene_id} is missing")
         return read(self, scene_id, frames)
 
-    monkeypatch.setattr(FrameReader, "stack", partly)
+    monkeypatch.setattr(FrameReader, "stack", read_unless_lost)
     few = [items[0], next(i for i in items if i.scene_id != lost and i.family == "time")]
     frames, errors = item_browser.encode_frames(few, micro_store)
     assert errors == [f"the video of {lost} is missing"]
@@ -102,7 +103,7 @@ def test_missing_frames_are_reported_and_the_others_stay(micro_store, items, mon
         ("", "unparsed"),
     ],
 )
-def test_a_response_has_the_verdict_of_its_parsed_answer(micro_store, items, text, verdict):
+def test_the_verdict_on_a_response_is_that_of_its_parsed_answer(micro_store, items, text, verdict):
     item = items[0]
     wrong = next(letter for letter in LETTERS if letter != item.letter)
     response = parse_response(text.format(right=item.letter, wrong=wrong), False)

@@ -1,4 +1,4 @@
-"""The rows of the report's tables, and their names."""
+"""The rows of the report's tables: which results share a row or have one of their own."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from tests.evaluation.study.test_agreement import summarize, vote
 
 
 def change_first_row(report: Path, **row: object) -> None:
+    """Change fields of the first result in a report.json."""
     content = json.loads(report.read_text())
     content["rows"][0] |= row
     report.write_text(json.dumps(content))
 
 
-def test_two_measurements_of_a_model_share_a_row(runs):
-    # Another seed gives another interval.
+def test_results_of_a_model_on_two_benchmarks_share_a_row(runs):
+    # The second run of the model on the same items has another interval, as with another seed.
     shutil.copytree(runs / "select" / "cot", runs / "select" / "again")
     macro = {"value": 1.0, "low": 0.9, "high": 1.0, "n": 8}
     change_first_row(runs / "select" / "again" / "report.json", macro_interval=macro)
@@ -33,7 +34,7 @@ def test_two_measurements_of_a_model_share_a_row(runs):
         assert "cot, cot" in table
 
 
-def test_an_untrained_base_of_two_runs_has_one_row(runs, micro, micro_store, report):
+def test_an_untrained_base_that_two_runs_measured_has_one_row(runs, micro, micro_store, report):
     retrieve_run(runs, micro_store, micro, "other")
     folder = report(runs=["retrieve/*"], items=1)
     table = read_table(folder, "distillation-retrieval-micro")
@@ -41,7 +42,7 @@ def test_an_untrained_base_of_two_runs_has_one_row(runs, micro, micro_store, rep
     assert table.count("| emb |") == table.count("| other |") == 1
 
 
-def test_the_majority_vote_of_the_same_build_has_a_row_that_is_not_bold(runs, micro_store, report):
+def test_the_majority_vote_on_the_same_build_has_a_row_that_is_not_bold(runs, micro_store, report):
     votes = [vote(name, k, 0, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
     found = {
         "benchmark": "micro",
@@ -51,8 +52,8 @@ def test_the_majority_vote_of_the_same_build_has_a_row_that_is_not_bold(runs, mi
     finish(runs / "export_study" / "pilot", ExportStudyCommand(run="pilot"), found)
     folder = report(items=0)
     # Every vote is correct, and no cell is bold.
-    whole = " | ".join(["100.0"] * 5)
-    row = f"| Majority vote, pilot | {whole} | - | 6 |"
+    cells = " | ".join(["100.0"] * 5)
+    row = f"| Majority vote, pilot | {cells} | - | 6 |"
     assert row in read_table(folder, "selection-micro")
     for other in ({"benchmark": "elsewhere"}, {"build": "before"}):
         (runs / "export_study" / "pilot" / "report.json").write_text(json.dumps({**found, **other}))

@@ -1,4 +1,5 @@
-"""The page in Chromium, from its file alone: narrow and wide, light and dark, mouse and keys."""
+"""The page in Chromium, from its file alone: on narrow and wide screens, light and dark, by mouse
+and by keyboard."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from selenium.webdriver.support.ui import Select
 from conf.entry import Run
 from conf.schema import ReportCommand
 from evaluation import report
-from tests.evaluation.chromium import OVERFLOW, chromium_in
+from tests.evaluation.chromium import IS_TOO_WIDE, chromium_in
 from tests.evaluation.reporting.conftest import HOSTILE
 
 pytestmark = pytest.mark.slow
@@ -39,7 +40,7 @@ def chromium(tmp_path_factory) -> Iterator[webdriver.Chrome]:
 
 @pytest.fixture(scope="module")
 def page(measured, micro_store, tmp_path_factory) -> Path:
-    """The page alone, moved away from the run folder."""
+    """The page, moved out of the run folder and away from its other files."""
     folder = tmp_path_factory.mktemp("report")
     cfg = ReportCommand(checkpoints=str(measured), store=str(micro_store.folder.parent), items=60)
     report.main.__wrapped__(cfg, Run("default", folder))
@@ -48,7 +49,7 @@ def page(measured, micro_store, tmp_path_factory) -> Path:
     return moved
 
 
-def look(browser: webdriver.Chrome, page: Path, width: int, light: str = "light") -> None:
+def open_page(browser: webdriver.Chrome, page: Path, width: int, light: str = "light") -> None:
     screen = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
     scheme = [{"name": "prefers-color-scheme", "value": light}]
@@ -57,7 +58,7 @@ def look(browser: webdriver.Chrome, page: Path, width: int, light: str = "light"
 
 
 def choose(browser: webdriver.Chrome, **values: str) -> list[str]:
-    """Set filters, and return the ids of all items that match."""
+    """Set filters, show all items that match, and return their ids."""
     for name, value in values.items():
         Select(browser.find_element(By.NAME, name)).select_by_value(value)
     more = browser.find_element(By.ID, "more")
@@ -73,15 +74,15 @@ def items_of(browser: webdriver.Chrome) -> list[dict]:
 
 @pytest.mark.parametrize("width", [360, 1280])
 @pytest.mark.parametrize("light", ["light", "dark"])
-def test_page_fits_the_screen_and_has_contrast(chromium, page, width, light):
-    look(chromium, page, width, light)
+def test_the_page_fits_the_screen_and_has_contrast(chromium, page, width, light):
+    open_page(chromium, page, width, light)
     for fold in chromium.find_elements(By.TAG_NAME, "summary"):
         fold.click()
-    # A run may have a long name.
+    # The name of a run may be long.
     chromium.execute_script(
         "document.getElementsByName('model')[0].add(new Option('run'.repeat(30)))"
     )
-    assert not chromium.execute_script(OVERFLOW)
+    assert not chromium.execute_script(IS_TOO_WIDE)
     for name in ("body", "td", "svg text"):
         part = chromium.find_element(By.CSS_SELECTOR, name)
         ink = chromium.execute_script(LUMINANCE, part, "fill" if name == "svg text" else "color")
@@ -91,9 +92,9 @@ def test_page_fits_the_screen_and_has_contrast(chromium, page, width, light):
     assert behind < 0.2 if light == "dark" else behind > 0.9
 
 
-def test_page_sends_no_request_and_logs_no_error(chromium, page):
+def test_the_page_sends_no_request_and_logs_no_error(chromium, page):
     chromium.get_log("browser")
-    look(chromium, page, 1280)
+    open_page(chromium, page, 1280)
     choose(chromium)
     assert chromium.execute_script(REQUESTED) == []
     # Violations of the page's content security policy would be logged here, too.
@@ -103,8 +104,8 @@ def test_page_sends_no_request_and_logs_no_error(chromium, page):
     assert "Content Security Policy" in refused["message"]
 
 
-def test_responses_are_text_not_markup(chromium, page):
-    look(chromium, page, 1280)
+def test_responses_are_shown_as_text_without_markup(chromium, page):
+    open_page(chromium, page, 1280)
     choose(chromium)
     assert chromium.title == "DynaPix report"
     texts = "return [...document.querySelectorAll('pre')].map((pre) => pre.textContent)"
@@ -113,7 +114,7 @@ def test_responses_are_text_not_markup(chromium, page):
 
 
 def test_an_item_shows_its_frames_and_marks_the_target(chromium, page):
-    look(chromium, page, 1280)
+    open_page(chromium, page, 1280)
     item = next(i for i in items_of(chromium) if i["id"] == choose(chromium)[0])
     article = chromium.find_element(By.TAG_NAME, "article")
     images = article.find_elements(By.TAG_NAME, "img")
@@ -125,7 +126,7 @@ def test_an_item_shows_its_frames_and_marks_the_target(chromium, page):
 
 
 def test_filters_select_items(chromium, page):
-    look(chromium, page, 1280)
+    open_page(chromium, page, 1280)
     items = items_of(chromium)
     assert len(choose(chromium)) == len(items) == 60
     for family in ("event", "time", "window"):
@@ -148,8 +149,8 @@ def test_filters_select_items(chromium, page):
     assert chromium.find_element(By.ID, "count").text == "0 of 60 items"
 
 
-def test_page_works_by_keyboard(chromium, page):
-    look(chromium, page, 1280)
+def test_the_page_works_by_keyboard(chromium, page):
+    open_page(chromium, page, 1280)
     reached = []
     body = chromium.find_element(By.TAG_NAME, "body")
     body.click()

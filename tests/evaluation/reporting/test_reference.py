@@ -19,18 +19,18 @@ RETRIEVAL = [
 ]
 
 
-def named(group: str, name: str) -> dict:
+def find_row(group: str, name: str) -> dict:
     return next(row for row in reference(group) if row["name"] == name)
 
 
 @pytest.mark.parametrize("row", SELECTION, ids=lambda row: row["name"])
-def test_macro_is_the_mean_of_the_families(row):
+def test_printed_macro_accuracies_are_the_means_of_the_families(row):
     # Printed values are rounded to 0.1.
     assert row["Macro"] == pytest.approx(sum(row[f] for f in ITEMS) / 3, abs=0.1)
 
 
 @pytest.mark.parametrize("row", reference("selection_distilled"), ids=lambda row: row["name"])
-def test_micro_and_time_accuracies_are_means_weighted_by_items(row):
+def test_printed_micro_and_time_accuracies_are_means_weighted_by_items(row):
     pooled = sum(row[f] * n for f, n in ITEMS.items()) / sum(ITEMS.values())
     assert row["Micro"] == pytest.approx(pooled, abs=0.1)
     if "horizons" in row:
@@ -39,8 +39,8 @@ def test_micro_and_time_accuracies_are_means_weighted_by_items(row):
 
 
 def test_rows_that_the_paper_prints_twice_agree():
-    base = named("selection_distilled", "Zero-shot (base)")
-    released = named("selection_generative", "Qwen3-VL-8B (instruct)")
+    base = find_row("selection_distilled", "Zero-shot (base)")
+    released = find_row("selection_generative", "Qwen3-VL-8B (instruct)")
     assert all(base[key] == released[key] for key in ("Event", "Time", "Window", "Macro"))
     for one, other in (
         (reference("retrieval_two_stage")[0], reference("retrieval_distilled")[0]),
@@ -48,12 +48,12 @@ def test_rows_that_the_paper_prints_twice_agree():
     ):
         assert all(one[key] == other[key] for key in one if key != "name")
     assert reference("transfer")[0]["In domain"] == base["Micro"]
-    cot = named("selection_distilled", COT_STUDENT)
+    cot = find_row("selection_distilled", COT_STUDENT)
     assert reference("ablation")[0]["In domain"] == cot["Micro"]
 
 
 @pytest.mark.parametrize("row", RETRIEVAL, ids=lambda row: row["name"])
-def test_retrieval_rows_are_self_consistent(row):
+def test_printed_recalls_mrr_and_median_ranks_are_consistent(row):
     assert 0 < row["R@1"] < row["R@10"] < row["R@50"] < 100
     assert row["R@1"] / 100 < row["MRR"] < 1
     assert (row["Median"] <= 10) == (row["R@10"] >= 50)

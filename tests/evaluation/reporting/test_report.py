@@ -1,4 +1,4 @@
-"""The report over finished runs: its files, and the runs that it refuses."""
+"""The report on finished runs: its files, and the runs that it refuses."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ from tests.user_errors import raises_user_error
 
 
 def page_data(folder: Path) -> dict:
+    """Return the data of the browser of items on the page."""
     page = (folder / "report.html").read_text()
     return json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL)[1])
 
 
 def read_groups(table: str) -> dict[str, str]:
-    """The rows of a Markdown table by the label of their group."""
+    """Return the rows of a Markdown table as text, by the label of their group."""
     parts = re.split(r"^\| \*(.*?)\*.*$", table, flags=re.MULTILINE)[1:]
     return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
 def update_report(report: Path, **entries: object) -> None:
+    """Change entries of a report.json."""
     report.write_text(json.dumps(json.loads(report.read_text()) | entries))
 
 
@@ -68,8 +70,10 @@ def test_the_report_has_every_table_and_figure(report):
     assert all(len(item["responses"]) == 5 for item in items)
 
 
-def test_students_are_compared_with_their_bases_and_ablations(runs, micro, micro_store, report):
-    # The other students always answer B.
+def test_students_are_compared_with_their_bases_and_with_other_regimes(
+    runs, micro, micro_store, report
+):
+    # The student `cot` and this base always answer correctly, the other students always answer B.
     items = micro_store.selection("test")
     wrong = sum(item.letter != "B" for item in items)
     select_run(runs, micro_store, micro, "plain", right, mode="reasoning")
@@ -81,7 +85,7 @@ def test_students_are_compared_with_their_bases_and_ablations(runs, micro, micro
         (cot, base): "| +0.0 | +0.0 to +0.0 | 0 | 0 | 1 |", (ablated, base): f"| 0 | {wrong} |",
         (ablated, plain): "| +0.0 | +0.0 to +0.0 | 0 | 0 | 1 |",
     }  # fmt: skip
-    # No other model has the mode of the answer-only student or of the released base.
+    # No base was measured in answer mode, and no student in record mode.
     groups = read_groups(read_table(folder, "paired-micro").replace("\\", ""))
     assert set(groups) == {f"{left} (left) less {other} (right)" for left, other in expected}
     for (left, other), cells in expected.items():
@@ -93,7 +97,7 @@ def test_students_are_compared_with_their_bases_and_ablations(runs, micro, micro
         assert cells in overall
 
 
-def test_models_of_one_name_get_the_names_of_their_runs(runs, micro, micro_store, report):
+def test_models_with_the_same_name_get_the_names_of_their_runs(runs, micro, micro_store, report):
     select_run(runs, micro_store, micro, "again", right, mode="record")
     folder = report(items=1)
     names = ["small base, base (record)", "small base, again (record)"]
@@ -138,12 +142,11 @@ def test_runs_are_chosen_by_name_and_pattern(runs, report):
         "cot", "cot_no_candidate_analysis", "small base",
     }  # fmt: skip
     assert not list(folder.glob("tables/*retrieval*"))
-    named = f"{runs}/select/cot"
-    folder = report(runs=[named], items=1)
+    folder = report(runs=[f"{runs}/select/cot"], items=1)
     assert len(page_data(folder)["items"][0]["responses"]) == 1
 
 
-def test_responses_under_other_settings_and_torn_lines_are_left_out(runs, report):
+def test_responses_with_other_settings_and_incomplete_lines_are_left_out(runs, report):
     log = runs / "select" / "cot" / "answers.jsonl"
     lines = log.read_text().splitlines()
     stale = [json.loads(line) for line in lines]
@@ -152,7 +155,7 @@ def test_responses_under_other_settings_and_torn_lines_are_left_out(runs, report
         if "text" in row:
             row["text"] = "stale"
     before = "".join(json.dumps(row) + "\n" for row in stale)
-    log.write_text(before + "\n".join(lines) + '\n{"item_id": "torn')
+    log.write_text(before + "\n".join(lines) + '\n{"item_id": "incomplete')
     folder = report(runs=["select/cot"], items=5)
     texts = [r["text"] for item in page_data(folder)["items"] for r in item["responses"]]
     assert texts
@@ -160,17 +163,17 @@ def test_responses_under_other_settings_and_torn_lines_are_left_out(runs, report
 
 
 def test_responses_to_a_suite_are_shown_beside_those_to_all_items(runs, micro, micro_store, report):
-    everything = {"runs": ["select/*"], "items": 500}
-    before = page_data(report(**everything))["items"]
+    settings = {"runs": ["select/*"], "items": 500}
+    before = page_data(report(**settings))["items"]
     pairs = micro_store.selection("test")[:6]
     suite = {"model": "cot", "mode": "reasoning", "suite": MATCHED_ANCHOR}
     select_run(runs, micro_store, micro, "pairs", right, pairs, **suite)
-    after = page_data(report(**everything))["items"]
+    after = page_data(report(**settings))["items"]
     models = {item["id"]: {r["model"] for r in item["responses"]} for item in after}
     for item in before:
         assert {r["model"] for r in item["responses"]} <= models[item["id"]]
-    of_suite = {name for name, of in models.items() if "cot (reasoning), matched_anchor" in of}
-    assert of_suite == {item.item_id for item in pairs}
+    in_suite = {k for k, labels in models.items() if "cot (reasoning), matched_anchor" in labels}
+    assert in_suite == {item.item_id for item in pairs}
 
 
 def test_the_report_has_controls_and_their_differences(runs, report):
@@ -189,7 +192,7 @@ def test_the_report_has_controls_and_their_differences(runs, report):
     assert read_table(folder, "control-micro-candidate_only")
 
 
-def test_a_model_on_a_benchmark_that_it_was_not_trained_on_is_transfer(runs, report):
+def test_results_on_a_benchmark_without_trained_models_are_transfer(runs, report):
     for name in ("base", "cot"):
         shutil.copytree(runs / "select" / name, runs / "select" / f"{name}-elsewhere")
         path = runs / "select" / f"{name}-elsewhere" / "report.json"
@@ -200,7 +203,7 @@ def test_a_model_on_a_benchmark_that_it_was_not_trained_on_is_transfer(runs, rep
     assert "| cot (reasoning) | **100.0** | - | - | **100.0** |" in table
     assert read_table(folder, "transfer-selection-elsewhere")
     assert not (folder / "tables" / "distillation-selection-elsewhere.tex").exists()
-    # That benchmark is not built.
+    # That benchmark is not built, so its items cannot be shown.
     page = (folder / "report.html").read_text()
     assert "python -m data.build benchmark=elsewhere" in page
 
@@ -252,7 +255,7 @@ def test_a_failing_report_keeps_the_previous_one(runs, report):
     assert {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()} == before
 
 
-def test_runs_of_different_items_are_refused(runs, micro, micro_store, report):
+def test_runs_over_different_items_are_refused(runs, micro, micro_store, report):
     items = micro_store.selection("test")
     few = select_run(runs, micro_store, micro, "few", right, items[3:])
     missing = (str(few), "3 only in", *(item.item_id for item in items[:3]))
@@ -263,9 +266,9 @@ def test_runs_of_different_items_are_refused(runs, micro, micro_store, report):
 
 def test_a_retriever_is_compared_with_its_untrained_base(runs, micro, micro_store, report):
     similarity_run(runs, micro_store, micro, "small", model="emb")
-    # The untrained base was also measured alone: an equal row.
+    # The untrained base was also measured alone, with the same result.
     similarity_run(runs, micro_store, micro, "small")
-    # Another base of that name answers differently.
+    # Another base of the same name answers differently.
     similarity_run(runs, micro_store, micro, "small", model="other", untrained=(0, 1, 0, 0))
     folder = report(runs=["similarity/*"], items=40)
     table = read_table(folder, "paired-micro")
@@ -284,7 +287,7 @@ def test_a_retriever_is_compared_with_its_untrained_base(runs, micro, micro_stor
 
 
 @pytest.mark.parametrize("kind", ["select", "similarity", "retrieve", "two_stage"])
-def test_runs_of_different_builds_are_refused(runs, kind, report):
+def test_runs_on_different_builds_are_refused(runs, kind, report):
     [newest] = sorted((runs / kind).iterdir())[-1:]
     update_report(newest / "report.json", build="later")
     with raises_user_error("different-builds", contains=("benchmark micro", newest.name)):
@@ -320,7 +323,7 @@ def test_a_damaged_file_is_named(runs, file, content, report):
 
 
 @pytest.mark.parametrize(
-    ("pattern", "code", "named"),
+    ("pattern", "code", "hint"),
     [
         ("select/unfinished", "unfinished-run", "select/unfinished"),
         ("study/friends", "unfinished-run", "evaluation.study.export"),
@@ -329,10 +332,10 @@ def test_a_damaged_file_is_named(runs, file, content, report):
         ("elsewhere/*", "missing-run", "elsewhere/*"),
     ],
 )
-def test_patterns_without_a_finished_evaluation_are_refused(runs, pattern, code, named, report):
+def test_patterns_without_a_finished_evaluation_are_refused(runs, pattern, code, hint, report):
     (runs / "study" / "friends").mkdir(parents=True)
     (runs / "select" / "unfinished").mkdir()
-    with raises_user_error(code, contains=named):
+    with raises_user_error(code, contains=hint):
         report(runs=[pattern])
 
 

@@ -1,4 +1,4 @@
-"""Every format of a table shows the same cells, whatever text they contain."""
+"""Every format of a table shows the same cells, whatever text the cells contain."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ESCAPED = {
     "CoT -> text": (r"CoT -\> text", r"CoT $\rightarrow$ text"),
     "run … (answer)": ("run … (answer)", r"run \ldots{} (answer)"),
 }
-"""Names in Markdown and in LaTeX."""
+"""Names of rows, with their escaped forms in Markdown and in LaTeX."""
 TABLE = Table(
     "hostile & name",
     "A caption with 100% of <b>everything</b>",
@@ -70,7 +70,7 @@ def test_html_shows_every_cell_as_text():
     assert re.findall(r"<b>(.*?)</b>", table) == ["2.0"]
 
 
-def test_best_values_are_bold_and_people_do_not_compete():
+def test_best_values_are_bold_except_in_rows_that_are_not_ranked():
     rows = [
         {"name": "a", "R": Interval(0.09, 0.08, 0.95, 9)}, {"name": "b", "R": 0.08},
         {"name": "tie", "R": 0.0900001}, {"name": "c", "R": None},
@@ -79,12 +79,12 @@ def test_best_values_are_bold_and_people_do_not_compete():
     table = Table("t", "c", ["R"], {"": rows}, paper={"paper": rows[:1]}, best={"R": max})
     assert table.as_markdown().count("**9.0**") == 2
     assert table.as_latex().count("textbf") == 2
-    # A single value is not compared.
+    # The paper has a single value in the column, which is not marked.
     assert table.as_markdown().count("| 9.0 |") == 1
     assert "*" not in str(table)
 
 
-def test_differences_have_signs():
+def test_differences_are_printed_with_signs():
     row = {"name": "a", "R@1": Interval(0.09, -0.08, 0.95, 9), "MRR": Interval(-0.1, -0.2, 0, 9)}
     lines = Table("t", "c", ["R@1", "MRR"], {"": [row]}, signed=True).body[0][1]
     assert [line[1:] for line in lines] == [
@@ -92,7 +92,7 @@ def test_differences_have_signs():
     ]  # fmt: skip
 
 
-def test_latex_closes_what_it_opens():
+def test_latex_is_balanced_and_has_no_unescaped_character():
     latex = TABLE.as_latex()
     plain = re.sub(r"\\[{}]", "", latex)
     assert plain.count("{") == plain.count("}")
@@ -101,7 +101,7 @@ def test_latex_closes_what_it_opens():
     assert r"\label{tab:hostile---name}" in latex
 
 
-def test_text_is_aligned():
+def test_columns_of_the_plain_text_are_aligned():
     lines = str(TABLE).splitlines()
     edge = lines[2].index("R@1") + 3
     assert all(line[edge - 3 : edge] == "1.0" for line in lines[4 : 4 + len(ESCAPED)])

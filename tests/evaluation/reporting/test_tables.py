@@ -1,4 +1,4 @@
-"""Results, tables and figures of one evaluation command."""
+"""The results, tables and figures of single evaluations."""
 
 import json
 from dataclasses import asdict, replace
@@ -51,7 +51,7 @@ def selection() -> SelectionResult:
 
 @pytest.fixture(scope="module")
 def queries() -> list[RetrievalQuery]:
-    """Four for each scene, of builders 1 to 6 in turn."""
+    """Four queries for each scene, which builders 1 to 6 made in turn."""
     return [
         RetrievalQuery(
             f"q{k}", "test", "future", k % 6 + 1, "time", "Which?", f"scene-{k % SCENES}", 0, 50,
@@ -83,15 +83,15 @@ def test_retrieval_results_match_reference_metrics_and_intervals(ranks, queries)
         (builder, width) for builder in (None, 1, 2, 3, 4, 5, 6) for width in ranks.widths
     ]
     for result in results:
-        of = [k for k, q in enumerate(queries) if result.builder in (None, q.builder)]
+        indices = [i for i, q in enumerate(queries) if result.builder in (None, q.builder)]
         k = ranks.widths.index(result.width)
-        counts = (ranks.greater[k, of], ranks.tied[k, of], ranks.found[of])
+        counts = (ranks.greater[k, indices], ranks.tied[k, indices], ranks.found[indices])
         metrics = ranking_metrics(*counts, 10_000, RECALLS)
         assert {name: measure.value for name, measure in result.measures.items()} == metrics
-        assert (result.queries, result.frames) == (len(of), 10_000)
+        assert (result.queries, result.frames) == (len(indices), 10_000)
         for measure in result.measures.values():
             assert measure.low <= measure.value <= measure.high
-            assert measure.n == len(of)
+            assert measure.n == len(indices)
     each = query_metrics(ranks.greater[1], ranks.tied[1], ranks.found, 10_000, RECALLS)
     scenes = [q.scene_id for q in queries]
     for name, statistic in (("mrr", np.mean), ("median_rank", np.median), ("recall@10", np.mean)):
@@ -102,13 +102,13 @@ def test_retrieval_results_match_reference_metrics_and_intervals(ranks, queries)
     assert results != retrieval_results("tiny", "one", ranks, queries, seed=4)
 
 
-def test_selection_results_have_accuracy_by_horizon_and_an_interval_of_macro(selection):
+def test_selection_results_have_horizons_and_an_interval_of_macro(selection):
     assert list(selection.horizons) == ["8 frames", "16 frames", "1 s", "2 s"]
-    for name, share in selection.horizons.items():
-        family = "time" if name.endswith("s") and "frames" not in name else "window"
-        second = name in ("2 s", "16 frames")
-        of = [c for k, c in enumerate(CREDITS) if FAMILIES[k] == family and k % 2 == second]
-        assert share == mean_with_wilson(np.array(of))
+    for name, accuracy in selection.horizons.items():
+        family = "time" if name.endswith(" s") else "window"
+        parity = name in ("2 s", "16 frames")
+        credits = [c for k, c in enumerate(CREDITS) if FAMILIES[k] == family and k % 2 == parity]
+        assert accuracy == mean_with_wilson(np.array(credits))
     assert selection.families == accuracy_by_family(FAMILIES, CREDITS).families
     assert selection.macro_interval.value == pytest.approx(selection.macro)
     table = str(selection_table([selection]))
@@ -121,14 +121,14 @@ def test_selection_results_have_accuracy_by_horizon_and_an_interval_of_macro(sel
     assert "paper" not in str(selection_table([selection], "standin_physion"))
 
 
-def test_results_survive_json(selection, retrievals):
+def test_results_can_be_read_from_json(selection, retrievals):
     for result in (selection, *retrievals):
         assert from_json(type(result), json.loads(json.dumps(asdict(result)))) == result
     with pytest.raises(ValueError, match="recall_1"):
         from_json(RetrievalResult, {**asdict(retrievals[0]), "recall_1": 0.5})
 
 
-def test_retrieval_table_shows_the_untrained_row_and_the_cost_at_each_width(retrievals):
+def test_the_retrieval_table_has_untrained_rows_and_costs_at_each_width(retrievals):
     lines = [line.split() for line in str(retrieval_table(retrievals)).splitlines()[4:16:2]]
     assert [line[:2] for line in lines] == [
         [name, str(width)] for width in (4096, 256, 64) for name in (UNTRAINED, "contrastive")

@@ -1,4 +1,4 @@
-"""Exact ranks follow from a plain table of scores, in any order and blocks of the database."""
+"""Exact ranks equal those of a score matrix, in any order and blocks of the database."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WIDTHS = (96, 48, 20, 7)
 
 
 def embeddings(rows: int, seed: int = 0) -> np.ndarray:
-    """Rows of very different lengths, some with a tiny first piece."""
+    """Random embeddings of very different lengths, some of which have tiny first entries."""
     rng = np.random.default_rng(seed)
     values = rng.standard_normal((rows, WIDTHS[0])) * 10.0 ** rng.uniform(-3, 3, (rows, 1))
     values[::5, :7] *= 1e-6
@@ -27,7 +27,7 @@ def embeddings(rows: int, seed: int = 0) -> np.ndarray:
 
 
 def cosines(queries: np.ndarray, database: np.ndarray, width: int) -> np.ndarray:
-    """Cosines by their definition, in double precision."""
+    """Cosines (queries, frames) by their definition, in double precision."""
     units = [
         a[:, :width].astype(float) / np.linalg.norm(a[:, :width].astype(float), axis=1)[:, None]
         for a in (queries, database)
@@ -56,13 +56,13 @@ def test_scores_are_cosines_to_fp32() -> None:
         np.testing.assert_allclose(scores, cosines(queries, database, WIDTHS[::-1][k]), atol=6e-8)
 
 
-def test_ranks_follow_from_a_plain_table() -> None:
+def test_ranks_equal_those_of_a_score_matrix() -> None:
     queries, database = embeddings(40), embeddings(300, 1)
     targets = np.random.default_rng(2).integers(300, size=40)
     found = exact_ranks(queries, database[targets], [database], WIDTHS)
     for k, width in enumerate(WIDTHS):
         greater, tied = count_ranks(cosines(queries, database, width), targets)
-        # A few pairs tie in fp32 but not in double precision.
+        # A few frames tie with the target in fp32 but not in double precision.
         assert np.abs(found.greater[k] - greater).max() <= 1
         assert (found.greater[k] + found.tied[k] >= greater).all()
         assert (found.tied[k] >= tied).all()
@@ -76,8 +76,8 @@ def test_blocks_of_the_database_do_not_change_ranks(monkeypatch, size, block) ->
     database[::3] = database[0]
     targets = np.arange(23) * 11
     expected = exact_ranks(queries, database[targets], [database], WIDTHS)
-    monkeypatch.setattr(exact_search, "FRAMES", block)
-    monkeypatch.setattr(exact_search, "QUERIES", 1 + block % 9)
+    monkeypatch.setattr(exact_search, "BLOCK_FRAMES", block)
+    monkeypatch.setattr(exact_search, "BLOCK_QUERIES", 1 + block % 9)
     assert same(exact_ranks(queries, database[targets], split(database, size), WIDTHS), expected)
 
 
@@ -101,11 +101,12 @@ def test_the_order_of_the_database_and_of_the_queries_does_not_change_ranks() ->
 
 @pytest.mark.parametrize("size", [1, 13, 64, 129])
 def test_equal_frames_tie_at_any_position(size) -> None:
-    """Three copies of every frame, in other blocks and at other positions of a block."""
-    queries, once = embeddings(64), embeddings(129, 1)
-    database = np.concatenate([once, once[::-1], np.roll(once, 17, axis=0)])
+    """The database has three copies of every frame, in different blocks and at different positions
+    in a block."""
+    queries, frames = embeddings(64), embeddings(129, 1)
+    database = np.concatenate([frames, frames[::-1], np.roll(frames, 17, axis=0)])
     targets = np.arange(64)
-    distinct = exact_ranks(queries, once[targets], [once], WIDTHS)
+    distinct = exact_ranks(queries, frames[targets], [frames], WIDTHS)
     assert not distinct.tied.any()
     found = exact_ranks(queries, database[targets], split(database, size), WIDTHS)
     assert (found.tied == 2).all()
@@ -129,7 +130,8 @@ def test_scores_of_pairs_and_of_blocks_are_bit_identical() -> None:
 
 
 def test_products_of_pieces_are_exact() -> None:
-    """Compared with Python's integers, also for vectors whose products all have one sign."""
+    """The products equal those of Python's integers, also if all products of entries are
+    positive."""
     rng = np.random.default_rng(0)
     rows = rng.standard_normal((4, 4096))
     rows[1], rows[2] = 1.0, np.abs(rows[2])

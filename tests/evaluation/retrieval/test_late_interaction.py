@@ -1,4 +1,4 @@
-"""Ranks by late interaction follow the definition, and no order, block or padding changes them."""
+"""Ranks by late interaction equal those of the library, in any order, blocks and padding."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ WIDTH = 24
 
 
 def random_vectors(rows: int, most: int, seed: int) -> list[np.ndarray]:
-    """Unit vectors, from one to `most` per row."""
+    """Random unit vectors: for each row, from one to `most` of them."""
     rng = np.random.default_rng(seed)
     vectors = [rng.standard_normal((rng.integers(1, most + 1), WIDTH)) for _ in range(rows)]
     return [(v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32) for v in vectors]
 
 
 def rows_of(vectors: list[np.ndarray], more: int = 0) -> np.ndarray:
-    """Rows with padding for `more` vectors than the longest has."""
+    """Stack the vectors of each row, padded by `more` vectors beyond the longest row."""
     rows = pad_rows([v.ravel() for v in vectors])
     return np.pad(rows, ((0, 0), (0, more * WIDTH)))
 
@@ -34,7 +34,7 @@ def queries() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def frames() -> list[np.ndarray]:
-    """Every third frame equals the first."""
+    """Vectors of 120 frames, of which every third equals the first."""
     vectors = random_vectors(120, 9, 1)
     return [vectors[0] if k % 3 == 0 else v for k, v in enumerate(vectors)]
 
@@ -58,7 +58,7 @@ def test_ranks_agree_with_the_librarys_scores(queries, frames) -> None:
     np.testing.assert_allclose(pairs, scores[np.arange(20), TARGETS], rtol=1e-6, atol=1e-5)
     found = ranks(queries, frames)
     greater, _ = count_ranks(scores, TARGETS)
-    # In fp32 the library's scores of equal frames may differ.
+    # The library computes in fp32, where the scores of equal frames may differ.
     assert (found.greater[0] <= greater).all()
     assert (found.greater[0] + found.tied[0] >= greater).all()
     copies = TARGETS % 3 == 0
@@ -70,8 +70,8 @@ def test_ranks_agree_with_the_librarys_scores(queries, frames) -> None:
 @pytest.mark.parametrize(("size", "block", "cells"), [(1, 9, 1), (7, 64, 2**10), (50, 1, 2**23)])
 def test_blocks_do_not_change_ranks(monkeypatch, queries, frames, size, block, cells) -> None:
     expected = ranks(queries, frames)
-    monkeypatch.setattr(late_interaction, "VECTORS", block)
-    monkeypatch.setattr(late_interaction, "CELLS", cells)
+    monkeypatch.setattr(late_interaction, "BLOCK_VECTORS", block)
+    monkeypatch.setattr(late_interaction, "BLOCK_PRODUCTS", cells)
     assert same(ranks(queries, frames, size=size), expected)
 
 
@@ -97,7 +97,7 @@ def test_padding_changes_no_rank_and_is_not_counted(queries, frames) -> None:
 
 
 def test_sums_of_up_to_8000_vectors_are_exact() -> None:
-    """All vectors are equal, so that the sum is the largest possible."""
+    """All vectors are equal, which gives the largest possible sum."""
     vector = np.full((1, WIDTH), WIDTH**-0.5, np.float32)
     steps = np.rint(vector.astype(np.float64) * late_interaction.GRID).astype(object)
     for count in (1, 7999, 8000):

@@ -1,4 +1,4 @@
-"""A study of the small benchmark, prepared once, and servers over copies of it."""
+"""Studies of the benchmark `micro`, which are prepared once, and servers of copies of them."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ SMALL = 4
 
 
 def prepare(micro, micro_store, root: Path, items: int) -> Path:
+    """Create a study with its media, and return its run folder."""
     cfg = StudyCommand(
         benchmark=micro, store=str(micro_store.folder.parent), items=str(items), annotators=3
     )
@@ -36,6 +37,7 @@ def prepared(tmp_path_factory, micro, micro_store) -> Path:
 
 @pytest.fixture(scope="session")
 def prepared_small(tmp_path_factory, micro, micro_store) -> Path:
+    """The run folder of a study of four items by three annotators, before it is served."""
     return prepare(micro, micro_store, tmp_path_factory.mktemp("prepared"), SMALL)
 
 
@@ -44,7 +46,7 @@ Serve = Callable[..., Server]
 
 @pytest.fixture(scope="module")
 def serve(tmp_path_factory) -> Iterator[Serve]:
-    """Starts the command over a copy of a prepared run folder."""
+    """Return a function that starts the command on a copy of a prepared run folder."""
     servers = []
 
     def start(prepared: Path, *settings: str) -> Server:

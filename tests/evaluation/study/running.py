@@ -1,4 +1,4 @@
-"""A real `python -m evaluation.study` to start and kill, and annotators who use HTTP."""
+"""Start and kill `python -m evaluation.study`, and take part in a study over HTTP."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ ROOT = Path(__file__).parents[3]
 
 
 class Server:
-    """The command on a study in checkpoints/study/NAME; it keeps its port when it restarts."""
+    """Runs the command on the study in a run folder, checkpoints/study/NAME.
+
+    The port stays the same after a restart.
+    """
 
     def __init__(self, folder: Path, *settings: str) -> None:
         self.folder, self.settings = folder, settings
@@ -45,6 +48,7 @@ class Server:
         self.process.wait(timeout=60)
 
     def links(self) -> dict[str, str]:
+        """Return the token in each annotator's unused link, by name."""
         lines = (self.folder / "links.txt").read_text().splitlines()
         pairs = [line.split() for line in lines if not line.startswith("#")]
         return {name: link.rpartition("/")[2] for name, link in pairs}
@@ -52,6 +56,8 @@ class Server:
 
 @dataclass(frozen=True)
 class Reply:
+    """A response of the server."""
+
     status: int
     headers: HTTPMessage
     body: bytes
@@ -61,26 +67,27 @@ class Reply:
         return self.body.decode()
 
     def hidden(self, name: str) -> str:
-        """The value of a hidden field of the page's form."""
+        """Return the value of a hidden field of the page's form."""
         return unescape(re.search(rf'name="{name}" value="([^"]*)"', self.text)[1])
 
     def media(self) -> list[str]:
-        """Paths of the prefix and of the candidates, in the order of the page."""
+        """Return the paths of the prefix and of the candidates, in the order of the page."""
         return re.findall(r'data-src="([^"]+)"', self.text)
 
     @property
     def action(self) -> str | None:
+        """The path to which the page's form is sent; None if the page has no form."""
         found = re.search(r'action="([^"]+)"', self.text)
         return found and found[1]
 
 
 class Visitor:
-    """A client with a cookie, which repeats requests until the server is up."""
+    """An HTTP client with a cookie, which repeats a request until the server responds."""
 
     def __init__(self, port: int, patience: float = 60) -> None:
         self.port, self.patience = port, patience
         self.cookie: str | None = None
-        self._open: HTTPConnection | None = None
+        self._connection: HTTPConnection | None = None
 
     def request(self, method: str, path: str, fields: dict | None = None, **headers: str) -> Reply:
         if self.cookie:
@@ -92,20 +99,20 @@ class Visitor:
         until = time.monotonic() + self.patience
         while True:
             try:
-                if self._open is None:
-                    self._open = HTTPConnection("127.0.0.1", self.port, timeout=60)
-                self._open.request(method, path, body, headers)
-                response = self._open.getresponse()
-                answered = Reply(response.status, response.msg, response.read())
+                if self._connection is None:
+                    self._connection = HTTPConnection("127.0.0.1", self.port, timeout=60)
+                self._connection.request(method, path, body, headers)
+                response = self._connection.getresponse()
+                reply = Reply(response.status, response.msg, response.read())
                 break
             except (OSError, HTTPException):
-                self._open = None
+                self._connection = None
                 if time.monotonic() > until:
                     raise
                 time.sleep(0.05)
-        if cookie := answered.headers.get("Set-Cookie"):
+        if cookie := reply.headers.get("Set-Cookie"):
             self.cookie = cookie.partition(";")[0]
-        return answered
+        return reply
 
     def home(self) -> Reply:
         return self.request("GET", "/")
@@ -123,11 +130,11 @@ class Visitor:
         )
 
     def leave(self, page: Reply) -> Reply:
-        """Leave a page without a question."""
+        """Leave a page that has no open question."""
         return self.request("POST", "/continue", key_of(page))
 
     def to_question(self) -> Reply:
-        """The first page of the study itself."""
+        """Leave the pages before the first item, practice included, and return the item's page."""
         while True:
             page = self.home()
             if page.action != "/answer":
@@ -145,18 +152,16 @@ def key_of(page: Reply) -> dict[str, str]:
 
 @dataclass
 class Annotator:
-    """Takes part in a whole study and remembers the answers, letters by the item's key."""
+    """Takes part in a study, and remembers the answers: the letters by the key of the item."""
 
     visitor: Visitor
     choose: Callable[[int], str]
     answers: dict[str, str] = field(default_factory=dict)
     rests: int = 0
 
-    def take_part(self, most: int | None = None) -> None:
-        while most is None or len(self.answers) < most:
-            page = self.visitor.home()
-            if page.action is None:
-                return
+    def take_part(self) -> None:
+        """Answer all items."""
+        while (page := self.visitor.home()).action is not None:
             if page.action != "/answer":
                 self.rests += "Time for a break" in page.text
                 self.visitor.leave(page)

@@ -1,4 +1,4 @@
-"""Accuracy, majority and agreement, compared with closed forms and another library."""
+"""Accuracy, majority and agreement of votes, compared with formulas and with another library."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.user_errors import raises_user_error
 def vote(
     annotator: str, item: int, choice: int, family: str = "event", **changes
 ) -> dict[str, Any]:
-    """A vote on an item whose correct candidate is the first."""
+    """Return a vote on an item whose first candidate is correct."""
     return {
         "annotator": annotator, "item_id": f"i{item}", "family": family, "answer": 0,
         "choice": choice, "right": choice == 0, "seconds": 10.0 + item,
@@ -37,7 +37,7 @@ def summarize(votes: list[dict[str, Any]], items: int, annotators: list[str]) ->
 
 
 def sample_votes(rng, items: int, depths: list[int]) -> list[list[int]]:
-    """Votes that agree more than chance."""
+    """Return the votes on each item, which agree more often than by chance."""
     truth = rng.integers(4, size=items)
     return [
         [int(t) if rng.random() < 0.6 else int(rng.integers(4)) for _ in range(rng.choice(depths))]
@@ -46,12 +46,12 @@ def sample_votes(rng, items: int, depths: list[int]) -> list[list[int]]:
 
 
 def count(items: list[list[int]]) -> pd.DataFrame:
-    """(items, 4) votes for each candidate."""
+    """Return the number of votes for each candidate (items, 4)."""
     return pd.DataFrame([np.bincount(choices, minlength=4) for choices in items], columns=range(4))
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_alpha_equals_that_of_the_krippendorff_package(seed) -> None:
+def test_krippendorff_alpha_equals_that_of_the_package(seed) -> None:
     rng = np.random.default_rng(seed)
     counts = count(sample_votes(rng, 40, [2, 3, 5]))
     expected = krippendorff.alpha(value_counts=counts.values, level_of_measurement="nominal")
@@ -59,7 +59,7 @@ def test_alpha_equals_that_of_the_krippendorff_package(seed) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_kappa_is_agreement_above_chance(seed) -> None:
+def test_fleiss_kappa_equals_its_definition(seed) -> None:
     items = sample_votes(np.random.default_rng(seed), 30, [3])
     pairs = [a == b for c in items for a, b in itertools.combinations(c, 2)]
     votes = Counter(itertools.chain(*items))
@@ -70,7 +70,7 @@ def test_kappa_is_agreement_above_chance(seed) -> None:
     )
 
 
-def test_agreement_is_independent_of_candidate_names_and_order() -> None:
+def test_agreement_does_not_depend_on_candidate_indices_or_order() -> None:
     rng = np.random.default_rng(0)
     items = sample_votes(rng, 25, [3])
     names = rng.permutation(4)
@@ -97,7 +97,7 @@ def test_majority_is_strictly_more_than_half(choices, wins) -> None:
     assert found == wins or (np.isnan(found) and wins is None)
 
 
-def test_a_study_of_the_papers_shape() -> None:
+def test_a_study_of_the_papers_size_is_summarized() -> None:
     """59 items, of which 10 have one vote, 30 two and 19 three: 127 judgments."""
     rng = np.random.default_rng(0)
     depths = [1] * 10 + [2] * 30 + [3] * 19
@@ -111,16 +111,16 @@ def test_a_study_of_the_papers_shape() -> None:
     assert found["depth"] == {"0": 1, "1": 10, "2": 30, "3": 19}
     assert found["fleiss_kappa"]["items"] == 19
     assert found["krippendorff_alpha"]["items"] == 49
-    assert sum(of["micro"]["n"] for of in found["accuracy"].values()) == 127
+    assert sum(accuracy["micro"]["n"] for accuracy in found["accuracy"].values()) == 127
     assert found["majority"]["micro"]["n"] == 59
     by_item = {k: [v["choice"] for v in votes if v["item_id"] == f"i{k}"] for k in range(59)}
     ties = sum(len(c) == 2 and c[0] != c[1] for c in by_item.values())
     assert found["majority"]["undecided"] == ties > 0
     right = sum(c.count(0) * 2 > len(c) for c in by_item.values())
     assert found["majority"]["micro"]["value"] == pytest.approx(right / 59)
-    for name, of in found["accuracy"].items():
+    for name, accuracy in found["accuracy"].items():
         own = [v["right"] for v in votes if v["annotator"] == name]
-        assert of["micro"]["value"] == pytest.approx(sum(own) / len(own))
+        assert accuracy["micro"]["value"] == pytest.approx(sum(own) / len(own))
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     table = str(human_table(found))
     assert "10 with 1, 30 with 2, 19 with 3" in " ".join(table.split())
@@ -135,14 +135,14 @@ def test_annotators_without_votes_are_left_out() -> None:
     assert found["fleiss_kappa"] == {"value": pytest.approx(-1.0), "items": 4}
 
 
-def test_one_annotator_has_no_agreement() -> None:
+def test_the_agreement_of_a_single_annotator_is_undefined() -> None:
     found = summarize([vote("A1", k, 0) for k in range(3)], 3, ["A1", "A2"])
     assert found["fleiss_kappa"] == {"value": None, "items": 0}
     assert found["krippendorff_alpha"] == {"value": None, "items": 0}
     assert "undefined" in str(human_table(found))
 
 
-def test_times_are_medians_over_pages_loaded_once() -> None:
+def test_times_are_medians_over_pages_that_were_loaded_once() -> None:
     votes = [vote("A1", k, 0, seconds=s, client_seconds=s / 2) for k, s in enumerate([4, 9, 5])]
     votes.append(vote("A1", 3, 0, seconds=1e5, loads=2))
     found = summarize(votes, 4, ["A1"])["seconds"]

@@ -1,4 +1,4 @@
-"""The items of a study, their order, and the letters of their candidates."""
+"""The items of a study, their order for each annotator, and the letters of their candidates."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def item(k: int, family: str, scene: int | None = None, stop: int = 10) -> Selec
 
 @pytest.fixture(scope="module")
 def items() -> list[SelectionItem]:
-    """The paper's number of items, in families of different sizes."""
+    """As many items as in the paper's study, in families of different sizes."""
     families = ["event"] * 12 + ["time"] * 24 + ["window"] * 23
     return [item(k, family) for k, family in enumerate(families)]
 
@@ -63,7 +63,7 @@ def test_the_orders_of_four_annotators_are_a_latin_square(items, seed) -> None:
     for i in items:
         for candidate in range(4):
             letters = [order.index(candidate) for order in orders[i.item_id]]
-            # All candidates move alike, so comparing pages does not reveal the correct one.
+            # All candidates move alike, so that comparing pages does not reveal the correct one.
             assert [(x - letters[0]) % 4 for x in letters] == [0, 1, 2, 3]
             if candidate != i.answer:
                 moved = (letters[0] - orders[i.item_id][0].index(i.answer)) % 4
@@ -85,7 +85,7 @@ def test_assignment_depends_on_the_seed_the_items_and_the_annotator(items) -> No
 
 
 def open_next(db: sqlite3.Connection, annotator: str) -> str:
-    """Open and answer the annotator's next item; return its id."""
+    """Open and answer the next item of an annotator, and return its id."""
     token = _open_item(db, annotator, practice=False)
     db.execute("UPDATE turn SET loaded = opened, answered = opened WHERE token = ?", (token,))
     [row] = db.execute("SELECT item_id FROM turn WHERE token = ?", (token,))
@@ -93,9 +93,9 @@ def open_next(db: sqlite3.Connection, annotator: str) -> str:
 
 
 def new_study(folder: Path, items: list[SelectionItem], names: list[str]) -> sqlite3.Connection:
-    links = {name: name for name in names}
+    link_tokens = {name: name for name in names}
     assignments = assign_items(items, names, 0)
-    return storage.create(folder / storage.DATABASE, {}, items, [], links, assignments)
+    return storage.create(folder / storage.DATABASE, {}, items, [], link_tokens, assignments)
 
 
 def test_families_and_votes_are_balanced_if_annotators_stop_early(items, tmp_path) -> None:
@@ -128,7 +128,7 @@ def test_the_earliest_prefix_of_a_scene_comes_first(tmp_path) -> None:
     assert [i for i in order if i != "i3"] == ["i1", "i2", "i0"]
 
 
-def test_sampled_items_are_balanced_and_avoid_shared_scenes() -> None:
+def test_sampled_items_are_balanced_and_do_not_share_scenes() -> None:
     pool = [item(k, FAMILIES[k % 3], scene=k // 2) for k in range(60)]
     sampled = sample_items(pool, 20, 0, "items")
     assert sorted(Counter(i.family for i in sampled).values()) == [6, 7, 7]
@@ -140,7 +140,7 @@ def test_sampled_items_are_balanced_and_avoid_shared_scenes() -> None:
         sample_items(pool, 61, 0, "practice")
 
 
-def test_an_items_file_has_plain_ids_or_json(micro_store, tmp_path) -> None:
+def test_a_file_of_items_has_plain_ids_or_json(micro_store, tmp_path) -> None:
     first, second, *_ = [i.item_id for i in micro_store.selection("test")]
     file = tmp_path / "items.txt"
     file.write_text(f'{second}\n\n{{"item_id": "{first}", "note": 2}}\n')

@@ -16,7 +16,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from evaluation.study import storage
 from evaluation.study.storage import read_votes
-from tests.evaluation.chromium import OVERFLOW, chromium_in
+from tests.evaluation.chromium import IS_TOO_WIDE, chromium_in
 
 pytestmark = pytest.mark.slow
 
@@ -44,7 +44,7 @@ def find(browser: webdriver.Chrome, what: str) -> WebElement:
 
 
 def await_page(browser: webdriver.Chrome) -> str:
-    """Wait until a page is loaded, and return its button's text, or its heading."""
+    """Wait until a page is loaded. Return the text of its main button, or of its heading."""
     WebDriverWait(browser, PATIENCE, 0.05).until(
         lambda b: (
             b.execute_script("return document.readyState") == "complete"
@@ -56,7 +56,7 @@ def await_page(browser: webdriver.Chrome) -> str:
 
 
 def await_next(browser: webdriver.Chrome, act: Callable[[], None]) -> str:
-    """Act, wait for the next page, and return its button's text, or its heading."""
+    """Call `act`, wait for the next page, and return its text as `await_page` does."""
     browser.execute_script("window.unchanged = true")
     act()
     WebDriverWait(browser, PATIENCE, 0.05).until(
@@ -73,7 +73,7 @@ def votes(served, name: str) -> pd.DataFrame:
 
 
 def check_fits(browser: webdriver.Chrome) -> None:
-    assert not browser.execute_script(OVERFLOW), "the page is wider than the screen"
+    assert not browser.execute_script(IS_TOO_WIDE), "the page is wider than the screen"
     for target in browser.find_elements(By.CSS_SELECTOR, "button, label, .button"):
         assert min(target.size.values()) >= MIN_TARGET, target.text
 
@@ -109,8 +109,9 @@ def test_pages_fit_the_screen_and_answers_are_stored(
     assert (found.loads == 1).all()
 
 
-def test_the_study_works_by_keyboard(chromium, served) -> None:
-    """Without a click. A reloaded page has the same question."""
+def test_the_study_works_by_keyboard_and_a_reloaded_page_has_the_same_question(
+    chromium, served
+) -> None:
     chromium.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
     def press(*keys: str) -> Callable[[], None]:

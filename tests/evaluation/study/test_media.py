@@ -1,4 +1,4 @@
-"""Media hold the pixels of frames and no metadata."""
+"""The media of items have the pixels of the frames, and no metadata."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_prefix_is_a_video_of_every_frame_without_metadata(micro_store, item) 
     assert not any(word in prefix.content for word in (b"x264", b"Lav", item.scene_id.encode()))
 
 
-def test_frames_of_odd_size_are_padded() -> None:
+def test_videos_of_odd_size_are_padded_to_even_size() -> None:
     pixels = np.random.default_rng(0).integers(256, size=(4, 51, 75, 3)).astype(np.uint8)
     with av.open(io.BytesIO(encode_video(pixels, 30.0))) as video:
         assert (video.streams.video[0].width, video.streams.video[0].height) == (76, 52)

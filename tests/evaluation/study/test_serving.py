@@ -1,4 +1,4 @@
-"""A whole study over HTTP, and attacks on its server."""
+"""A complete study over HTTP, and attacks on its server."""
 
 from __future__ import annotations
 
@@ -33,11 +33,12 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def small(serve, prepared_small):
-    """A server of four items, for tests that each take another annotator."""
+    """A server of a study of four items, which several tests share."""
     return serve(prepared_small)
 
 
 def rows(server, query: str, *values) -> list[sqlite3.Row]:
+    """Return the rows of a query to the study's database."""
     db = storage.open_study(server.folder / storage.DATABASE)
     try:
         return db.execute(query, values).fetchall()
@@ -47,7 +48,7 @@ def rows(server, query: str, *values) -> list[sqlite3.Row]:
 
 @pytest.fixture
 def visitor(small) -> Visitor:
-    """The first annotator, signed in on another device each time."""
+    """The annotator A1, signed in with a new link in each test."""
     return Visitor(small.port).sign_in(small.links()["A1"])
 
 
@@ -91,7 +92,7 @@ def test_a_study_survives_kills_with_three_concurrent_annotators(serve, prepared
     found = json.loads((tmp_path / "report.json").read_text())
     assert found["depth"] == {"3": ITEMS}
     assert found["fleiss_kappa"]["items"] == ITEMS
-    # Three annotators have an item's correct candidate at three letters.
+    # Each of the three annotators saw the correct candidate of an item at another letter.
     places = Counter((v["item_id"], _place_of_answer(server, v)) for v in votes)
     assert set(places.values()) == {1}
 
@@ -103,7 +104,7 @@ def _place_of_answer(server, vote: dict) -> int:
     return row["shown"].index(str(vote["answer"]))
 
 
-def test_a_letter_chooses_the_candidate_at_its_place(small, micro_store) -> None:
+def test_a_letter_chooses_the_candidate_that_the_page_shows_at_it(small, micro_store) -> None:
     visitor = Visitor(small.port).sign_in(small.links()["A2"])
     page = visitor.to_question()
     images = [visitor.request("GET", path).body for path in page.media()[1:]]
@@ -119,7 +120,7 @@ def test_a_letter_chooses_the_candidate_at_its_place(small, micro_store) -> None
 
 
 def test_no_response_reveals_the_correct_answer(small, micro_store) -> None:
-    """Pages differ only in the question, in the order of the candidates and in random tokens."""
+    """The page of an item depends only on its question, its media and random tokens."""
     items = {i.item_id: i for i in micro_store.selection()}
     visitor = Visitor(small.port).sign_in(small.links()["A3"])
     answers, places, names = [], [], []
@@ -201,7 +202,7 @@ def test_every_response_has_the_security_headers(small, visitor) -> None:
     assert "unsafe" not in HEADERS["Content-Security-Policy"]
 
 
-def test_a_full_disk_locks_nobody_out(small) -> None:
+def test_an_annotator_can_sign_in_although_the_disk_is_full(small) -> None:
     def full() -> None:
         raise OSError("No space left on device")
 
@@ -210,13 +211,13 @@ def test_a_full_disk_locks_nobody_out(small) -> None:
     auth.write_links(db, small.folder / auth.LINKS_FILE, "http://here")
     assert response["status"] == 303
     assert any(name == b"set-cookie" for name, _ in response["headers"])
-    # Without its tables no page can be rendered.
+    # In a database without tables, every query fails.
     broken = build_app(sqlite3.connect(":memory:"), StudyCommand(), full)
     assert post_link(broken, "x" * 10)["status"] == 500
 
 
 def post_link(app, link: str) -> dict:
-    """The beginning of an application's response to the form of a link."""
+    """Send the form of a link to an application, and return the start of the response."""
     messages = []
 
     async def receive() -> dict:
@@ -229,7 +230,7 @@ def post_link(app, link: str) -> dict:
         "type": "http", "method": "POST", "path": "/link", "raw_path": b"/link",
         "query_string": b"", "headers": [(b"host", b"here")], "http_version": "1.1",
     }  # fmt: skip
-    # The application raises errors again for the server to log.
+    # After an error, the application responds, and raises the error again so that it is logged.
     with contextlib.suppress(sqlite3.Error):
         asyncio.run(app(scope, receive, send))
     return messages[0]
@@ -249,7 +250,7 @@ def test_repeated_early_and_forged_answers_change_nothing(small, visitor) -> Non
     [after] = map(tuple, rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key")))
     assert after == kept
 
-    # Another annotator's item in the own session.
+    # An annotator cannot answer an item that is open for another annotator.
     other = Visitor(small.port).sign_in(small.links()["A2"])
     theirs = other.to_question()
     other.load(theirs)
@@ -291,7 +292,7 @@ def test_hostile_fields_change_nothing(small, visitor, changes, status) -> None:
     assert list(map(tuple, before)) == list(map(tuple, after))
 
 
-def test_forms_of_other_sites_are_refused(visitor) -> None:
+def test_forms_on_other_sites_are_refused(visitor) -> None:
     page = visitor.to_question()
     for headers in (
         {"Origin": "http://evil.example"},
@@ -334,12 +335,12 @@ def test_without_a_session_every_request_is_refused(small, visitor) -> None:
         assert stranger.load(page).status == 401
 
 
-def test_of_a_thousand_concurrent_answers_one_counts(small, visitor) -> None:
+def test_only_one_of_many_concurrent_answers_counts(small, visitor) -> None:
     page = visitor.to_question()
     visitor.load(page)
     votes = len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL"))
 
-    async def one(k: int) -> int:
+    async def request(k: int) -> int:
         body = urlencode({**key_of(page), "choice": LETTERS[k % 4], "seconds": 1})
         head = "GET /" if k % 2 else "POST /answer"
         sent = "" if k % 2 else body
@@ -354,7 +355,7 @@ def test_of_a_thousand_concurrent_answers_one_counts(small, visitor) -> None:
         return int(status.split()[1])
 
     async def all_at_once() -> Counter:
-        return Counter(await asyncio.gather(*(one(k) for k in range(1000))))
+        return Counter(await asyncio.gather(*(request(k) for k in range(1000))))
 
     assert asyncio.run(all_at_once()) == {200: 500, 303: 500}
     assert len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL")) == votes + 1

@@ -1,4 +1,4 @@
-"""Studies that cannot be resumed are refused; the others lose nothing."""
+"""A study that cannot be resumed is refused. A resumed study has lost no data."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from tests.user_errors import raises_user_error
 
 @pytest.fixture
 def path(tmp_path, prepared_small) -> Path:
+    """The database of a copy of the prepared study."""
     shutil.copytree(prepared_small, tmp_path / "study")
     return tmp_path / "study" / storage.DATABASE
 
@@ -31,7 +32,7 @@ def modify(path: Path, *statements: str) -> None:
     db.close()
 
 
-def test_another_version_is_refused(path) -> None:
+def test_a_study_of_another_version_is_refused(path) -> None:
     modify(path, f"PRAGMA user_version = {storage.VERSION + 1}")
     with raises_user_error("unknown-version", contains=str(storage.VERSION + 1)):
         storage.open_study(path)
@@ -40,8 +41,8 @@ def test_another_version_is_refused(path) -> None:
 @pytest.mark.parametrize("content", [b"not a database" * 100, None])
 def test_a_damaged_study_is_refused(path, content) -> None:
     if content is None:
-        whole = path.read_bytes()
-        content = whole[: len(whole) // 2]
+        complete = path.read_bytes()
+        content = complete[: len(complete) // 2]
     path.write_bytes(content)
     for side_file in path.parent.glob("*.sqlite-*"):
         side_file.unlink()
@@ -67,14 +68,14 @@ def test_only_the_owner_can_read_the_files_of_a_study(tmp_path) -> None:
     db.close()
 
 
-def test_a_study_whose_creation_was_killed_does_not_exist(tmp_path) -> None:
+def test_a_study_whose_creation_was_interrupted_does_not_exist(tmp_path) -> None:
     path = tmp_path / storage.DATABASE
     assert storage.open_study(path) is None
     path.touch()
     assert storage.open_study(path) is None
 
 
-def test_lost_media_are_encoded_again_from_the_same_benchmark(path, micro, micro_store) -> None:
+def test_missing_media_are_encoded_from_the_same_benchmark(path, micro, micro_store) -> None:
     before = path.read_bytes().count(b"IEND")
     modify(path, "DELETE FROM medium WHERE slot = 2")
     cfg = StudyCommand(benchmark=micro, store=str(micro_store.folder.parent), items="4")
@@ -86,7 +87,7 @@ def test_lost_media_are_encoded_again_from_the_same_benchmark(path, micro, micro
     assert path.read_bytes().count(b"IEND") >= before
 
 
-def test_lost_media_of_another_benchmark_are_refused(path, micro, micro_store) -> None:
+def test_missing_media_are_not_encoded_from_another_benchmark(path, micro, micro_store) -> None:
     modify(path, "DELETE FROM medium", "UPDATE about SET value = 'x' WHERE key = 'identity'")
     cfg = StudyCommand(benchmark=micro, store=str(micro_store.folder.parent), items="4")
     with raises_user_error("different-builds", contains="7 items"):
@@ -104,7 +105,7 @@ def test_a_changed_file_of_items_is_refused(path, tmp_path) -> None:
         setup.check_items(StudyCommand(items=str(file)), db)
 
 
-def test_practice_is_of_the_training_split(micro_store, prepared_small) -> None:
+def test_practice_items_are_from_the_training_split(micro_store, prepared_small) -> None:
     db = storage.open_study(prepared_small / storage.DATABASE)
     split = {i.item_id: i.split for i in micro_store.selection()}
     assert {split[i] for i in storage.item_ids(db, practice=True)} == {"train"}

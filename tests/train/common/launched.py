@@ -1,4 +1,4 @@
-"""Run trainers under `accelerate launch`: each of the runs that a JSON file lists."""
+"""Train the runs that a JSON file lists, one after another, as a rank of `accelerate launch`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from train.student import run as student_run
 
 TRAINERS = {"sft": sft.main, "contrastive": contrastive.main}
 VALIDATION_ITEMS = 3
-"""Held-out items in the settings of the tests; training has more."""
+"""Number of validation items in the settings of the tests; there are more training items."""
 build = dataset.supervised_items
 
 
@@ -40,7 +40,8 @@ def enable_fsdp_on_cpus() -> None:
 
 
 def five_samples(*arguments: Any) -> dict[str, list[dataset.SupervisedItem]]:
-    """Five training samples of two modes: a step of four, and one that all ranks cannot share."""
+    """Return what `supervised_items` returns, but only five samples if the items are those of
+    training: a step of four samples, and a step of one, which two ranks cannot share."""
     items = build(*arguments)
     if len(arguments[1]) <= VALIDATION_ITEMS:
         return items
@@ -57,7 +58,7 @@ def main() -> None:
     enable_fsdp_on_cpus()
     dataset.supervised_items = five_samples
     for run in plan["runs"]:
-        # As accelerate launch sets it with and without --use_fsdp.
+        # accelerate launch sets this with --use_fsdp.
         os.environ["ACCELERATE_USE_FSDP"] = str(run["fsdp"]).lower()
         if rank() == 0 and run["checkpoint"]:
             shutil.copytree(run["checkpoint"], Path(run["folder"]) / Path(run["checkpoint"]).name)

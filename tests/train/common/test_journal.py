@@ -47,8 +47,8 @@ def settings(few_steps) -> SftCommand:
 
 @pytest.fixture(scope="module")
 def trained(settings, tmp_path_factory) -> tuple[Path, dict[str, float]]:
-    """A run whose best checkpoint is its first one: no answer of this model can be parsed, at any
-    step."""
+    """A run whose best checkpoint is the first: its best_metric, the share of answers that can be
+    parsed, is 0 at every step."""
     folder = tmp_path_factory.mktemp("trained")
     return folder, sft.main.__wrapped__(settings, Run("trained", folder))
 
@@ -72,7 +72,7 @@ def test_the_best_checkpoint_becomes_the_student(trained) -> None:
 
 
 @pytest.mark.slow
-def test_generated_answers_are_those_of_the_evaluation(
+def test_generated_answers_equal_those_of_evaluation_select(
     trained, settings, micro_store, frames, tmp_path
 ) -> None:
     folder, _ = trained
@@ -96,7 +96,7 @@ def test_generated_answers_are_those_of_the_evaluation(
 
 
 @pytest.mark.slow
-def test_measuring_and_resuming_do_not_change_a_run(trained, settings, tmp_path) -> None:
+def test_generating_answers_and_resuming_do_not_change_a_run(trained, settings, tmp_path) -> None:
     folder, results = trained
     changes = {"generated_items": 0, "best_metric": None, "report_to": [], "keep_checkpoints": 2}
     plain = replace(settings, train=replace(settings.train, **changes))
@@ -109,7 +109,8 @@ def test_measuring_and_resuming_do_not_change_a_run(trained, settings, tmp_path)
     assert not equal_adapters(unmeasured / "student", unmeasured / "checkpoint-2")
     assert not (unmeasured / "samples.jsonl").exists()
 
-    # Killed after the evaluation that followed its checkpoint, and again after its last step.
+    # The first time, the run resumes from a checkpoint that is older than the last lines of its
+    # journal; the second time, its last step is done.
     resumed = tmp_path / "resumed"
     shutil.copytree(folder / "checkpoint-2", resumed / "checkpoint-2")
     for name in ("metrics.jsonl", "samples.jsonl"):
@@ -165,7 +166,7 @@ def held_out(responses: list[str]) -> StudentDataset:
     return StudentDataset([lazy(k, response) for k, response in enumerate(responses)])
 
 
-def test_shares_of_parsed_and_right_answers(few_steps, processor, tmp_path) -> None:
+def test_shares_of_parsed_and_correct_answers(few_steps, processor, tmp_path) -> None:
     samples = held_out(["Answer: A", "It falls.\nAnswer: B", "Answer: C", "Answer: D", "Answer: A"])
     texts = ["Answer: A", "It falls.\nAnswer: C", "It falls", "Answer: D"]
     answers = HeldOutAnswers(few_steps(generated_items=4), processor, tmp_path)
@@ -177,7 +178,7 @@ def test_shares_of_parsed_and_right_answers(few_steps, processor, tmp_path) -> N
     assert [r["answer"] for r in rows] == ["A", "B", "C", "D"]
     assert {(r["step"], r["mode"]) for r in rows} == {(7, "answer")}
 
-    # Descriptions ask for no letter.
+    # Responses without a letter are not measured.
     samples = held_out(["The cube is near the centre."] * 4)
     assert answers.measure(Writer(processor, texts), "frame", samples, step=8) == {}
 

@@ -53,7 +53,7 @@ def five_samples(monkeypatch) -> None:
 
 
 def train_alone(settings: SftCommand, folder: Path, checkpoint: Path | None = None) -> Path:
-    """A run of one rank, from its start or a checkpoint."""
+    """Train with one rank, from the start or from a checkpoint, and return the run's folder."""
     folder.mkdir(parents=True)
     if checkpoint is not None:
         shutil.copytree(checkpoint, folder / checkpoint.name)
@@ -62,7 +62,7 @@ def train_alone(settings: SftCommand, folder: Path, checkpoint: Path | None = No
 
 
 def overrides(settings: SftCommand | ContrastiveCommand, folder: Path) -> list[str]:
-    """The part of a command line that both trainers share."""
+    """Return the overrides that the command lines of both trainers have in common."""
     train = {k: v for k, v in asdict(settings.train).items() if k != "report_to"}
     return [
         "benchmark=micro", f"store={settings.store}", f"run={folder.name}",
@@ -72,7 +72,7 @@ def overrides(settings: SftCommand | ContrastiveCommand, folder: Path) -> list[s
 
 
 def plan_student(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any]:
-    """A run of a student for launched.py."""
+    """Describe the run of a student for launched.py."""
     student = settings.student
     keys = ("name", "model", "quantization", "image_size", "max_length", "max_new_tokens")
     command = [
@@ -86,7 +86,7 @@ def plan_student(settings: SftCommand, folder: Path, **changes: Any) -> dict[str
 
 
 def plan_retriever(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]:
-    """A run of a retriever for launched.py."""
+    """Describe the run of a retriever for launched.py."""
     retriever = settings.retriever
     late, sizes = retriever.late, retriever.architecture
     model = (
@@ -111,7 +111,7 @@ def plan_retriever(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]
 
 
 def launch(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Two ranks on CPUs, also on a machine with GPUs."""
+    """Start two ranks with accelerate. They use CPUs, even if there are GPUs."""
     accelerate = Path(sys.executable).with_name("accelerate")
     environment = {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
     return run_child(
@@ -122,13 +122,13 @@ def launch(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def check_same(one: Path, two: Path, step: int = -1) -> None:
-    """Compare the journals after a step, and the weights."""
+    """Compare the journals of two runs after a step, and their weights."""
     check_same_journals(one, two, step)
     check_same_weights(one, two)
 
 
 def check_same_journals(one: Path, two: Path, step: int = -1) -> None:
-    """The fraction of an epoch is not compared: it counts the micro-batches of a rank."""
+    """Compare all values but the epoch, a fraction that counts the micro-batches of one rank."""
     journals = [
         [{k: v for k, v in r.items() if k != "epoch"} for r in read_journal(f) if r["step"] > step]
         for f in (one, two)
@@ -143,12 +143,12 @@ def check_same_weights(
     weights = [load_file(f / name) for f in (one, two)]
     assert weights[0].keys() == weights[1].keys()
     for name, weight in weights[0].items():
-        # Ranks sum gradients in another order: fp32 rounding, after steps at a rate of 1e-3.
+        # Ranks sum gradients in another order, which changes the rounding in fp32.
         torch.testing.assert_close(weight, weights[1][name], atol=5e-6, rtol=1e-5)
 
 
 def error_lines(ended: subprocess.CompletedProcess[str]) -> list[str]:
-    """The errors that a user sees, none of which is a traceback."""
+    """Return the lines with errors; require that no rank printed a traceback."""
     assert "[rank0]: Traceback" not in ended.stderr
     assert "[rank1]: Traceback" not in ended.stderr
     return [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
@@ -158,9 +158,9 @@ def error_lines(ended: subprocess.CompletedProcess[str]) -> list[str]:
 def test_two_ranks_train_what_one_trains(
     settings, contrastive_settings, saved_base, five_samples, tmp_path
 ) -> None:
-    """Two ranks equal one with twice the accumulation (a student) or with the whole batch (a
-    retriever). So do two ranks of FSDP, a resumed run, and runs that one rank starts and two resume
-    or the reverse. An error on one rank ends both with one sentence.
+    """Two ranks train the same weights as one rank with the same batch. This also holds with FSDP,
+    for resumed runs, and for runs that one rank starts and two ranks resume, or the reverse. An
+    error on one rank ends both ranks with one message.
     """
     runs = tmp_path / "sft"
     one = train_alone(settings, runs / "one")
@@ -255,7 +255,7 @@ def test_fsdp_without_effect_is_refused(settings, tmp_path, monkeypatch) -> None
 @pytest.mark.parametrize("count", [1, 2, 5, 8, 11, 64])
 @pytest.mark.parametrize(("micro_batch", "number"), [(1, 2), (2, 2), (4, 2), (2, 4), (1, 8)])
 def test_ranks_divide_each_step_of_a_single_rank(count, micro_batch, number) -> None:
-    """accelerate gives the micro-batches of an order to the ranks in turn."""
+    """accelerate deals the micro-batches to the ranks in turn."""
     lengths = np.random.default_rng(0).integers(1, 1000, count).tolist()
     alone = list(LengthSampler(lengths, 8, 0))
     order = LengthSampler(lengths, 8, 0, micro_batch, number)
@@ -268,13 +268,13 @@ def test_ranks_divide_each_step_of_a_single_rank(count, micro_batch, number) -> 
         samples = [i for part in shares for b in part[first : first + each] for i in b]
         supervised = sorted(i for i in samples if i >= 0)
         assert supervised == sorted(alone[step : step + 8])
-        # Fillers repeat the shortest sample of the step.
+        # The samples that fill up a step repeat its shortest sample.
         assert {~i for i in samples if i < 0} <= {alone[step : step + 8][-1]}
     assert len({len(part) for part in shares}) == 1
 
 
-def test_ranks_have_equal_work() -> None:
-    """No rank always has the longer of two neighbours."""
+def test_ranks_get_samples_of_equal_length() -> None:
+    """The longer of two consecutive samples goes to each rank in turn."""
     lengths = np.random.default_rng(0).integers(1, 1000, 64)
     order = np.array(list(LengthSampler(lengths.tolist(), 64, 0, 1, 2))).reshape(-1, 2)
     loads = lengths[order].sum(axis=0)

@@ -1,4 +1,4 @@
-"""A run that was killed and resumed ends as an uninterrupted one, in both trainers."""
+"""In both trainers, a run that was killed and resumed ends like an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from train.common.journal import read_journal
 from train.student import dataset
 
 DROPOUT = LoraConfig(rank=4, dropout=0.1)
-"""Adapters that use random numbers in each pass; a resumed run must use the same ones."""
+"""Adapters with dropout; a resumed run must draw the same random numbers."""
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def train(main, settings, folder: Path) -> Path:
 
 
 def train_twice(main, settings, folder: Path, step: int) -> tuple[Path, Path]:
-    """An uninterrupted run, and one that resumes from the first one's checkpoint of a step."""
+    """Return the folders of an uninterrupted run, and of a run that resumes from its checkpoint."""
     whole, resumed = train(main, settings, folder / "whole"), folder / "resumed"
     for checkpoint in whole.glob("checkpoint-*"):
         if int(checkpoint.name.removeprefix("checkpoint-")) <= step:
@@ -78,22 +78,22 @@ def test_other_data_is_refused(sft_settings, tmp_path, monkeypatch) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("steps", "step"), [(4, 2), (6, 3)], ids=["between epochs", "within one"])
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_student_resumes_in_a_later_epoch(
+def test_a_student_resumes_after_its_first_epoch(
     sft_settings, tmp_path, monkeypatch, steps, step, workers
 ) -> None:
-    """Six samples are two steps an epoch; each epoch permutes the candidates."""
+    """An epoch of six samples has two steps, and permutes the candidates."""
     build, render = dataset.supervised_items, dataset.selection_sample
     letters: dict[str, set[str]] = {}
 
     def six_samples(*arguments):
         return {mode: items[:3] for mode, items in build(*arguments).items()}
 
-    def noted(item, mode, *arguments):
+    def recorded(item, mode, *arguments):
         letters.setdefault(f"{item.item_id} {mode}", set()).add(item.letter)
         return render(item, mode, *arguments)
 
     monkeypatch.setattr(dataset, "supervised_items", six_samples)
-    monkeypatch.setattr(dataset, "selection_sample", noted)
+    monkeypatch.setattr(dataset, "selection_sample", recorded)
     settings = replace(sft_settings.train, max_steps=steps, workers=workers)
     runs = train_twice(sft.main, replace(sft_settings, train=settings), tmp_path, step)
     check_same_weights(*(f / "student" / "adapter_model.safetensors" for f in runs))
@@ -104,7 +104,7 @@ def test_a_student_resumes_in_a_later_epoch(
 
 @pytest.mark.slow
 def test_micro_batches_change_neither_loss_nor_gradient(few_steps, tmp_path) -> None:
-    """The first step's loss and gradient of four unequal samples, at once and one by one."""
+    """In the first step, with four samples of unequal length in one micro-batch or in four."""
     first = []
     for micro_batch in (4, 1):
         settings = few_steps(batch=4, max_steps=1, validation_items=1, micro_batch=micro_batch)
@@ -126,10 +126,10 @@ def test_only_numbered_folders_are_checkpoints(tmp_path, caplog) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one vector", "many"])
 @pytest.mark.parametrize("adapters", [False, True], ids=["whole", "adapters"])
-def test_a_retriever_resumes_and_keeps_its_best(
+def test_a_retriever_resumes_and_keeps_its_best_checkpoint(
     contrastive_settings, saved_base, tmp_path, late, adapters
 ) -> None:
-    """Within its second epoch."""
+    """It resumes within its second epoch."""
     changes = {"max_steps": 8, "evaluations": 4, "keep_checkpoints": 4, "best_metric": "mrr"}
     settings = replace(contrastive_settings.train, **changes)
     base = {"architecture": None, "model": saved_base, "quantization": "nf4", "lora": DROPOUT}
@@ -163,7 +163,7 @@ def test_a_missing_best_checkpoint_is_reported(contrastive_settings, tmp_path) -
 def test_an_unreadable_best_checkpoint_stops_the_run(
     contrastive_settings, tmp_path, monkeypatch
 ) -> None:
-    """The last weights are not silently saved instead."""
+    """The weights of the last step are not silently saved instead."""
 
     def damaged(*_: object) -> None:
         raise RuntimeError("damaged")

@@ -1,4 +1,4 @@
-"""Errors that stop a training run, and scenes that it must not train on."""
+"""Errors that stop a training run, scenes that it must not train on, and the GPU that it uses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from data.records import SelectionItem
 from data.store import Store
 from tests.user_errors import raises_user_error
 from train import sft
-from train.common.held_out import HELD_OUT, held_out_scenes
+from train.common.held_out import HELD_OUT_SHARE, held_out_scenes
 from train.student.dataset import load_datasets, uses_only
 from train.student.trainer import token_mean
 
@@ -41,7 +41,7 @@ def test_a_non_finite_loss_stops_the_run(settings, micro_store, tmp_path) -> Non
 
 
 class NanGradient(torch.autograd.Function):
-    """A finite loss with a gradient of NaN."""
+    """Returns a loss unchanged, but its gradient is NaN."""
 
     @staticmethod
     def forward(ctx: Any, loss: torch.Tensor) -> torch.Tensor:
@@ -119,7 +119,7 @@ class Names:
 def test_whether_a_scene_is_held_out_depends_on_its_name_only() -> None:
     names = [f"s0-{k:06d}" for k in range(2000)]
     held_out = held_out_scenes(Names(names))
-    assert len(held_out) == pytest.approx(HELD_OUT * len(names), rel=0.15)
+    assert len(held_out) == pytest.approx(HELD_OUT_SHARE * len(names), rel=0.15)
     assert held_out_scenes(Names(names[:500])) == held_out & set(names[:500])
     assert len(held_out_scenes(Names(names[:1]))) == 1
 
@@ -139,7 +139,7 @@ def test_a_run_without_ranks_uses_one_gpu(monkeypatch, visible, rank, expected) 
 
 @pytest.mark.parametrize("save", [torch.save, save_file])
 def test_weights_that_cannot_be_written_end_the_command(tmp_path, capsys, save):
-    """The libraries' errors are not OSErrors, and the disk may have space again."""
+    """The libraries raise errors that are not OSErrors."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:

@@ -1,4 +1,4 @@
-"""Processes that prepare batches: how many batches they prepare, and how their errors end."""
+"""Worker processes: how many batches they prepare in advance, and how their errors are reported."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_workers_prepare_the_next_step(workers, batches) -> None:
     assert prefetch_factor(0, batches) is None
 
 
-def test_the_error_of_a_worker_loses_its_traceback(
+def test_the_error_of_a_worker_is_reported_without_its_traceback(
     micro_store, frames, student_cfg, processor
 ) -> None:
     item = micro_store.selection("train")[0]
@@ -43,11 +43,11 @@ def test_the_error_of_a_worker_loses_its_traceback(
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_sample_that_is_too_long_ends_the_run(few_steps, tmp_path, monkeypatch, workers) -> None:
-    """The audit estimates lengths, and may miss the longest sample."""
-    monkeypatch.setattr("train.student.run.audit", lambda *_: "")
+    """The audit may miss the longest sample, because lengths are estimated."""
+    monkeypatch.setattr("train.student.run.audit_student", lambda *_: "")
     settings = few_steps(regime="answer_only", workers=workers)
     settings = replace(settings, student=replace(settings.student, max_length=150))
-    # The error of a worker process has lost its code.
+    # The error of a worker process loses its code.
     code = "user-error" if workers else "sample-too-long"
     with raises_user_error(code, contains="student.max_length=150"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))

@@ -1,4 +1,4 @@
-"""Mistakes in the retriever trainer's input are refused by name before anything is trained."""
+"""The retriever's trainer refuses unusable input before it trains, with errors that name it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
 from data import store
-from data.store import add_checksum, load_rows, save_rows
+from data.store import load_rows, save_rows, with_checksum
 from tests.user_errors import raises_user_error
 from train import contrastive
 
@@ -26,27 +26,27 @@ Rows = list[dict]
 
 
 def edited(folder: Path, root: Path, edit: Callable[[Rows], Rows]) -> str:
-    """A folder with a copy of a benchmark whose queries are edited, with valid checksums."""
+    """Copy a benchmark into `root`, edit its queries, and update its checksums; return `root`."""
     copy = root / folder.name
     shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("embeddings"))
     path = copy / "retrieval.parquet"
     save_rows(edit(load_rows(path)), path)
     manifest = json.loads((copy / store.MANIFEST).read_text())
     manifest["files"] = store.hash_files(copy)
-    (copy / store.MANIFEST).write_text(json.dumps(add_checksum(manifest)))
+    (copy / store.MANIFEST).write_text(json.dumps(with_checksum(manifest)))
     return str(root)
 
 
 def assert_refused(
-    settings: ContrastiveCommand, folder: Path, *names: str, code: str | None = None
+    settings: ContrastiveCommand, folder: Path, *parts: str, code: str | None = None
 ) -> None:
-    """The trainer refuses with a code and a message that has these names, and saves no
-    retriever."""
+    """Require the trainer to raise a UserError with this code and these parts in its message, and
+    to save no retriever."""
     folder.mkdir()
     with pytest.raises(UserError) as caught:
         contrastive.main.__wrapped__(settings, Run("run", folder))
     assert code in (None, caught.value.code)
-    assert all(name in str(caught.value) for name in names), caught.value
+    assert all(part in str(caught.value) for part in parts), caught.value
     assert {p.name for p in folder.iterdir()} <= {"untrained", "resolved.yaml"}
 
 
@@ -115,8 +115,8 @@ def test_contradictory_batch_settings_are_refused(contrastive_settings) -> None:
     assert "train.hard_negatives=3" in problem
 
 
-def over(settings: ContrastiveCommand, folder: Path | str) -> ContrastiveCommand:
-    """Settings of adapters over a base in a folder or of the hub."""
+def train_adapters_over(settings: ContrastiveCommand, folder: Path | str) -> ContrastiveCommand:
+    """Return settings that train adapters over a base, which is a folder or a hub model."""
     cfg = replace(settings.retriever, architecture=None, model=str(folder), lora=LoraConfig(rank=4))
     return replace(settings, retriever=cfg)
 
@@ -127,8 +127,8 @@ def test_a_base_with_trained_modules_after_its_backbone_is_refused(
     saved = tmp_path / "saved"
     parts = [Transformer(saved_base), Pooling(64, pooling_mode="lasttoken"), Dense(64, 8)]
     SentenceTransformer(modules=parts).save_pretrained(str(saved), create_model_card=False)
-    assert_refused(over(contrastive_settings, saved), tmp_path / "run", "Dense")
-    late = over(contrastive_settings, saved)
+    assert_refused(train_adapters_over(contrastive_settings, saved), tmp_path / "run", "Dense")
+    late = train_adapters_over(contrastive_settings, saved)
     late.retriever.late = LateConfig(width=8)
     assert_refused(late, tmp_path / "late", "Dense")
 
@@ -140,11 +140,11 @@ def test_a_cached_hub_base_with_another_pooling_is_refused(
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     commit = "a1" * 20
     cached = tmp_path / "models--lab--embedder"
-    whole = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
-    whole.save_pretrained(str(cached / "snapshots" / commit), create_model_card=False)
+    model = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
+    model.save_pretrained(str(cached / "snapshots" / commit), create_model_card=False)
     (cached / "refs").mkdir()
     (cached / "refs" / "main").write_text(commit)
-    cfg = over(contrastive_settings, "lab/embedder")
+    cfg = train_adapters_over(contrastive_settings, "lab/embedder")
     assert_refused(cfg, tmp_path / "run", "lab/embedder", "mean")
 
 
@@ -152,20 +152,20 @@ def test_a_base_of_another_family_is_refused(contrastive_settings, saved_base, t
     other = tmp_path / "other"
     shutil.copytree(saved_base, other)
     Qwen2VLConfig().save_pretrained(other)
-    assert_refused(over(contrastive_settings, other), tmp_path / "run", "qwen2_vl")
+    assert_refused(train_adapters_over(contrastive_settings, other), tmp_path / "run", "qwen2_vl")
 
 
 def test_non_finite_weights_end_the_run_before_its_first_step(
     contrastive_settings, saved_base, tmp_path
 ) -> None:
-    """Refused by the evaluation before the first step, which names a query."""
+    """The evaluation before the first step raises an error that names a query."""
     base = tmp_path / "base"
     shutil.copytree(saved_base, base)
     weights = load_file(base / "model.safetensors")
     (name,) = (k for k in weights if k.endswith("language_model.norm.weight"))
     weights[name][3] = float("nan")
     save_file(weights, base / "model.safetensors", metadata={"format": "pt"})
-    settings = over(contrastive_settings, base)
+    settings = train_adapters_over(contrastive_settings, base)
     folder = tmp_path / "run"
     folder.mkdir()
     with raises_user_error("non-finite-embedding", "query "):
@@ -173,6 +173,6 @@ def test_non_finite_weights_end_the_run_before_its_first_step(
     assert not (folder / "retriever").exists()
 
 
-def test_sharding_is_refused(contrastive_settings, tmp_path, monkeypatch) -> None:
+def test_fsdp_is_refused(contrastive_settings, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
     assert_refused(contrastive_settings, tmp_path / "run", "FSDP")

@@ -38,7 +38,7 @@ def test_ranks_share_the_batch_of_one_rank(queries) -> None:
 
 
 def test_no_target_is_a_document_of_another_query_while_possible(queries) -> None:
-    """Every query of the small benchmark shares its scene, and often its target, with others."""
+    """In the small benchmark, queries share their scenes with others, and often their targets."""
     documents = [{q.target, *q.hard_negatives[:1]} for q in queries]
     first = epoch_batches(queries)[0]
     for k in first:
@@ -53,7 +53,7 @@ def test_incompatible_queries_fill_the_last_batches(queries) -> None:
 
 
 def test_columns_are_queries_targets_and_negatives(queries) -> None:
-    items = batch_columns(queries, 2)
-    assert items[0] == queries
-    assert items[1] == [q.target for q in queries]
-    assert items[2:] == [[q.hard_negatives[k] for q in queries] for k in range(2)]
+    columns = batch_columns(queries, 2)
+    assert columns[0] == queries
+    assert columns[1] == [q.target for q in queries]
+    assert columns[2:] == [[q.hard_negatives[k] for q in queries] for k in range(2)]

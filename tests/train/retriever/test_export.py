@@ -1,4 +1,4 @@
-"""An exported retriever embeds as the trained one does, wherever it is loaded."""
+"""An exported retriever computes the embeddings of the trained one, also without this project."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ from train import export
 METRICS = {"recall@10_at_start": 0.25, "recall@10": 0.5}
 
 
-@pytest.fixture(scope="module", params=[None, LateConfig(width=24)], ids=["one", "late"])
+@pytest.fixture(
+    scope="module", params=[None, LateConfig(width=24)], ids=["one vector", "many vectors"]
+)
 def settings(request, contrastive_settings, saved_base) -> ContrastiveCommand:
     cfg = replace(
         contrastive_settings.retriever, architecture=None, model=saved_base, quantization="nf4",
@@ -43,10 +45,10 @@ def settings(request, contrastive_settings, saved_base) -> ContrastiveCommand:
 
 @pytest.fixture(scope="module")
 def runs(settings, tmp_path_factory) -> Path:
-    """A finished run of train.contrastive whose adapters weigh as much as their base."""
+    """A finished run of train.contrastive whose adapters change the outputs considerably."""
     root = tmp_path_factory.mktemp("checkpoints")
     folder = root / "contrastive" / "run"
-    open_run(Run("run", folder), asdict(settings), "train.contrastive", [])
+    open_run(Run("run", folder), asdict(settings), "train.contrastive")
     resolve_run(folder, "fp32", settings.retriever, data="0")
     torch.manual_seed(0)
     model = load_retriever(settings.retriever, "fp32", [], folder)
@@ -75,11 +77,11 @@ def forms(settings, runs, tmp_path_factory) -> dict[str, tuple[dict, Path]]:
 
 
 def test_the_measured_difference_is_recorded_and_small(forms) -> None:
-    for format, most in (("fp32", 1e-4), ("bf16", 0.1)):
+    for format, limit in (("fp32", 1e-4), ("bf16", 0.1)):
         measured, folder = forms[format]
         assert json.loads((folder / "export.json").read_text())["measured"] == measured
-        assert 0 < measured["query_difference"] < most
-        assert 0 < measured["score_difference"] < most
+        assert 0 < measured["query_difference"] < limit
+        assert 0 < measured["score_difference"] < limit
         assert 0 <= measured["best_frame_agreement"] <= 1
         weights = load_file(folder / "model.safetensors").values()
         assert {w.dtype for w in weights} == {loading.DTYPES[format]}
@@ -109,7 +111,7 @@ torch.save([[torch.as_tensor(one) for one in some] for some in embedded], output
 def test_the_library_alone_computes_the_same_embeddings(
     settings, runs, forms, micro_store, frames, tmp_path
 ) -> None:
-    """As the trained retriever, the adapters over their 4-bit base."""
+    """They equal those of the trained retriever, the adapters over their 4-bit base."""
     queries, preset = micro_store.standard_test()[:2], settings.retriever
     data = {
         "queries": [query_input(q, frames, preset) for q in queries],

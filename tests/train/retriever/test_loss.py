@@ -1,4 +1,4 @@
-"""The retriever's losses, compared with the library's on the same batch."""
+"""The retriever's loss and gradients equal those of the library on the same batch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torch.nn.functional import cross_entropy, normalize
 from torch.nn.utils.rnn import pad_sequence
 
 from conf.schema import LateConfig, LoraConfig, RetrieverConfig
-from models.lora_kernels import fuse
+from models.lora_kernels import use_fast_layers
 from models.retriever.embedder import (
     Retriever,
     embed,
@@ -68,7 +68,7 @@ def trained(request, micro_store, retriever_cfg, saved_base, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def distinct(queries):
-    """Queries of which no target is another query's document."""
+    """Queries none of which has a target among the targets and hard negatives of another."""
     kept = []
     for query in queries:
         targets = {q.target for q in kept}
@@ -101,7 +101,7 @@ def ranking_loss(model, inputs: RetrieverInputs, cfg: RetrieverConfig, **options
 
 @pytest.fixture(scope="module")
 def library(trained, distinct, frames) -> Gradients:
-    """The library's loss and gradients, on inputs that are all in memory."""
+    """The library's loss and gradients, computed with all inputs in memory."""
     model, cfg = trained
     features = []
     for column in batch_columns(distinct, NEGATIVES):
@@ -117,9 +117,9 @@ def library(trained, distinct, frames) -> Gradients:
 
 
 def own(trained, queries, frames, reuse_features=False, **options) -> Gradients:
-    """The loss of `train.contrastive`, with its LoRA kernels."""
+    """Return the loss and gradients of `train.contrastive`, with its LoRA kernels."""
     model, cfg = copy.deepcopy(trained)
-    fuse(model)
+    use_fast_layers(model)
     inputs = RetrieverInputs(model, frames, cfg, bf16=False, reuse_features=reuse_features)
     loss = ranking_loss(model, inputs, cfg, **options)
     return gradients(model, loss, batch_columns(queries, NEGATIVES))
@@ -144,10 +144,10 @@ def test_reused_vision_features_change_no_gradient(trained, distinct, frames, li
 
 
 @pytest.mark.parametrize("trained", ["whole", "multi-vector"], indirect=True)
-def test_the_loss_is_its_formula_without_identical_frames(
+def test_the_loss_equals_its_formula_with_identical_frames_masked(
     trained, queries, distinct, frames
 ) -> None:
-    """From embeddings as `embed` returns them. Some targets are other queries' documents."""
+    """The formula is applied to the embeddings of `embed`. Some targets are documents of others."""
     model, cfg = trained
     assert len(queries) > len(distinct)
     value, _ = own(trained, queries, frames)
@@ -180,7 +180,7 @@ def test_the_loss_is_its_formula_without_identical_frames(
 def test_bf16_changes_gradients_by_rounding_only(
     micro_store, retriever_cfg, saved_base, queries, frames, tmp_path
 ) -> None:
-    """As on GPUs: a base in bf16 and adapters in fp32, computed under autocast."""
+    """As on GPUs, the base is in bf16 and the adapters in fp32, under autocast."""
     over = {"architecture": None, "model": saved_base, "lora": LoraConfig(rank=4)}
     cfg = replace(retriever_cfg, **over)
     losses, flat = {}, {}

@@ -48,7 +48,7 @@ def settings(few_steps) -> SftCommand:
 def trained(settings, tmp_path_factory) -> Path:
     """The folder of a finished run with two checkpoints, as the command leaves it."""
     run = Run("trained", tmp_path_factory.mktemp("trained"))
-    open_run(run, asdict(settings), "train.sft", [])
+    open_run(run, asdict(settings), "train.sft")
     metrics = sft.main.__wrapped__(settings, run)
     (run.folder / "metrics.json").write_text(json.dumps(metrics))
     return run.folder
@@ -58,7 +58,7 @@ def trained(settings, tmp_path_factory) -> Path:
 def test_adapters_of_another_rank_are_refused(settings, trained, tmp_path) -> None:
     other = replace(settings, student=replace(settings.student, lora=LoraConfig(rank=8)))
     with raises_user_error("other-settings", contains="student.lora.rank was 4 and is now 8"):
-        open_run(Run("trained", trained), asdict(other), "train.sft", [])
+        open_run(Run("trained", trained), asdict(other), "train.sft")
     with raises_user_error("other-rank", contains="student.lora.rank"):
         loading.load_trained(other.student, "fp32", trained / "student")
     shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
@@ -68,7 +68,7 @@ def test_adapters_of_another_rank_are_refused(settings, trained, tmp_path) -> No
 
 @pytest.fixture(scope="module")
 def wider(saved_base: str, student_cfg, processor, tmp_path_factory) -> str:
-    """A base of another width than the one that students are trained over here."""
+    """A base with a larger hidden size than that of the trained student."""
     folder = tmp_path_factory.mktemp("wider")
     shutil.copytree(saved_base, folder, dirs_exist_ok=True)
     sizes = replace(student_cfg.architecture, hidden=128)
@@ -88,7 +88,7 @@ def test_adapters_of_another_base_are_refused(
     shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
     with raises_user_error("other-base", contains="checkpoint-1"):
         sft.main.__wrapped__(replace(settings, student=over), Run("run", tmp_path))
-    # The same base elsewhere is the same base.
+    # A base may be moved to another folder.
     shutil.copytree(saved_base, tmp_path / "moved")
     resolved.check_base(trained, replace(over, model=str(tmp_path / "moved")))
 
@@ -102,28 +102,28 @@ def test_an_incomplete_checkpoint_is_skipped(trained, tmp_path, caplog) -> None:
     names = {path.name for path in last.iterdir()} - {"README.md"}
     assert {"adapter_model.safetensors", "optimizer.pt", "scheduler.pt", "rng_state.pth"} < names
     for name in names:
-        whole = (last / name).read_bytes()
-        for left in (0, len(whole) // 2, len(whole) - 2):
-            (last / name).write_bytes(whole[:left])
+        content = (last / name).read_bytes()
+        for left in (0, len(content) // 2, len(content) - 2):
+            (last / name).write_bytes(content[:left])
             caplog.clear()
             assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-1"
-            assert f"({name} is incomplete): resuming from the one before" in caplog.text
-        (last / name).write_bytes(whole)
+            assert f"({name} is incomplete): trying the one before" in caplog.text
+        (last / name).write_bytes(content)
     for name in names - {"adapter_config.json", "training_args.bin"}:
-        whole = (last / name).read_bytes()
+        content = (last / name).read_bytes()
         (last / name).unlink()
         caplog.clear()
         assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-1"
-        assert "is missing): resuming" in caplog.text
-        (last / name).write_bytes(whole)
+        assert "is missing): trying" in caplog.text
+        (last / name).write_bytes(content)
     assert newest_checkpoint(tmp_path) == last
     shutil.rmtree(tmp_path / "checkpoint-1")
     (last / "optimizer.pt").unlink()
     assert newest_checkpoint(tmp_path) is None
-    assert "(its optimizer is missing): starting again" in caplog.text
+    assert "(its optimizer is missing): training starts again" in caplog.text
 
 
-def over(student: StudentConfig, folder: Path) -> StudentConfig:
+def with_model(student: StudentConfig, folder: Path) -> StudentConfig:
     return replace(student, model=str(folder))
 
 
@@ -138,7 +138,7 @@ def test_a_base_without_a_vision_tower_is_refused(nf4_cfg, processor, tmp_path) 
     Qwen3ForCausalLM(config).save_pretrained(tmp_path)
     processor.tokenizer.save_pretrained(tmp_path)
     with raises_user_error("unsupported-model", contains=f"student.model={tmp_path}"):
-        loading.load_student(over(nf4_cfg, tmp_path), "fp32", list)
+        loading.load_student(with_model(nf4_cfg, tmp_path), "fp32", list)
     with raises_user_error("unsupported-model", contains="retriever.model"):
         embedder.load_retriever(retriever_over(tmp_path), "fp32", [], tmp_path)
 
@@ -181,7 +181,7 @@ def test_a_processor_of_another_model_is_refused(
     shutil.copytree(saved_base, base)
     change(base)
     with raises_user_error(code, contains=named):
-        loading.load_student(over(nf4_cfg, base), "fp32", list)
+        loading.load_student(with_model(nf4_cfg, base), "fp32", list)
     with pytest.raises(UserError):
         embedder.load_retriever(retriever_over(base), "fp32", [], tmp_path)
 

@@ -1,4 +1,4 @@
-"""An exported student answers as the trained one, with whichever library it is loaded."""
+"""An exported student computes the outputs of the trained one, also with transformers alone."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ def settings(micro, micro_store, nf4_cfg) -> SftCommand:
 
 
 def finished_run(settings: SftCommand, root: Path) -> Path:
-    """A finished run of train.sft whose adapters weigh as much as their base."""
+    """Write a finished run of train.sft whose adapters change the outputs considerably."""
     folder = root / "sft" / "run"
-    open_run(Run("run", folder), asdict(settings), "train.sft", [])
+    open_run(Run("run", folder), asdict(settings), "train.sft")
     resolve_run(folder, "fp32", settings.student, data="0")
     torch.manual_seed(0)
     model, processor = loading.load_student(settings.student, settings.train.precision, list)
@@ -113,11 +113,11 @@ def test_a_merged_weight_is_the_dequantised_one_and_its_adapters_product(
 
 
 def test_the_measured_difference_is_recorded_and_small(exports) -> None:
-    for format, most in (("fp32", 1e-5), ("bf16", 0.05)):
+    for format, limit in (("fp32", 1e-5), ("bf16", 0.05)):
         measured, folder = exports[format]
         assert json.loads((folder / "export.json").read_text())["measured"] == measured
         for mode in ("reasoning", "answer"):
-            assert 0 < measured[f"{mode}_logit_difference"] < most
+            assert 0 < measured[f"{mode}_logit_difference"] < limit
             assert 0 <= measured[f"{mode}_letter_agreement"] <= 1
         weights = load_file(folder / "model.safetensors").values()
         assert {w.dtype for w in weights} == {loading.DTYPES[format]}
@@ -154,7 +154,7 @@ torch.save((batch["input_ids"], logits), outputs)
 def test_transformers_alone_computes_the_same_logits(
     settings, runs, exports, micro_store, frames, tmp_path
 ) -> None:
-    """As the trained student, the adapters over their 4-bit base."""
+    """They equal those of the trained student, the adapters over their 4-bit base."""
     item = micro_store.selection("test")[0]
     sample = selection_sample(item, "answer", "cot", frames, settings.student.frames)
     data = {"content": sample.content, "images": sample.images}
@@ -197,7 +197,9 @@ def test_every_format_evaluates_like_the_run(settings, runs, exports, tmp_path) 
     assert run_title(models["fp32"]) == "run fp32"
 
 
-def test_an_export_is_written_once_for_its_weights(settings, runs, exports, tmp_path) -> None:
+def test_an_export_is_kept_and_refused_for_other_adapters(
+    settings, runs, exports, tmp_path
+) -> None:
     shutil.copytree(runs, tmp_path / "runs")
     measured, folder = exports["fp32"]
     before = (folder / "model.safetensors").stat()
@@ -212,7 +214,7 @@ def test_an_export_is_written_once_for_its_weights(settings, runs, exports, tmp_
 
 @pytest.mark.slow
 def test_an_export_that_differs_too_much_is_deleted(settings, runs, tmp_path, monkeypatch) -> None:
-    """Here merging leaves out the adapters."""
+    """The export differs too much because merging is patched to leave out the adapters."""
     monkeypatch.setattr(loading, "merge_adapters", lambda base, *_: base.dequantize(torch.float32))
     with raises_user_error("merge-difference"):
         exported(settings, runs, "fp32", tmp_path)
@@ -220,7 +222,7 @@ def test_an_export_that_differs_too_much_is_deleted(settings, runs, tmp_path, mo
 
 
 def test_missing_rationales_are_not_narrated(settings, tmp_path, micro_store) -> None:
-    """The export compares logits on them, and must not send requests to a teacher."""
+    """An export must not send requests to a teacher."""
     shutil.copytree(micro_store.folder, tmp_path / "micro")
     (tmp_path / "micro" / "rationales.jsonl").unlink()
     with raises_user_error("missing-rationales", "verify=false"):
@@ -250,7 +252,7 @@ def test_the_card_describes_the_run(settings, runs, exports) -> None:
         "| benchmark | micro, 10 scenes by bullet, seed 0 |",
         "| teacher | template |",
         "| answer loss | 2.5 | 0.375 |",
-        # Servers load adapters over the base as it was released.
+        # The warning about servers, which load adapters over the released base.
         "unquantised base",
     ):
         assert row in card.text
@@ -279,7 +281,7 @@ def test_differences_are_relative_to_the_values_or_their_scale() -> None:
     assert math.isnan(compare(before, broken)["logit_difference"])
 
 
-def train_whole(config: Path) -> None:
+def set_rank_to_zero(config: Path) -> None:
     text = config.read_text()
     assert "rank: 4" in text
     config.write_text(text.replace("rank: 4", "rank: 0").replace("nf4", "none"))
@@ -290,7 +292,7 @@ def train_whole(config: Path) -> None:
     [
         (lambda run: (run / "metrics.json").unlink(), "unfinished-run"),
         (lambda run: shutil.rmtree(run), "missing-run"),
-        (lambda run: train_whole(run / "config.yaml"), "nothing-to-merge"),
+        (lambda run: set_rank_to_zero(run / "config.yaml"), "nothing-to-merge"),
         (lambda run: (run / "student" / "adapter_model.safetensors").unlink(), "missing-adapters"),
         (
             lambda run: (run / "resolved.yaml").write_text("{precision: fp32, base: x, data: x}"),

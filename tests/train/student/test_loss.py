@@ -57,7 +57,7 @@ def gradients(model: PreTrainedModel, loss: torch.Tensor) -> list[torch.Tensor]:
 
 
 def right_padded(encoded: list[Encoded], processor: ProcessorMixin) -> dict:
-    """The left-padded batch, each row rolled until its padding is on the right."""
+    """Return a batch that is padded on the right."""
     batch = pad(encoded, processor.tokenizer.pad_token_id)
     longest = batch["input_ids"].shape[1]
     for name in ("input_ids", "attention_mask", "mm_token_type_ids", "labels"):
@@ -71,7 +71,7 @@ def test_padding_changes_neither_loss_nor_gradients(samples, processor, model, a
     model.set_attn_implementation(ATTENTIONS[attention])
     torch.manual_seed(0)
     model = loading.add_adapters(model, LoraConfig(rank=2))
-    # Gradients reach all adapters only if none is zero.
+    # If B is zero, as it is at first, A gets no gradient.
     randomize_adapters(model, 0.1)
     model.eval()
     collate = Collator(processor, 1500)
@@ -125,7 +125,7 @@ def test_lengths_are_estimated_without_rendering(
     assert np.argsort(estimated).tolist() == np.argsort(real).tolist()
 
 
-def test_the_letters_logits_choose_the_answer(
+def test_the_letter_with_the_highest_logit_is_chosen(
     micro_store, frames, student_cfg, processor, model
 ) -> None:
     items: list[SelectionItem] = micro_store.selection("train")[:6]
@@ -172,7 +172,7 @@ def test_each_step_is_sorted_by_length(count) -> None:
     assert second != list(LengthSampler(lengths.tolist(), 16, seed=1)) or count <= 16
 
 
-def test_the_right_tokens_are_counted() -> None:
+def test_correct_tokens_are_counted() -> None:
     labels = torch.tensor([[5, 6, 7, 8], [IGNORED, IGNORED, 7, 8]])
     logits = torch.nn.functional.one_hot(torch.tensor([[6, 7, 0, 0], [3, 7, 8, 0]]), 10).float()
     accuracy = TokenAccuracy({"color": [6, 9], "shape": [8], "place": [9]})
@@ -180,5 +180,5 @@ def test_the_right_tokens_are_counted() -> None:
     # The logits of a position predict the next token; unsupervised tokens are not counted.
     assert counts[:, :2].tolist() == [[2, 3], [2, 2]]
     metrics = accuracy.measure(EvalPrediction(counts.numpy(), None), StudentDataset([]))
-    # There is no word of the last kind.
+    # No label is a word of the last kind.
     assert metrics == {"token_accuracy": 4 / 5, "color_accuracy": 1, "shape_accuracy": 1 / 2}

@@ -1,4 +1,4 @@
-"""The responses of each regime, which stay correct in every order of the candidates."""
+"""The responses of each regime, and that they stay correct if the candidates are permuted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def items_of(store: Store, regime: str) -> dict[str, list[SupervisedItem]]:
 
 
 @pytest.mark.parametrize("regime", COT)
-def test_a_regime_leaves_out_only_its_part(micro_store, regime) -> None:
+def test_a_regime_leaves_out_only_the_part_that_it_names(micro_store, regime) -> None:
     supervised = items_of(micro_store, regime)["reasoning"]
     assert supervised
     left_out = {"Candidate analysis"} if regime == "cot_no_candidate_analysis" else set()
@@ -57,8 +57,8 @@ def test_both_modes_are_trained_with_the_same_answer(micro_store, regime) -> Non
 
 
 def test_permuted_responses_are_correct(micro_store) -> None:
-    """For every item in the orders of several epochs, the validator accepts the rationale, the
-    match lines agree with the predicates, and the answer is the same frame."""
+    """For every item and several epochs, the validator accepts the permuted rationale, the match
+    lines agree with the predicates, and the answer is still the target frame."""
     by_mode = items_of(micro_store, "cot")
     orders = set()
     for s in by_mode["reasoning"] + by_mode["answer"]:
@@ -98,7 +98,9 @@ def test_an_order_depends_on_seed_epoch_and_item(micro_store, frames, student_cf
     assert first != orders(supervised[0], seed=1)
     assert first != second
     for seed in (0, None):
-        dataset = StudentDataset([s.lazy(frames, student_cfg.frames, seed) for s in supervised])
+        dataset = StudentDataset(
+            [s.lazy_sample(frames, student_cfg.frames, seed) for s in supervised]
+        )
         dataset.set_epoch(1)
         for k, s in enumerate(supervised):
             expected = s if seed is None else s.permuted(seed, 1)

@@ -1,4 +1,4 @@
-"""Cached features give the loss and gradients of the pixels."""
+"""With cached features of the vision tower, the loss and gradients equal those with pixels."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from train.student.trainer import TrainerCollator, token_mean
 from train.student.vision_cache import PAIRS, VisionCache, pair_digests
 
 PLENTY = 1 << 40
+"""A limit in bytes that no test reaches."""
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def student(nf4_cfg):
 
 @pytest.fixture
 def samples(micro_store, frames, student_cfg) -> list[Sample]:
-    """Two items with clips, one without its clip, and the first again."""
+    """Two samples with clips, one without a clip, and the first sample again."""
     items = micro_store.selection("train")[:3]
     samples = [
         selection_sample(i, "answer", "cot", frames, student_cfg.frames, f"Answer: {i.letter}")
@@ -66,9 +67,9 @@ def loss_and_gradients(
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.0])
 def test_loss_and_gradients_are_those_of_the_pixels(student, samples, share) -> None:
-    """Also if the cache has room for a share of the features only."""
+    """This also holds if the cache has room for only a share of the features."""
     model, processor = student
-    # Adapters start at zero, where many gradients vanish.
+    # If B is zero, as it is at first, many gradients vanish.
     randomize_adapters(model, 0.1)
     collator = TrainerCollator(Collator(processor, 1500), digests=True)
     whole = VisionCache(model, "fp32", PLENTY)
@@ -114,7 +115,7 @@ def test_digests_depend_on_the_pixels_only(micro_store, frames, student_cfg, pro
     assert digests([one]) == digests([one.copy()]) != digests([two])
     pairs = digests([], np.stack([one, two, two, one, three]))
     assert len(set(pairs)) == 3
-    # An odd last frame is repeated, as an image is.
+    # The last of an odd number of frames is paired with itself, as an image is.
     assert pairs[-1:] == digests([three])
 
 
@@ -126,7 +127,7 @@ def test_a_trained_tower_is_refused(model) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_run_with_the_cache_is_the_same(few_steps, tmp_path, workers) -> None:
-    """Over two epochs, evaluations included."""
+    """The runs take two epochs, with evaluations."""
     journals = []
     for reuse in (False, True):
         folder = tmp_path / str(reuse)

@@ -1,4 +1,4 @@
-"""Object tokens: the labels of visual tokens, and the loss on them."""
+"""Object tokens: the labels of visual tokens that show objects, and the loss on them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import torch
 from models.student.collator import Collator
 from train.tiny_base import questions
 from train.tiny_base.object_tokens import (
-    NONE,
-    WORDS,
+    MAX_WORDS,
+    NO_WORD,
     ObjectTokenCollator,
     first_token,
     object_token_loss,
@@ -39,9 +39,9 @@ def test_words_are_labels_of_the_tokens_at_their_objects(
         for label in sample.object_labels:
             x, y = (min(math.floor(share * side), side - 1) for share in label.place)
             words = [first_token(processor, word) for word in label.words]
-            filled = [*words, *[NONE] * (WORDS - len(words))]
+            filled = [*words, *[NO_WORD] * (MAX_WORDS - len(words))]
             expected.append([row, int(cells[label.picture, y, x]), *filled])
-            if len(words) == WORDS and sample.clip is None:
+            if len(words) == MAX_WORDS and sample.clip is None:
                 before = sample.content[2 * label.picture]["text"]
                 assert before == f"\nCandidate {label.words[-1]}: "
     assert batch["object_labels"].tolist() == expected
@@ -58,8 +58,8 @@ def test_visible_objects_are_described(micro_store) -> None:
 
 
 def test_loss_is_minimal_for_equal_probabilities() -> None:
-    """The minimum is the entropy of three equally likely words; padding does not count."""
-    object_labels = torch.tensor([[0, 1, 4, 5, 6, NONE]])
+    """The minimum is the entropy of three equally likely words. Padding does not count."""
+    object_labels = torch.tensor([[0, 1, 4, 5, 6, NO_WORD]])
     even = torch.full((1, 3, 10), -torch.inf)
     even[0, 1, [4, 5, 6]] = 0.0
     assert object_token_loss(even, object_labels).item() == pytest.approx(math.log(3))

@@ -1,4 +1,4 @@
-"""Questions of the tiny base: answers agree with the oracle and are unique."""
+"""Questions for the tiny base: their answers agree with the oracle and are unambiguous."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def visible(store: Store, scene_id: str, frame: int) -> dict[str, str]:
 
 @pytest.fixture
 def regions(micro_store, frames) -> dict[bytes, list[dict[str, str]]]:
-    """Visible objects and regions of frames, by their pixels. The frames of a scene at rest have
-    the same entry, except when an object slowly crosses the border of a region."""
+    """For each image, by its pixels, the visible objects and their regions in the frames that look
+    so. These differ if an object slowly crosses the border of a region."""
     every: dict[bytes, list[dict[str, str]]] = {}
     for scene_id in {item.scene_id for item in micro_store.selection()}:
         for frame in range(128):
@@ -45,7 +45,7 @@ def regions(micro_store, frames) -> dict[bytes, list[dict[str, str]]]:
 
 
 def described(text: str) -> dict[str, str]:
-    """Objects and regions in a description."""
+    """Return the objects that a description names, with their regions."""
     stated = re.findall(r"The (\w+ \w+ \w+) is (near the [\w-]+)\.", text)
     assert len(dict(stated)) == len(stated)
     return dict(stated)
@@ -106,7 +106,7 @@ def test_places_of_an_object_in_each_candidate(regions, kinds, kind, question, e
 
 
 def predicted_place(text: str, phrase: str) -> str | None:
-    """The place that the narrator predicts for an object."""
+    """Return the region that the narrator predicts for an object."""
     prediction = text[text.index("Prediction: ") : text.index("Outcome: ")]
     will = rf"{phrase} (?:will be|should be|remains|stays)(?: hidden)? (near the [\w-]+)"
     matches = re.search(will, prediction)
@@ -186,7 +186,7 @@ def test_answer_is_the_later_frame(kinds) -> None:
         assert len(sample.images) == 2
         letters.add(sample.response)
         wrong = sample.images[sample.response == "Answer: A"]
-        # The earlier one is the clip's last frame, and the two differ.
+        # The earlier frame is the last frame of the clip, and the frames differ.
         assert (wrong == sample.clip.pixels[-1]).all()
         assert not (sample.images[0] == sample.images[1]).all()
     assert letters == {"Answer: A", "Answer: B"}
