@@ -148,18 +148,6 @@ class Record:
     def to_row(self) -> dict[str, Any]:
         return asdict(self)
 
-    @classmethod
-    def from_row(cls, row: dict[str, Any]) -> Self:
-        """Return a row's record. Raises ValueError if a value is missing or has a wrong type."""
-        return _adapter(cls).validate_python(row)
-
-
-@cache
-def _adapter(record: type[Record]) -> TypeAdapter:
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(record)
-
 
 @dataclass(frozen=True)
 class SelectionItem(Record):
@@ -206,6 +194,10 @@ class SelectionItem(Record):
                 f"{self.answer}"
             )
 
+    @classmethod
+    def from_row(cls, row: dict[str, Any]) -> Self:
+        return cls(**row | {"candidates": tuple(Candidate(**c) for c in row["candidates"])})
+
     @property
     def letter(self) -> str:
         return LETTERS[self.answer]
@@ -240,6 +232,11 @@ class RetrievalQuery(Record):
     removed_object: str | None = None
     standard: bool = False
     """Whether the query belongs to the standard test, on which retrievers are evaluated."""
+
+    @classmethod
+    def from_row(cls, row: dict[str, Any]) -> Self:
+        negatives = tuple(FrameRef(**ref) for ref in row["hard_negatives"])
+        return cls(**row | {"target": FrameRef(**row["target"]), "hard_negatives": negatives})
 
     @property
     def name(self) -> str:
@@ -277,6 +274,19 @@ class Rationale(Record):
     """Whether the built-in narrator wrote the text because no response of the teacher passed."""
     claims: dict[str, list[int]] = field(default_factory=dict)
     """Counts of supported, contradicted and unknown claims about the scene, by kind of claim."""
+
+    @classmethod
+    def from_row(cls, row: dict[str, Any]) -> Self:
+        """Return a row's record. Raises ValueError if a value is missing or has a wrong type."""
+        return _rationale_adapter().validate_python(row)
+
+
+@cache
+def _rationale_adapter() -> TypeAdapter[Rationale]:
+    # Reading a benchmark does not need pydantic.
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(Rationale)
 
 
 def sample_prefix_frames(start: int, stop: int, count: int) -> list[int]:

@@ -19,25 +19,32 @@ PAGE = "report.html"
 @command("evaluation.report", ReportCommand)
 def main(cfg: ReportCommand, run: Run) -> None:
     from evaluation.reporting.item_browser import browse_items
-    from evaluation.reporting.measurements import check_builds, deduplicate, read_measurements
+    from evaluation.reporting.measurements import (
+        deduplicate,
+        distinguish_item_sets,
+        read_measurements,
+    )
     from evaluation.reporting.page import render_page
     from evaluation.reporting.runs import RETRIEVAL_KINDS, SELECTION_KINDS, gather_runs
     from evaluation.reporting.sections import build_sections
 
     root = Path(cfg.checkpoints)
-    runs = gather_runs(root, cfg.runs)
+    runs, left_out = gather_runs(root, Path(cfg.saved), cfg.runs)
+    for sentence in left_out:
+        log.warning("%s", sentence)
     selections = read_measurements(runs, root, SELECTION_KINDS)
+    selections = deduplicate(distinguish_item_sets(selections))
     retrievals = read_measurements(runs, root, RETRIEVAL_KINDS)
-    check_builds(selections + retrievals)
+    retrievals = deduplicate(distinguish_item_sets(retrievals))
     browser = browse_items(selections, Path(cfg.store), cfg.items, cfg.seed)
-    sections = build_sections(deduplicate(selections), deduplicate(retrievals), runs, browser)
+    sections = build_sections(selections, retrievals, runs, browser)
     tables = [table for section in sections for table in section.tables]
     text = "\n\n".join(str(table) for table in tables if not table.folded)
 
     # All files are rendered before the first is written: an error leaves the previous report as is.
     files = {
         "report.txt": text + "\n",
-        PAGE: render_page(sections, browser, [r.title for r in runs]),
+        PAGE: render_page(sections, browser, [r.title for r in runs], left_out),
     }
     for figure in (figure for section in sections for figure in section.figures):
         files[f"figures/{figure.name}.svg"] = figure.svg

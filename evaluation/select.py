@@ -37,7 +37,8 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
     from data.render.frame_cache import FrameReader
     from evaluation.generators import base, response_log
-    from evaluation.reporting import selection_report
+    from evaluation.metrics.selection import Choices, selection_report
+    from evaluation.reporting.selection_report import write_report
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = FrameReader(store, student.image_size)
@@ -63,16 +64,17 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             keys[mode, control] = responses.keys[mode]
 
     choices = [
-        selection_report.Choices.from_answers(model.name, *variant, responses)
+        Choices.from_answers(model.name, *variant, responses)
         for variant, responses in answers.items()
     ]
-    results = selection_report.write_report(
-        choices, items, store.name, cfg.seed, run.folder, cfg.suite, build=store.identity,
-        asked=[(*variant, key) for variant, key in keys.items()],
-    )  # fmt: skip
+    asked = [(*variant, key) for variant, key in keys.items()]
+    report = selection_report(
+        choices, items, store.name, store.identity, cfg.seed, cfg.suite, asked
+    )
+    write_report(report, run.folder, items[0].suite)
     return {
         f"{r.mode}_{name}": value
-        for r in results
+        for r in report.rows
         if r.control == cfg.control
         for name, value in (*r.metrics.items(), ("parse_rate", r.parse_rate))
     }

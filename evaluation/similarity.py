@@ -17,7 +17,8 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from data.records import FrameRef
     from evaluation.embedders.base import open_retriever
     from evaluation.metrics.results import SIMILARITY
-    from evaluation.reporting.selection_report import Choices, write_report
+    from evaluation.metrics.selection import Choices, selection_report
+    from evaluation.reporting.selection_report import write_report
     from evaluation.retrieval import nearest_candidate
     from evaluation.select import select_items
 
@@ -37,10 +38,9 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         choices.append(Choices(name, SIMILARITY, None, credits, letters))
 
     write_json_lines(run.folder / "scores.jsonl", score_rows)
-    results = write_report(
-        choices, items, store.name, cfg.seed, run.folder, cfg.suite, build=store.identity
-    )
-    return results[0].metrics
+    report = selection_report(choices, items, store.name, store.identity, cfg.seed, cfg.suite)
+    write_report(report, run.folder, items[0].suite)
+    return report.rows[0].metrics
 
 
 if __name__ == "__main__":

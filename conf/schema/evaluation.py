@@ -107,7 +107,9 @@ class SimilarityCommand(ItemsCommand, EmbeddingCommand):
 class ReportCommand(CommandConfig):
     runs: list[str] | None = None
     """Run folders below `checkpoints`, or glob patterns of them, such as [select/cot,retrieve/*];
-    null reports every finished run."""
+    null reports every finished run, and the results in `saved`."""
+    saved: str = "runs"
+    """Folder of the results that `dynapix.Result.save` wrote."""
     items: int = setting(120, least=0)
     """Maximum number of items shown per benchmark, sampled evenly from the subtypes and from
     correct and wrong answers."""
@@ -185,6 +187,8 @@ class StudyCommand(CommandConfig):
 class ExportStudyCommand(CommandConfig):
     run: str = "default"
     """Run of evaluation.study to export: its name or its folder."""
+    seed: int = setting(0, least=0)
+    """Seed of the bootstrap over scenes."""
 
     def find_problems(self, group: str) -> list[str]:
         return check_run(self.run, f"{self.checkpoints}/study")

@@ -1,81 +1,17 @@
-"""Statistics of a benchmark's scenes and selection items, and the accuracy of baselines.
-
-Baselines answer selection items from the oracle by simple rules, without simulating the scene. A
-high accuracy of a baseline shows that items can be answered by a shortcut.
-"""
+"""Statistics of a benchmark's scenes and selection items, and the accuracy of baselines."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from data.records import FAMILIES, LETTERS, SPLITS, Candidate, SelectionItem
+from data.records import FAMILIES, LETTERS, SPLITS, SelectionItem
 from data.store import Store
-from data.world.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
-from data.world.standins import standin_view
-
-Cost = Callable[[SelectionItem, Candidate, Store], float]
-"""Cost of choosing a candidate of an item."""
-
-
-def displacement_from_prefix(item: SelectionItem, candidate: Candidate, store: Store) -> float:
-    """Displacement between the last frame of the prefix and the candidate."""
-    scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
-    return cross_scene_displacement(scene, item.prefix_stop, other, candidate.frame)
-
-
-def displacement_from_others(item: SelectionItem, candidate: Candidate, store: Store) -> float:
-    """Sum of the displacements between the candidate and the other candidates."""
-    scene = store.scene(candidate.scene_id)
-    return sum(
-        cross_scene_displacement(scene, candidate.frame, store.scene(c.scene_id), c.frame)
-        for c in item.candidates
-    )
-
-
-def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: Store) -> float:
-    """Mean distance of the objects from their positions at constant velocity, px at 336 x 336.
-
-    Positions are extrapolated from the last frame of the prefix to the target's moment, which
-    questions of the event and window families do not state. An object that the candidate's scene
-    lacks has the image's diagonal as its distance, which is also the maximum.
-    """
-    scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
-    seconds = (item.target_frame - item.prefix_stop) / scene.fps
-    positions = scene.positions[item.prefix_stop] + seconds * scene.velocities[item.prefix_stop]
-    expected, _ = standin_view(store.manifest["config"].get("standin")).camera.project(positions)
-    actual = {o: other.image_positions[candidate.frame, k] for k, o in enumerate(other.objects)}
-    scale = MODEL_SIZE / np.array(scene.image_size)
-    distances = [
-        np.linalg.norm((expected[k] - actual[o]) * scale) if o in actual else DIAGONAL
-        for k, o in enumerate(scene.objects)
-    ]
-    return float(np.minimum(distances, DIAGONAL).mean())
-
-
-BASELINES: dict[str, Cost] = {
-    "nearest": displacement_from_prefix,
-    "farthest": lambda *arguments: -displacement_from_prefix(*arguments),
-    "first": lambda item, candidate, store: item.candidates.index(candidate),
-    "odd": lambda *arguments: -displacement_from_others(*arguments),
-    "typical": displacement_from_others,
-    "velocity": constant_velocity_error,
-}
-"""Cost function of each baseline; a baseline chooses the candidate with the lowest cost."""
-
-
-def score_baselines(item: SelectionItem, store: Store) -> dict[str, float]:
-    """Return each baseline's score on an item: 1/m if the target is among the m candidates with the
-    lowest cost, otherwise 0."""
-    scores = {}
-    for name, cost in BASELINES.items():
-        costs = np.array([cost(item, candidate, store) for candidate in item.candidates])
-        best = np.flatnonzero(costs == costs.min())
-        scores[name] = float(item.answer in best) / len(best)
-    return scores
+from data.tracks.baselines import BASELINES, score_baselines
+from data.world.displacement import cross_scene_displacement
 
 
 def compute_statistics(store: Store) -> dict[str, Any]:

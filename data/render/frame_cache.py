@@ -22,7 +22,6 @@ import pyarrow as pa
 from PIL import Image
 
 from data.records import Scene
-from data.releases.readers import READERS
 from data.render import get_renderer
 from data.store import FRAMES_FOLDER, Store, write_atomically
 from data.world.standins import standin_view
@@ -104,6 +103,8 @@ def render_frames(
         (height, width, 3) uint8 arrays.
     """
     if scene.footage is not None:
+        from data.releases.readers import READERS
+
         reader = READERS[config["simulator"]]
         images = reader.load_images(scene, Path(config["folder"]), frames)
     else:

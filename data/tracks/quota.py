@@ -7,13 +7,15 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import count, islice
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from conf.schema import Quota
 from data.records import SPLITS, Scene, SelectionItem
 from data.tracks.selection.distractors import DistractorPicker, Family
+
+if TYPE_CHECKING:
+    from conf.schema import Quota
 
 Element = TypeVar("Element")
 

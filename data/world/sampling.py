@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from conf.schema import BenchmarkConfig
 from data.records import COLORS, FPS, MATERIALS, SHAPES, Scene, SceneObject
 from data.world.camera import STANDARD_VIEW, Camera
 from data.world.physics import STANDARD_PHYSICS, Body, Motion, Physics, shared_simulator
 from data.world.shapes import BOUNDING_RADIUS, RADIUS
 from data.world.visibility import compute_visibility
+
+if TYPE_CHECKING:
+    from conf.schema import BenchmarkConfig
 
 AT_REST = 0.35
 """Probability that an object added for a collision starts at rest."""

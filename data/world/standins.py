@@ -13,15 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from conf.schema import BenchmarkConfig
 from data.records import Scene, SceneObject
 from data.world.camera import STANDARD_VIEW, Camera, View
 from data.world.physics import GENERATOR_VERSION, Body, Physics, shared_simulator
 from data.world.sampling import is_on_screen, record_scene, sample_objects, unit_vector
 from data.world.shapes import RADIUS
+
+if TYPE_CHECKING:
+    from conf.schema import BenchmarkConfig
 
 STANDINS_VERSION = "2"
 """Increment it whenever the scenes or the appearance of a stand-in change."""

@@ -18,15 +18,6 @@ class Interval:
     n: int
 
 
-def mean_with_wilson(values: np.ndarray) -> Interval:
-    """Return the mean of values from 0 to 1, such as credits, with its Wilson interval."""
-    # statsmodels takes longer to import than everything else that --help needs.
-    from statsmodels.stats.proportion import proportion_confint
-
-    low, high = proportion_confint(values.sum(), len(values), method="wilson")
-    return Interval(float(values.mean()), float(low), float(high), len(values))
-
-
 class SceneBootstrap:
     """95% percentile bootstrap intervals, in which scenes are resampled with all of their items.
 
@@ -44,47 +35,60 @@ class SceneBootstrap:
         scene_counts = np.bincount(cells.ravel(), minlength=sampled.size).reshape(sampled.shape)
         self._counts = scene_counts.astype(np.int32)[:, codes]
 
-    def mean(self, values: np.ndarray) -> np.ndarray:
-        """Return the interval of the mean of `values` (items,), as an array [low, high]."""
-        return _percentiles(self._counts @ values / self._counts.sum(1))
+    def mean(self, values: Sequence[float]) -> Interval:
+        """Return the mean of the values (items,)."""
+        values = np.asarray(values, float)
+        return _interval(values.mean(), self._counts @ values / self._counts.sum(1), len(values))
 
-    def median(self, values: np.ndarray) -> np.ndarray:
-        """Return the interval [low, high] of the median of `values` (items,)."""
+    def median(self, values: Sequence[float]) -> Interval:
+        """Return the median of the values (items,)."""
+        values = np.asarray(values, float)
         order = np.argsort(values, kind="stable")
         cumulative = np.cumsum(self._counts[:, order], axis=1, dtype=np.int32)
         total = cumulative[:, -1:]
         # The median of an even number of items is the mean of the middle two.
         middle = [(cumulative > index).argmax(1) for index in ((total - 1) // 2, total // 2)]
-        return _percentiles(np.asarray(values, float)[order][middle].mean(0))
+        return _interval(np.median(values), values[order][middle].mean(0), len(values))
 
-    def macro(self, values: np.ndarray, groups: Sequence[str]) -> np.ndarray:
-        """Return the interval [low, high] of the unweighted mean of the groups' means of `values`.
+    def group_means(self, values: Sequence[float], groups: Sequence[str]) -> dict[str, Interval]:
+        """Return the mean of the values of each group, sorted by group.
+
+        Scenes are resampled as for all items. A resample without an item of a group does not count
+        for the interval of that group.
+
+        Args:
+            values: (items,), such as the credit for each item.
+            groups: The name of each item's group, such as its family.
+        """
+        values, groups = np.asarray(values, float), np.asarray(groups, str)
+        names, resampled = self._resample_groups(values, groups)
+        members = [values[groups == name] for name in names]
+        return {
+            str(name): _interval(own.mean(), resampled[:, k], len(own))
+            for k, (name, own) in enumerate(zip(names, members, strict=True))
+        }
+
+    def macro(self, values: Sequence[float], groups: Sequence[str]) -> Interval:
+        """Return the unweighted mean of the groups' means of the values (items,).
 
         If a resample has no item of a group, its mean is over the other groups.
         """
-        _, codes = np.unique(np.asarray(groups), return_inverse=True)
-        member = np.eye(codes.max() + 1)[codes]
+        values, groups = np.asarray(values, float), np.asarray(groups, str)
+        names, resampled = self._resample_groups(values, groups)
+        mean = np.mean([values[groups == name].mean() for name in names])
+        return _interval(mean, np.nanmean(resampled, axis=1), len(values))
+
+    def _resample_groups(
+        self, values: np.ndarray, groups: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the groups' names, and their means in each resample (resamples, groups): NaN for
+        a group without items."""
+        names, codes = np.unique(groups, return_inverse=True)
+        member = np.eye(len(names))[codes]
         sums, counts = self._counts @ (member * values[:, None]), self._counts @ member
-        means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
-        return _percentiles(np.nanmean(means, axis=1))
+        return names, np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
 
 
-def macro_by_scene(
-    values: Sequence[float], groups: Sequence[str], scenes: Sequence[str], seed: int
-) -> Interval:
-    """Return the unweighted mean of the groups' means, with its interval from `SceneBootstrap`.
-
-    Args:
-        values: A number for each item. Credits (see `accuracy_by_group`) give a macro accuracy;
-            differences of credits give the difference between two macro accuracies.
-        groups: The name of each item's group, such as its family.
-        scenes: The name of each item's scene.
-    """
-    values, groups = np.asarray(values, float), np.asarray(groups)
-    low, high = SceneBootstrap(scenes, seed).macro(values, groups)
-    mean = np.mean([values[groups == g].mean() for g in np.unique(groups)])
-    return Interval(float(mean), float(low), float(high), len(values))
-
-
-def _percentiles(results: np.ndarray) -> np.ndarray:
-    return np.percentile(results, [2.5, 97.5])
+def _interval(value: float, resampled: np.ndarray, n: int) -> Interval:
+    low, high = np.nanpercentile(resampled, [2.5, 97.5])
+    return Interval(float(value), float(low), float(high), n)

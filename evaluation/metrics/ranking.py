@@ -7,10 +7,11 @@ measure is its mean over all orders of these frames, so that constant scores giv
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.special import digamma
+
+from conf.errors import UserError
 
 
 def target_scores(scores: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -74,10 +75,56 @@ def query_metrics(
     """
     greater, tied, valid = np.asarray(greater), np.asarray(tied), np.asarray(valid, bool)
     # The sum of 1/rank over the tied ranks is a difference of harmonic numbers.
-    harmonic = digamma(greater + tied + 2) - digamma(greater + 1)
+    harmonic = np.concatenate([[0.0], np.cumsum(1 / np.arange(1, frames + 1))])
+    reciprocals = harmonic[greater + np.where(valid, tied, 0) + 1] - harmonic[greater]
     return {
         **{f"recall@{k}": expected_hits(greater, tied, valid, k) for k in ks},
-        "mrr": np.where(valid, harmonic / (tied + 1), 0.0),
+        "mrr": np.where(valid, reciprocals / np.where(valid, tied + 1, 1), 0.0),
         "median_rank": np.where(valid, greater + 1 + tied / 2, frames),
         "tie_rate": (valid & (tied > 0)).astype(float),
     }
+
+
+def rank_metrics(
+    scores: np.ndarray, gold: Sequence[int], ks: Sequence[int] = (1, 10, 50)
+) -> dict[str, float]:
+    """Return recall, mean reciprocal rank, median rank and rate of ties of a matrix of scores.
+
+    Scores are compared in fp32. Frames that tie with the target count by their mean over all orders
+    of the tied frames.
+
+    Args:
+        scores: (queries, frames); a higher score ranks first.
+        gold: (queries,) the column of each query's target. A query whose column is negative, or
+            whose target's score is NaN, is a miss: it has recall 0, reciprocal rank 0 and the last
+            rank, and counts in every mean.
+        ks: Cut-offs of the recalls.
+
+    Returns:
+        `recall@k` for each k, `mrr`, `median_rank` (1 is best) and `tie_rate`.
+
+    Raises:
+        UserError: The arguments have other shapes or values.
+    """
+    scores, columns = np.asarray(scores, np.float32), np.asarray(gold)
+    if scores.ndim != 2 or not scores.size or columns.shape != scores.shape[:1]:
+        raise UserError(
+            f"scores have the shape {scores.shape} and gold has {columns.shape}: give scores "
+            "(queries, frames) and one column per query",
+            code="invalid-scores",
+        )
+    if not np.issubdtype(columns.dtype, np.integer) or columns.max() >= scores.shape[1]:
+        raise UserError(
+            f"gold must be whole numbers below {scores.shape[1]}, the columns of scores",
+            code="invalid-scores",
+        )
+    if not ks or min(ks) < 1:
+        raise UserError(f"ks={list(ks)}: give cut-offs of 1 or more", code="invalid-scores")
+    targets = np.where(columns >= 0, target_scores(scores, np.maximum(columns, 0)), np.nan)
+    above, equal = count_above_and_equal(scores, targets)
+    measures = query_metrics(above, equal - 1, ~np.isnan(targets), scores.shape[1], ks)
+    return {name: float(_average(name)(values)) for name, values in measures.items()}
+
+
+def _average(measure: str) -> Callable[[np.ndarray], float]:
+    return np.median if measure == "median_rank" else np.mean

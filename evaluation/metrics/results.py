@@ -10,7 +10,7 @@ import numpy as np
 
 from data.records import FAMILIES, RetrievalQuery
 from evaluation.metrics.calibration import Calibration, PositionBias
-from evaluation.metrics.intervals import Interval, SceneBootstrap, mean_with_wilson
+from evaluation.metrics.intervals import Interval, SceneBootstrap
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.significance import PairedComparison
 
@@ -24,6 +24,8 @@ COMPARED = (*(f"recall@{k}" for k in RECALLS), "mrr")
 MEASURES = (*COMPARED, "median_rank", "tie_rate")
 UNTRAINED = "untrained"
 """First word of the names of Qwen3-VL retrievers that this project has not trained."""
+BASELINE = "baseline"
+"""Mode of the results of baselines, which choose by simple rules from the oracle."""
 SIMILARITY = "similarity"
 """Mode of the results of `evaluation.similarity`: a retriever chooses the nearest candidate."""
 
@@ -36,28 +38,24 @@ class Accuracy:
     `micro`, the accuracy over all items."""
 
     families: dict[str, Interval]
-    macro: float
+    macro: Interval
     micro: Interval
 
 
-def accuracy_by_group(groups: Sequence[str], credits: Sequence[float]) -> dict[str, Interval]:
-    """Return the accuracy of each group of items with its Wilson interval, sorted by group.
+def accuracy_by_family(
+    families: Sequence[str], credits: Sequence[float], scenes: SceneBootstrap
+) -> Accuracy:
+    """Return the accuracy by family, in the order of `FAMILIES`, and over all items.
 
     Args:
-        groups: The name of each item's group, such as its family, subtype or horizon.
+        families: The family of each item.
         credits: The credit for each item: 1 for a correct choice, 0 for a wrong choice, and 1/m if
             a retriever gives the highest score to the target and to m - 1 other candidates.
+        scenes: The bootstrap over the items' scenes.
     """
-    groups, credits = np.asarray(groups, str), np.asarray(credits, float)
-    return {str(g): mean_with_wilson(credits[groups == g]) for g in np.unique(groups)}
-
-
-def accuracy_by_family(families: Sequence[str], credits: Sequence[float]) -> Accuracy:
-    """Return the accuracy by family, in the order of `FAMILIES`, and over all items."""
-    by_family = accuracy_by_group(families, credits)
+    by_family = scenes.group_means(credits, families)
     ordered = {f: by_family[f] for f in FAMILIES if f in by_family}
-    macro = float(np.mean([i.value for i in ordered.values()]))
-    return Accuracy(ordered, macro, mean_with_wilson(np.asarray(credits, float)))
+    return Accuracy(ordered, scenes.macro(credits, families), scenes.mean(credits))
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,6 @@ class SelectionResult:
         families, macro, micro: As in `Accuracy`.
         parse_rate: Fraction of the responses in which a letter was found; None for a retriever.
         n: Number of items.
-        macro_interval: `macro` with its 95% interval, bootstrapped over scenes.
         horizons: Accuracy by horizon (time from the prefix to the target), shortest first. Examples
             of keys are "8 frames" (window family) and "1 s" (time family).
         suite: The set of items, such as "matched_anchor"; None for the standard items.
@@ -82,11 +79,10 @@ class SelectionResult:
     name: str
     mode: str
     families: dict[str, Interval]
-    macro: float
+    macro: Interval
     micro: Interval
     parse_rate: float | None
     n: int
-    macro_interval: Interval
     horizons: dict[str, Interval]
     suite: str | None
     control: str | None
@@ -97,14 +93,14 @@ class SelectionResult:
 
     @property
     def key(self) -> str:
-        """Key of the details in `SelectionReport`: `name` for a retriever, otherwise `variant`."""
-        return self.name if self.mode == SIMILARITY else self.variant
+        """Key of the details in `SelectionReport`: `variant`, or `name` if no mode was chosen."""
+        return self.name if self.mode in (BASELINE, SIMILARITY) else self.variant
 
     @property
     def metrics(self) -> dict[str, float]:
         """The accuracies by family, macro and micro."""
         families = {family: interval.value for family, interval in self.families.items()}
-        return {**families, "macro": self.macro, "micro": self.micro.value}
+        return {**families, "macro": self.macro.value, "micro": self.micro.value}
 
 
 def variant_name(mode: str, control: str | None) -> str:
@@ -248,7 +244,4 @@ def _query_metrics(ranks: Ranks, k: int, indices: list[int] | slice) -> dict[str
 
 
 def _summarize(name: str, values: np.ndarray, scenes: SceneBootstrap) -> Interval:
-    median = name == "median_rank"
-    low, high = scenes.median(values) if median else scenes.mean(values)
-    value = np.median(values) if median else np.mean(values)
-    return Interval(float(value), float(low), float(high), len(values))
+    return scenes.median(values) if name == "median_rank" else scenes.mean(values)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,16 @@ import numpy as np
 from conf.errors import UserError
 from data.records import FAMILIES, SelectionItem
 from data.tracks.controls import pair_items
-from evaluation.metrics.intervals import macro_by_scene
+from evaluation.metrics.intervals import SceneBootstrap
 
 MAX_NAMED_ITEMS = 3
 """Most items of each run that the error about different items names."""
+EXACT_SCENES = 12
+"""Largest number of scenes for which a sign-flip test enumerates all outcomes."""
+FLIPS = 10_000
+"""Random outcomes of a sign-flip test with more than `EXACT_SCENES` scenes."""
+TINY = 1e-9
+"""Differences of sums up to this size are rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +35,9 @@ class PairedComparison:
         low, high: 95% interval of the difference, bootstrapped over scenes.
         only_left, only_right: Numbers of items for which only this run is correct. An item with
             tied candidates counts for the run with more credit. None for "macro".
-        p: p-value of McNemar's exact test of these two numbers. None for "macro".
+        p: p-value of the sign-flip test over scenes (see `sign_flip_test`).
+        mcnemar: p-value of McNemar's exact test of `only_left` and `only_right`, which treats the
+            items of a scene as independent. None for "macro".
         mode: Mode of both runs; empty if their names contain it.
     """
 
@@ -41,9 +50,10 @@ class PairedComparison:
     low: float
     high: float
     n: int
+    p: float
     only_left: int | None = None
     only_right: int | None = None
-    p: float | None = None
+    mcnemar: float | None = None
     mode: str = ""
 
 
@@ -59,7 +69,7 @@ def compare_runs(
     Args:
         left, right: The credit for each item (1 for a correct choice) by item id.
         names: The names of the left and of the right run.
-        seed: Seed of the bootstrap over scenes.
+        seed: Seed of the resampling of scenes.
 
     Raises:
         UserError: The runs answered different items.
@@ -110,6 +120,53 @@ def check_same_items(
         )
 
 
+def sign_flip_test(
+    differences: np.ndarray, groups: np.ndarray, scenes: np.ndarray, seed: int
+) -> float:
+    """Return the two-sided p-value of a mean difference under random flips of the scenes' signs.
+
+    If two runs are equally good, exchanging them for all items of a scene gives an equally likely
+    outcome. The p-value is the share of outcomes whose mean is at least as far from 0 as the
+    observed one. Up to `EXACT_SCENES` scenes, all outcomes are enumerated; for more scenes, `FLIPS`
+    random ones and the observed one are used.
+
+    Args:
+        differences: (items,) left credit minus right credit.
+        groups: (items,) the family of each item; the mean is the unweighted mean of their means.
+        scenes: (items,) the scene of each item.
+    """
+    _, group_of, sizes = np.unique(groups, return_inverse=True, return_counts=True)
+    _, scene_of = np.unique(scenes, return_inverse=True)
+    parts = np.bincount(scene_of, differences / sizes[group_of]) / len(sizes)
+    parts = parts[np.abs(parts) > TINY]
+    if len(parts) <= EXACT_SCENES:
+        outcomes = np.zeros(1)
+        for part in parts:
+            outcomes = np.concatenate([outcomes + part, outcomes - part])
+    else:
+        rng = np.random.default_rng(seed)
+        signs = rng.choice(np.array([-1, 1], np.int8), (FLIPS, len(parts)))
+        outcomes = np.concatenate([signs @ parts, [parts.sum()]])
+    return float(np.mean(np.abs(outcomes) >= abs(parts.sum()) - TINY))
+
+
+def mcnemar_test(only_left: int, only_right: int) -> float:
+    """Return the p-value of McNemar's exact test: the two-sided binomial test of two counts."""
+    n, smaller = only_left + only_right, min(only_left, only_right)
+    tail = sum(comb(n, k) for k in range(smaller + 1))
+    return min(1.0, 2 * tail / 2**n)
+
+
+def adjust_holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values adjusted for the number of tests by Holm's step-down method."""
+    values = np.asarray(p_values, float)
+    order = np.argsort(values, kind="stable")
+    factors = len(values) - np.arange(len(values))
+    adjusted = np.empty_like(values)
+    adjusted[order] = np.minimum(np.maximum.accumulate(factors * values[order]), 1)
+    return adjusted.tolist()
+
+
 def _compare(
     names: tuple[str, str],
     of: str,
@@ -120,17 +177,12 @@ def _compare(
 ) -> PairedComparison:
     differences = credits[:, 0] - credits[:, 1]
     means = np.mean([credits[families == f].mean(axis=0) for f in np.unique(families)], axis=0)
-    mean = macro_by_scene(differences, families, scenes, seed)
-    counts = () if of == "macro" else _mcnemar(differences)
+    mean = SceneBootstrap(scenes, seed).macro(differences, families)
+    p = sign_flip_test(differences, families, scenes, seed)
+    counts: tuple = ()
+    if of != "macro":
+        better = int((differences > 0).sum()), int((differences < 0).sum())
+        counts = (*better, mcnemar_test(*better))
     return PairedComparison(
-        *names, of, *map(float, means), mean.value, mean.low, mean.high, len(credits), *counts
+        *names, of, *map(float, means), mean.value, mean.low, mean.high, len(credits), p, *counts
     )
-
-
-def _mcnemar(differences: np.ndarray) -> tuple[int, int, float]:
-    """Return the numbers of positive and of negative differences, and the p-value of their test."""
-    # statsmodels takes longer to import than everything else that --help needs.
-    from statsmodels.stats.contingency_tables import mcnemar
-
-    positive, negative = int((differences > 0).sum()), int((differences < 0).sum())
-    return positive, negative, float(mcnemar([[0, positive], [negative, 0]], exact=True).pvalue)

@@ -18,9 +18,11 @@ from data.render.frame_cache import FrameReader
 from data.store import Store, open_store
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.quota import interleave
-from evaluation.metrics.significance import PairedComparison, check_same_items
-from evaluation.reporting.measurements import Measurement, compare_models, deduplicate
-from evaluation.reporting.run_responses import ItemResponse, Responses, read_responses
+from evaluation.metrics.baselines import baseline_results
+from evaluation.metrics.results import SelectionResult
+from evaluation.metrics.significance import PairedComparison
+from evaluation.reporting.measurements import Measurement, compare_models
+from evaluation.reporting.run_responses import ItemResponse, Responses
 
 PREFIX_FRAMES = 6
 """Number of frames of the prefix that are shown, evenly spread."""
@@ -37,39 +39,47 @@ class ItemBrowser:
         entries: The shown items, in the form that page.js reads.
         frames: Data URLs of the items' frames, by name.
         notes: Sentences that say which items and frames are shown and which are missing.
-        comparisons: Paired comparisons of models by benchmark.
+        comparisons: Paired comparisons of models, by `Measurement.group`.
+        baselines: Results of the baselines on the same items, by `Measurement.group`.
     """
 
     entries: list[dict[str, Any]] = field(default_factory=list)
     frames: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     comparisons: dict[str, list[PairedComparison]] = field(default_factory=dict)
+    baselines: dict[str, list[SelectionResult]] = field(default_factory=dict)
 
-    def add_benchmark(
+    def add_group(
         self,
+        name: str,
         store: Store,
-        models: Mapping[str, tuple[Measurement, Responses]],
+        models: Mapping[str, Measurement],
         limit: int,
         seed: int,
     ) -> None:
-        """Compare the models that were measured on a benchmark, and add at most `limit` items.
+        """Compare the models of a group with each other, measure the baselines on the same items,
+        and add at most `limit` of these.
 
         Args:
-            models: The models with their responses, by label.
+            name: The group's name (`Measurement.group`).
+            models: The models' results, by label.
         """
         suites = (None, MATCHED_ANCHOR)
         items = {i.item_id: i for suite in suites for i in store.selection("test", suite)}
-        by_label = {label: responses for label, (_, responses) in models.items()}
+        by_label = {label: m.responses for label, m in models.items()}
         # The comparisons with controls are in the reports of the runs that measured them.
-        unchanged = {label: model for label, model in models.items() if not model[0].variants}
-        self.comparisons[store.name] = compare_models(unchanged, items, seed)
+        unchanged = {label: m for label, m in models.items() if not m.variants}
+        self.comparisons[name] = compare_models(unchanged, items, seed)
         answered = [i for k, i in items.items() if any(k in r for r in by_label.values())]
+        standard = [item for item in answered if item.suite == store.suite]
+        if standard:
+            self.baselines[name] = baseline_results(standard, store, seed)
         shown = choose_items(answered, by_label, limit, seed)
-        self.entries += page_entries(shown, by_label, store)
+        self.entries += page_entries(shown, by_label, store, name)
         frames, errors = encode_frames(shown, store)
         self.frames |= frames
         self.notes.append(
-            f"{store.name}: {len(shown):,} of {len(answered):,} answered items, spread over "
+            f"{name}: {len(shown):,} of {len(answered):,} answered items, spread over "
             "subtypes and over correct and wrong answers. Set items=N to show another number."
         )
         if errors:
@@ -80,42 +90,25 @@ class ItemBrowser:
 def browse_items(
     selections: Sequence[Measurement], stores: Path, limit: int, seed: int
 ) -> ItemBrowser:
-    """Return at most `limit` items of each measured benchmark in `stores`, with the responses.
-
-    Raises:
-        UserError: Two runs measured different items of the same item set.
-    """
-    runs = {m.run.folder: m.run for m in selections}
-    by_run = {folder: read_responses(run) for folder, run in runs.items()}
-
-    def responses_of(m: Measurement) -> Responses:
-        return by_run[m.run.folder].get(m.result.key, {})
-
-    first: dict[str, Measurement] = {}
-    for m in selections:
-        other = first.setdefault(m.item_set, m)
-        names = (str(other.run.folder), str(m.run.folder))
-        check_same_items(responses_of(other), responses_of(m), names)
-    browser, kept = ItemBrowser(), deduplicate(selections)
-    for name in dict.fromkeys(m.benchmark for m in kept):
-        models = {
-            ", ".join([m.label, *m.variants]): (m, responses_of(m))
-            for m in kept
-            if m.benchmark == name
-        }
+    """Return at most `limit` items of each group of results whose benchmark is in `stores`."""
+    browser = ItemBrowser()
+    for group in dict.fromkeys(m.group for m in selections):
+        of_group = [m for m in selections if m.group == group]
+        name, build = of_group[0].benchmark, of_group[0].run.report.build
         try:
             store = open_store(stores / name)
         except UserError as error:
             problem = str(error).replace("benchmark=NAME", f"benchmark={name}")
-            browser.notes.append(f"The items of {name} cannot be shown: {problem}.")
+            browser.notes.append(f"The items of {group} cannot be shown: {problem}.")
             continue
-        if any(m.run.report.build != store.identity for m, _ in models.values()):
+        if build != store.identity:
             # Items of two builds can differ although they have the same ids.
             browser.notes.append(
-                f"The items of {name} cannot be shown: {store.folder} was rebuilt since the runs."
+                f"The items of {group} cannot be shown: {store.folder} has another build."
             )
             continue
-        browser.add_benchmark(store, models, limit, seed)
+        models = {", ".join([m.label, *m.variants]): m for m in of_group}
+        browser.add_group(group, store, models, limit, seed)
     return browser
 
 
@@ -141,13 +134,13 @@ def choose_items(
 
 
 def page_entries(
-    items: Sequence[SelectionItem], responses: Mapping[str, Responses], store: Store
+    items: Sequence[SelectionItem], responses: Mapping[str, Responses], store: Store, group: str
 ) -> Iterator[dict[str, Any]]:
     """Yield the data of each item for the page, with frames by the names in `encode_frames`."""
     for item in items:
         yield {
             "id": item.item_id,
-            "benchmark": store.name,
+            "benchmark": group,
             "family": item.family,
             "subtype": item.subtype,
             "question": item.question,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +10,6 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
-from conf.errors import UserError
 from data.records import SelectionItem
 from evaluation.metrics.results import UNTRAINED, RetrievalResult, SelectionResult
 from evaluation.metrics.significance import PairedComparison, compare_runs
@@ -42,10 +42,18 @@ class Measurement:
     run: FinishedRun
     name: str
     training: dict[str, Any] | None
+    distinction: str = ""
 
     @property
     def benchmark(self) -> str:
         return self.result.benchmark
+
+    @property
+    def responses(self) -> Responses:
+        """The model's responses by item id; empty for a retrieval result."""
+        if isinstance(self.result, RetrievalResult):
+            return {}
+        return self.run.responses.get(self.result.key, {})
 
     @property
     def variants(self) -> list[str]:
@@ -55,9 +63,14 @@ class Measurement:
         return [x for x in (self.result.suite, self.result.control) if x is not None]
 
     @property
+    def group(self) -> str:
+        """The name of its benchmark, with the distinction."""
+        return ", ".join(filter(None, [self.benchmark, self.distinction]))
+
+    @property
     def item_set(self) -> str:
-        """The name of the measured items: benchmark, suite and control."""
-        return ", ".join([self.benchmark, *self.variants])
+        """The name of the item set: `group`, suite and control."""
+        return ", ".join([self.group, *self.variants])
 
     @property
     def trained(self) -> bool:
@@ -125,7 +138,7 @@ def deduplicate(measurements: Iterable[Measurement]) -> list[Measurement]:
     """
     kept: list[Measurement] = []
     for m in measurements:
-        if all(m.result != other.result for other in kept):
+        if all((m.group, m.result) != (other.group, other.result) for other in kept):
             kept.append(m)
     counts = Counter(m.row_key for m in kept)
     return [
@@ -177,41 +190,58 @@ def widest_results(measurements: Iterable[Measurement]) -> list[Measurement]:
     return sorted(widest.values(), key=lambda m: m.trained)
 
 
-def check_builds(measurements: Iterable[Measurement]) -> None:
-    """Raise a UserError if two runs measured different builds of a benchmark.
+def distinguish_item_sets(measurements: Iterable[Measurement]) -> list[Measurement]:
+    """Return the results, each with what distinguishes its build and its items from the main ones.
 
-    Items and queries of two builds can differ although they have the same ids.
+    The main build of a benchmark is that of its most recent run, because two builds can have other
+    items and queries with the same ids. The main items of a build are the largest set that a run
+    answered; `limit=` gives smaller ones.
     """
-    builds: dict[str, Measurement] = {}
-    for m in measurements:
-        other = builds.setdefault(m.benchmark, m)
-        if m.run.report.build != other.run.report.build:
-            raise UserError(
-                f"{other.run.folder} and {m.run.folder} measured different builds of benchmark "
-                f"{m.benchmark}: measure one of them again (run=NAME), or leave it out with "
-                "runs=[...]",
-                code="different-builds",
-            )
+    measurements = list(measurements)
+    builds: dict[str, str] = {}
+    for m in sorted(measurements, key=lambda m: m.run.started):
+        builds[m.benchmark] = m.run.report.build
+    items_of = [frozenset(m.responses) for m in measurements]
+    main: dict[tuple, frozenset[str]] = {}
+    for m, items in zip(measurements, items_of, strict=True):
+        key = _build_and_suite(m)
+        main[key] = max(main.get(key, frozenset()), items, key=len)
+    distinguished = []
+    for m, items in zip(measurements, items_of, strict=True):
+        parts = []
+        if m.run.report.build != builds[m.benchmark]:
+            parts.append(f"build {m.run.report.build[:8]}")
+        if items and items != main[_build_and_suite(m)]:
+            digest = hashlib.sha256("\n".join(sorted(items)).encode()).hexdigest()[:4]
+            parts.append(f"{len(items)} items ({digest})")
+        distinguished.append(replace(m, distinction=", ".join(parts)))
+    return distinguished
+
+
+def _build_and_suite(m: Measurement) -> tuple:
+    suite = m.result.suite if isinstance(m.result, SelectionResult) else None
+    return m.benchmark, m.run.report.build, suite
 
 
 def compare_models(
-    models: Mapping[str, tuple[Measurement, Responses]],
+    models: Mapping[str, Measurement],
     items: Mapping[str, SelectionItem],
     seed: int,
 ) -> list[PairedComparison]:
     """Compare the pairs of models that the paper compares; see `compare_runs`.
 
     Args:
-        models: The models that were measured on a benchmark, with their responses, by label.
+        models: The models that were measured on the same items, by label.
         items: The benchmark's items by id.
         seed: Seed of the bootstrap over scenes.
     """
     comparisons: list[PairedComparison] = []
     for pair in permutations(models, 2):
-        if not _is_paper_comparison(*(models[label][0] for label in pair)):
+        if not _is_paper_comparison(*(models[label] for label in pair)):
             continue
         credits = [
-            {k: r.credit(items[k].letter) for k, r in models[label][1].items()} for label in pair
+            {k: r.credit(items[k].letter) for k, r in models[label].responses.items()}
+            for label in pair
         ]
         answered = [item for item_id, item in items.items() if item_id in credits[0]]
         if answered:

@@ -14,8 +14,18 @@ from evaluation.reporting.sections import Section
 from evaluation.reporting.table import Best
 
 
-def render_page(sections: Sequence[Section], browser: ItemBrowser, runs: Sequence[str]) -> str:
-    """Return the page as HTML; `runs` are the names of the runs that it covers."""
+def render_page(
+    sections: Sequence[Section],
+    browser: ItemBrowser,
+    runs: Sequence[str],
+    left_out: Sequence[str],
+) -> str:
+    """Return the page as HTML.
+
+    Args:
+        runs: The names of the runs that it covers.
+        left_out: A sentence for each run that it does not cover, with the reason.
+    """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("evaluation.reporting"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
@@ -27,6 +37,7 @@ def render_page(sections: Sequence[Section], browser: ItemBrowser, runs: Sequenc
         sections=sections,
         svgs={f.name: Markup(inline_svg(f.svg, k)) for k, f in enumerate(figures)},
         runs=runs,
+        left_out=left_out,
         browser=browser,
         style=Markup((templates / "page.css").read_text(encoding="utf-8")),
         script=Markup((templates / "page.js").read_text(encoding="utf-8")),

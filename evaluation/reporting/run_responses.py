@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from conf.errors import UserError
 from conf.runs import read_json_lines
 from data.records import LETTERS
-from evaluation.metrics.results import variant_name
-from evaluation.reporting.runs import FinishedRun, reading
+from evaluation.metrics.results import SelectionReport, variant_name
 from models.student.answer_parser import Reason, parse_choice
 
 
@@ -42,21 +47,25 @@ Responses = Mapping[str, ItemResponse]
 """Responses by item id."""
 
 
-def read_responses(run: FinishedRun) -> dict[str, Responses]:
+def read_responses(folder: Path, kind: str, report: SelectionReport) -> dict[str, Responses]:
     """Return the responses of a run by `SelectionResult.key` and item id.
 
     Responses that were generated with other settings than those of the run's report are left out,
     and so are damaged lines.
 
+    Args:
+        folder: The run's folder.
+        kind: select or similarity.
+
     Raises:
         UserError: The responses are missing or of another version.
     """
-    variants = {key: variant_name(mode, control) for mode, control, key in run.report.asked}
+    variants = {key: variant_name(mode, control) for mode, control, key in report.asked}
     responses: dict[str, dict[str, ItemResponse]] = {}
-    file = "scores.jsonl" if run.kind == "similarity" else "answers.jsonl"
-    with reading(run.folder, file):
-        for row in read_json_lines(run.folder / file):
-            if run.kind == "similarity":
+    file = "scores.jsonl" if kind == "similarity" else "answers.jsonl"
+    with reading(folder, file):
+        for row in read_json_lines(folder / file):
+            if kind == "similarity":
                 variant, response = row["by"], nearest_candidates(row["scores"])
             elif "text" in row and row["key"] in variants:
                 variant = variants[row["key"]]
@@ -79,3 +88,17 @@ def parse_response(text: str, truncated: bool) -> ItemResponse:
     answer = parse_choice(text, cut=truncated)
     reason = answer.reason and str(answer.reason)
     return ItemResponse(text, answer.letter or "", reason, truncated)
+
+
+@contextmanager
+def reading(folder: Path, file: str = "report.json") -> Iterator[None]:
+    """Turn an error in the block, which reads `file` of a run, into a UserError that names it."""
+    failures = (OSError, ValueError, KeyError, TypeError, AttributeError)
+    try:
+        yield
+    except (*failures, YAMLError, OmegaConfBaseException) as error:
+        raise UserError(
+            f"{folder / file} is missing, damaged or of another version: delete {folder} and run "
+            "its command again, or leave the run out with runs=[...]",
+            code="damaged-file",
+        ) from error

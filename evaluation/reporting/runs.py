@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import fnmatch
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from conf.errors import UserError
 from evaluation.metrics.results import RetrievalReport, SelectionReport, from_json
+from evaluation.reporting.run_responses import Responses, read_responses, reading
 
 SELECTION_KINDS, RETRIEVAL_KINDS = ("select", "similarity"), ("retrieve", "two_stage")
 STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "contrastive")
@@ -41,44 +39,56 @@ class FinishedRun:
     """
 
     folder: Path
+    title: str
     kind: str
     name: str
     config: dict[str, Any]
     report: SelectionReport | RetrievalReport | dict[str, Any] | None
     started: str
-
-    @property
-    def title(self) -> str:
-        """Path below checkpoints/, such as select/default."""
-        return f"{self.kind}/{self.name}"
+    responses: Mapping[str, Responses] = field(default_factory=dict, repr=False)
 
 
-def gather_runs(root: Path, patterns: Sequence[str] | None) -> list[FinishedRun]:
-    """Return the finished runs below `root`, oldest first.
+def gather_runs(
+    root: Path, saved: Path, patterns: Sequence[str] | None
+) -> tuple[list[FinishedRun], list[str]]:
+    """Return the finished runs below `root` and the results in `saved`, oldest first.
 
     Args:
+        saved: Folder of the results that `dynapix.Result.save` wrote.
         patterns: Titles of runs, or glob patterns of titles, such as select/*; None for all runs.
 
+    Returns:
+        The runs, and a sentence for each run that is left out because it cannot be read.
+
     Raises:
-        UserError: No evaluation is among the runs, a pattern matches no finished run, or a run
-            cannot be read.
+        UserError: No evaluation is among the runs, a pattern matches no finished run, or a run that
+            a pattern names cannot be read.
     """
     # The runs of a sweep are one folder deeper.
     depths = ("*/metrics.json", "*/*/metrics.json")
     files = [f for kind in KINDS for depth in depths for f in sorted(root.glob(f"{kind}/{depth}"))]
-    finished = [file.parent.relative_to(root).as_posix() for file in files]
-    titles = (
-        finished if patterns is None else [t for p in patterns for t in _match(root, p, finished)]
-    )
-    runs = [_read_run(root, title) for title in dict.fromkeys(titles)]
+    folders = {f.parent.relative_to(root).as_posix(): f.parent for f in files}
+    folders |= {f.parent.as_posix(): f.parent for f in sorted(saved.glob("*/metrics.json"))}
+    titles = list(folders)
+    if patterns is not None:
+        titles = [title for p in patterns for title in _match(root, p, titles)]
+    runs, left_out = [], []
+    for title in dict.fromkeys(titles):
+        try:
+            runs.append(_read_run(folders[title], title))
+        except UserError as error:
+            if patterns is not None:
+                raise
+            left_out.append(f"{title} is left out: {error}")
     if all(run.kind in TRAINING_KINDS for run in runs):
+        reasons = "".join(f"\n{sentence}" for sentence in left_out)
         raise UserError(
             f"no finished evaluation is among the runs below {root}: first run python -m "
             "evaluation.select model=checkpoints/sft/RUN or python -m evaluation.retrieve "
-            "model=checkpoints/contrastive/RUN",
+            f"model=checkpoints/contrastive/RUN{reasons}",
             code="missing-run",
         )
-    return sorted(runs, key=lambda run: (run.started, run.kind, run.name))
+    return sorted(runs, key=lambda run: (run.started, run.kind, run.name)), left_out
 
 
 def _match(root: Path, pattern: str, finished: Sequence[str]) -> list[str]:
@@ -98,16 +108,21 @@ def _match(root: Path, pattern: str, finished: Sequence[str]) -> list[str]:
     raise UserError(f"runs: {pattern} matches no run below {root}{hint}", code="missing-run")
 
 
-def _read_run(root: Path, title: str) -> FinishedRun:
+def _read_run(folder: Path, title: str) -> FinishedRun:
     kind, _, name = title.partition("/")
-    folder, report = root / title, None
     with reading(folder, "run.json"):
         record = json.loads((folder / "run.json").read_text())
         started = min(map(str, [record["started"], *record["earlier_starts"]]))
+        # The results that `dynapix.Result.save` wrote name the command whose files they have.
+        kind = record.get("kind", kind)
+    report, responses = None, {}
     if kind in REPORT_TYPES:
         with reading(folder):
             report = from_json(REPORT_TYPES[kind], json.loads((folder / "report.json").read_text()))
-    return FinishedRun(folder, kind, name, _read_settings(folder), report, started)
+    if kind in SELECTION_KINDS:
+        responses = read_responses(folder, kind, report)
+    settings = _read_settings(folder)
+    return FinishedRun(folder, title, kind, name, settings, report, started, responses)
 
 
 def _read_settings(folder: Path) -> dict[str, Any]:
@@ -133,17 +148,3 @@ def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
     folders = [path, root / Path(*path.parts[1:])]
     found = [folder for folder in folders if (folder / "config.yaml").is_file()]
     return _read_settings(found[0]) if found else {}
-
-
-@contextmanager
-def reading(folder: Path, file: str = "report.json") -> Iterator[None]:
-    """Turn an error in the block, which reads `file` of a run, into a UserError that names it."""
-    failures = (OSError, ValueError, KeyError, TypeError, AttributeError)
-    try:
-        yield
-    except (*failures, YAMLError, OmegaConfBaseException) as error:
-        raise UserError(
-            f"{folder / file} is missing, damaged or of another version: delete {folder} and run "
-            "its command again, or leave the run out with runs=[...]",
-            code="damaged-file",
-        ) from error

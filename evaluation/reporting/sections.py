@@ -9,7 +9,7 @@ from functools import cached_property, partial
 from typing import Any
 
 from conf.runs import read_json_lines
-from evaluation.reporting import figures, tables
+from evaluation.reporting import figures, summary_tables, tables
 from evaluation.reporting.item_browser import ItemBrowser
 from evaluation.reporting.measurements import (
     ABLATED_REGIMES,
@@ -19,14 +19,9 @@ from evaluation.reporting.measurements import (
     transfer_benchmarks,
     widest_results,
 )
-from evaluation.reporting.runs import (
-    SELECTION_KINDS,
-    STUDY_KINDS,
-    TRAINING_KINDS,
-    FinishedRun,
-    reading,
-)
-from evaluation.reporting.table import Row, Table
+from evaluation.reporting.run_responses import reading
+from evaluation.reporting.runs import SELECTION_KINDS, STUDY_KINDS, TRAINING_KINDS, FinishedRun
+from evaluation.reporting.table import Row, Table, file_stem
 from train.common.curves import plot_curves
 
 Results = Sequence[Measurement]
@@ -79,7 +74,7 @@ def build_sections(
     studies = [run for run in runs if run.kind in STUDY_KINDS]
     widest = widest_results(retrievals)
     sections = [
-        zero_shot([m for m in in_domain if not m.trained], widest, studies),
+        zero_shot([m for m in in_domain if not m.trained], widest, studies, browser),
         distillation(in_domain, widest, browser),
         ablation(unchanged),
         transfer(unchanged, transfers, browser),
@@ -92,15 +87,21 @@ def build_sections(
     return [section for section in sections if section.tables or section.figures]
 
 
-def zero_shot(selections: Results, retrievals: Results, studies: Sequence[FinishedRun]) -> Section:
+def zero_shot(
+    selections: Results,
+    retrievals: Results,
+    studies: Sequence[FinishedRun],
+    browser: ItemBrowser,
+) -> Section:
     """Released models, without any training by this project, and the votes of humans."""
     section = Section("Zero-shot")
     for rows in group_by_item_set(selections).values():
         people = [row for study in studies for row in _majority_rows(study, rows[0])]
-        section.tables.append(tables.summary_table("selection", rows, people))
+        baselines = browser.baselines.get(rows[0].group, [])
+        section.tables.append(summary_tables.summary_table("selection", rows, people, baselines))
         section.figures.append(_family_figure("zero-shot", rows))
     for rows in group_by_item_set(m for m in retrievals if not m.trained).values():
-        section.tables.append(tables.summary_table("retrieval", rows))
+        section.tables.append(summary_tables.summary_table("retrieval", rows))
     return section
 
 
@@ -117,14 +118,17 @@ def _majority_rows(study: FinishedRun, m: Measurement) -> list[Row]:
 def distillation(selections: Results, retrievals: Results, browser: ItemBrowser) -> Section:
     """Trained models beside released models, on benchmarks that do not test transfer."""
     section = Section("Distillation")
-    for benchmark, rows in group_by_item_set(selections).items():
+    for rows in group_by_item_set(selections).values():
         if any(m.trained for m in rows):
-            section.tables.append(tables.summary_table("distillation-selection", rows))
+            baselines = browser.baselines.get(rows[0].group, [])
+            section.tables.append(
+                summary_tables.summary_table("distillation-selection", rows, baselines=baselines)
+            )
             section.figures.append(_family_figure("families", rows))
-            section.tables += _model_differences(benchmark, browser)
+            section.tables += _model_differences(rows[0].group, browser)
     for rows in group_by_item_set(retrievals).values():
         if trained := {m.run.folder: m.run for m in rows if m.trained}:
-            section.tables.append(tables.summary_table("distillation-retrieval", rows))
+            section.tables.append(summary_tables.summary_table("distillation-retrieval", rows))
         for run in trained.values():
             if run.report.differences:
                 table = tables.rank_differences_table(run.report.differences)
@@ -138,7 +142,9 @@ def ablation(selections: Results) -> Section:
     if not any(m.regime in ABLATED_REGIMES for m in rows):
         return Section("Ablation")
     rows.sort(key=lambda m: list(REGIMES).index(m.regime))
-    table = tables.overall_table("ablation", rows, lambda m, name: f"{REGIMES[m.regime]} ({name})")
+    table = summary_tables.overall_table(
+        "ablation", rows, lambda m, name: f"{REGIMES[m.regime]} ({name})"
+    )
     return Section("Ablation", [table])
 
 
@@ -147,30 +153,30 @@ def transfer(selections: Results, transfers: Container[str], browser: ItemBrowse
     section = Section("Transfer")
     models = {(m.result.name, m.result.mode) for m in selections if m.benchmark in transfers}
     if measured := [m for m in selections if (m.result.name, m.result.mode) in models]:
-        table = tables.overall_table(
+        table = summary_tables.overall_table(
             "transfer", measured, lambda m, name: f"{name} ({m.result.mode})"
         )
         section.tables.append(table)
-    for benchmark, rows in group_by_item_set(selections).items():
-        if benchmark in transfers:
-            section.tables.append(tables.summary_table("transfer-selection", rows))
+    for rows in group_by_item_set(selections).values():
+        if rows[0].benchmark in transfers:
+            section.tables.append(summary_tables.summary_table("transfer-selection", rows))
             # The paper's accuracies by family are on CLEVRER.
             section.figures.append(_family_figure("families", rows, with_paper=False))
-            section.tables += _model_differences(benchmark, browser)
+            section.tables += _model_differences(rows[0].group, browser)
     return section
 
 
-def _model_differences(benchmark: str, browser: ItemBrowser) -> list[Table]:
+def _model_differences(group: str, browser: ItemBrowser) -> list[Table]:
     """Return the differences between models over all items and, in a folded table, by family."""
-    comparisons = browser.comparisons.get(benchmark)
+    comparisons = browser.comparisons.get(group)
     if not comparisons:
         return []
     overall = tables.paired_table(p for p in comparisons if p.of == "all")
     by_family = tables.paired_table(comparisons)
     caption = f"{by_family.caption} by family"
     return [
-        _name_table(replace(overall, name="differences"), benchmark),
-        _name_table(replace(by_family, caption=caption, folded=True), benchmark),
+        _name_table(replace(overall, name="differences"), group),
+        _name_table(replace(by_family, caption=caption, folded=True), group),
     ]
 
 
@@ -179,7 +185,7 @@ def controls(selections: Results, runs: Sequence[FinishedRun]) -> Section:
     compared = [run for run in runs if run.kind in SELECTION_KINDS and run.report.controls]
     differences = [_name_table(tables.paired_table(r.report.controls), r.title) for r in compared]
     groups = group_by_item_set(selections).values()
-    accuracies = [tables.summary_table("control", rows) for rows in groups]
+    accuracies = [summary_tables.summary_table("control", rows) for rows in groups]
     return Section("Controls", differences + accuracies)
 
 
@@ -193,9 +199,11 @@ def selection_details(selections: Results, transfers: Container[str]) -> Section
     section = Section("Selection in detail")
     for benchmark, rows in group_by_item_set(selections).items():
         if horizons := {m.label: m.result.horizons for m in rows if m.result.horizons}:
-            plot = partial(figures.accuracy_figure, with_paper=benchmark not in transfers)
+            plot = partial(figures.accuracy_figure, with_paper=rows[0].benchmark not in transfers)
             caption = f"Accuracy by horizon on {benchmark}."
-            section.figures.append(Figure(f"horizons-{benchmark}", caption, plot, horizons))
+            section.figures.append(
+                Figure(file_stem(f"horizons-{benchmark}"), caption, plot, horizons)
+            )
         details = tables.detail_tables({m.label: (m.result.key, m.run.report) for m in rows})
         section.tables += [_name_table(replace(t, folded=True), benchmark) for t in details]
     return section
@@ -205,11 +213,11 @@ def retrieval_details(retrievals: Results) -> Section:
     section = Section("Retrieval in detail")
     for benchmark, rows in group_by_item_set(retrievals).items():
         ordered = sorted(rows, key=lambda m: (-(m.result.width or 0), not m.result.untrained))
-        section.tables.append(replace(tables.summary_table("widths", ordered), folded=True))
+        section.tables.append(replace(summary_tables.summary_table("widths", ordered), folded=True))
         if any(m.result.width for m in rows):
             plot, caption = figures.retrieval_figure, f"Recall by width on {benchmark}."
             results = [(m.name, m.result) for m in rows]
-            section.figures.append(Figure(f"widths-{benchmark}", caption, plot, results))
+            section.figures.append(Figure(file_stem(f"widths-{benchmark}"), caption, plot, results))
     return section
 
 
@@ -226,7 +234,7 @@ def training(runs: Sequence[FinishedRun]) -> Section:
 
 def _name_table(table: Table, name: str, title: str = "") -> Table:
     """Append a name to the table's name, and `title` (or else the name) to its caption."""
-    caption, suffix = f"{table.caption}: {title or name}", name.replace("/", "-")
+    caption, suffix = f"{table.caption}: {title or name}", file_stem(name)
     return replace(table, name=f"{table.name}-{suffix}", caption=caption)
 
 
@@ -234,4 +242,4 @@ def _family_figure(name: str, rows: Results, with_paper: bool = True) -> Figure:
     plot = partial(figures.accuracy_figure, with_paper=with_paper)
     caption = f"Accuracy by family on {rows[0].item_set}, with 95% intervals."
     accuracies = {m.label: m.result.families for m in rows}
-    return Figure(f"{name}-{rows[0].item_set}", caption, plot, accuracies)
+    return Figure(file_stem(f"{name}-{rows[0].item_set}"), caption, plot, accuracies)

@@ -5,25 +5,11 @@ from __future__ import annotations
 
 import json
 import logging
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from conf.runs import write_text
-from data.records import SelectionItem
-from data.tracks.controls import MATCHED_ANCHOR
-from data.tracks.selection.time import CELLS
-from evaluation.generators.response_log import Answer
-from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
-from evaluation.metrics.intervals import macro_by_scene
-from evaluation.metrics.results import (
-    SelectionReport,
-    SelectionResult,
-    accuracy_by_family,
-    accuracy_by_group,
-)
-from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
+from evaluation.metrics.results import SelectionReport
 from evaluation.reporting import tables
 from evaluation.reporting.figures import accuracy_figure
 from evaluation.reporting.reference import SUITE
@@ -31,134 +17,14 @@ from evaluation.reporting.reference import SUITE
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Choices:
-    """The choices of a model for all items, in one mode and under one control.
-
-    Attributes:
-        credits: For each item, 1 for a correct choice, 1/m if the target is one of m candidates
-            with the highest score, and 0 otherwise.
-        letters: The chosen letters; None for a tie or a response that cannot be parsed.
-        answers: The responses of a student to the items; empty for a retriever.
-    """
-
-    name: str
-    mode: str
-    control: str | None
-    credits: Sequence[float]
-    letters: Sequence[str | None]
-    answers: Sequence[Answer] = ()
-
-    @classmethod
-    def from_answers(
-        cls, name: str, mode: str, control: str | None, answers: Sequence[Answer]
-    ) -> Choices:
-        credits = [float(answer.right) for answer in answers]
-        return cls(name, mode, control, credits, [a.letter for a in answers], answers)
-
-
-def write_report(
-    choices: Sequence[Choices],
-    items: Sequence[SelectionItem],
-    benchmark: str,
-    seed: int,
-    folder: Path,
-    suite: str | None = None,
-    *,
-    build: str,
-    asked: Sequence[tuple[str, str | None, str]] = (),
-) -> list[SelectionResult]:
-    """Write the report into `folder`, and return the result of each element of `choices`.
-
-    Args:
-        seed: Seed of the bootstrap over scenes.
-        suite: As in `SelectionResult`.
-        build, asked: As in `SelectionReport`.
-    """
-    results = [selection_result(c, items, benchmark, seed, suite) for c in choices]
-    by_key = {result.key: c for result, c in zip(results, choices, strict=True)}
-    subtypes, letters = [f"{i.family}/{i.subtype}" for i in items], [i.letter for i in items]
-    calibrations = {key: _calibrate(c.answers) for key, c in by_key.items()}
-    report = SelectionReport(
-        build,
-        results,
-        controls=_compare(by_key, items, seed),
-        subtypes={key: accuracy_by_group(subtypes, c.credits) for key, c in by_key.items()},
-        readings={key: count_readings(c.answers) for key, c in by_key.items() if c.answers},
-        positions={key: measure_position_bias(c.letters, letters) for key, c in by_key.items()},
-        calibration={key: found for key, found in calibrations.items() if found},
-        asked=[*asked],
-    )
-    parts = [tables.selection_table(results, items[0].suite)]
+def write_report(report: SelectionReport, folder: Path, suite: str) -> None:
+    """Write a report into `folder` and log its main tables. `suite` is the suite of the items."""
+    results = report.rows
+    parts = [tables.selection_table(results, suite)]
     parts += [tables.paired_table(report.controls)] if report.controls else []
     log.info("%s", "\n\n".join(map(str, parts)))
-    parts += tables.detail_tables({key: (key, report) for key in by_key})
+    parts += tables.detail_tables({r.key: (r.key, report) for r in results})
     write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
     write_text(folder / "report.json", json.dumps(asdict(report), indent=1))
-    accuracies = {f"{r.name} ({r.variant})": r.families for r in results}
-    accuracy_figure(accuracies, folder / "selection.png", items[0].suite == SUITE)
-    return results
-
-
-def selection_result(
-    choices: Choices,
-    items: Sequence[SelectionItem],
-    benchmark: str,
-    seed: int,
-    suite: str | None = None,
-) -> SelectionResult:
-    """Return the accuracies of a model's choices. The arguments are those of `write_report`."""
-    credits, families = choices.credits, [i.family for i in items]
-    macro = macro_by_scene(credits, families, [i.scene_id for i in items], seed)
-    timed = [(h, c) for i, c in zip(items, credits, strict=True) if (h := horizon_of(i))]
-    by_horizon = accuracy_by_group([h for h, _ in timed], [c for _, c in timed])
-    # Horizons in frames come first: they are all shorter than one second.
-    ordered = sorted(by_horizon, key=lambda h: (h.endswith(" s"), int(h.split()[0])))
-    accuracy, letters = accuracy_by_family(families, credits), choices.letters
-    parse_rate = sum(x is not None for x in letters) / len(letters) if choices.answers else None
-    return SelectionResult(
-        benchmark, choices.name, choices.mode, accuracy.families, accuracy.macro, accuracy.micro,
-        parse_rate, len(items), macro, {h: by_horizon[h] for h in ordered}, suite,
-        choices.control,
-    )  # fmt: skip
-
-
-def horizon_of(item: SelectionItem) -> str | None:
-    """Return the horizon in seconds (time family) or in frames (window family), else None."""
-    if item.family == "time":
-        return f"{CELLS[item.subtype]} s"
-    return f"{item.horizon} frames" if item.family == "window" else None
-
-
-def count_readings(answers: Sequence[Answer]) -> dict[str, int]:
-    """Count parsed responses, valid records if the mode requests them, and the others by reason."""
-    counts = {"with a letter": sum(a.letter is not None for a in answers)}
-    if answers[0].valid is not None:
-        counts["  in a valid record"] = sum(a.valid for a in answers)
-    reasons = Counter(f"without: {a.reason}" for a in answers if a.letter is None)
-    return counts | dict(reasons.most_common())
-
-
-def _calibrate(answers: Sequence[Answer]) -> Calibration | None:
-    """Return the calibration of the confidences in valid records; None without valid records."""
-    valid = [answer for answer in answers if answer.valid]
-    return measure_calibration([a.record.confidence for a in valid], [a.right for a in valid])
-
-
-def _compare(
-    choices: Mapping[str, Choices], items: Sequence[SelectionItem], seed: int
-) -> list[PairedComparison]:
-    """Compare the choices without a control with those under each control, and, for matched-anchor
-    items, the choices for the two questions of each pair."""
-    ids = [item.item_id for item in items]
-    credits = {key: dict(zip(ids, c.credits, strict=True)) for key, c in choices.items()}
-    compared = []
-    for key, c in choices.items():
-        if c.control is not None:
-            pair, names = (credits[c.mode], credits[key]), ("unchanged", c.control)
-            differences = compare_runs(items, *pair, names, seed)
-            compared += [replace(p, mode=c.mode) for p in differences]
-        if items[0].suite == MATCHED_ANCHOR:
-            differences = compare_anchors(items, credits[key], seed)
-            compared += [replace(p, mode=key) for p in differences]
-    return compared
+    by_family = {f"{r.name} ({r.variant})": r.families for r in results}
+    accuracy_figure(by_family, folder / "selection.png", suite == SUITE)

@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import jinja2
-
 from evaluation.metrics.intervals import Interval
 
 NOTE_WIDTH = 100
@@ -140,6 +138,8 @@ class Table:
             escaped = escape(text.strip())
             return bold.format(escaped) if isinstance(text, Best) else escaped
 
+        import jinja2
+
         environment = jinja2.Environment(
             block_start_string="<%", block_end_string="%>", variable_start_string="<<",
             variable_end_string=">>", loader=jinja2.PackageLoader("evaluation.reporting"),
@@ -148,6 +148,11 @@ class Table:
         environment.filters["cell"] = cell
         slug = re.sub("[^A-Za-z0-9-]", "-", self.name)
         return environment.get_template(template).render(table=self, slug=slug)
+
+
+def file_stem(name: str) -> str:
+    """Return a name as a file name without spaces and brackets."""
+    return re.sub(r"[^\w.+-]+", "-", name).strip("-")
 
 
 def _escape_markdown(text: str) -> str:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,8 +19,7 @@ from evaluation.metrics.results import (
     SelectionResult,
     from_json,
 )
-from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting.measurements import TRANSFER_SUITES, Measurement, shared_names
+from evaluation.metrics.significance import PairedComparison, adjust_holm
 from evaluation.reporting.reference import SUITE, reference, table_with_paper
 from evaluation.reporting.table import DETAIL, Row, Table
 
@@ -31,26 +29,10 @@ RECALL_COLUMNS = [f"R@{k}" for k in RECALLS]
 MEASURE_COLUMNS = [*RECALL_COLUMNS, "MRR", "Median", "Tied"]
 RETRIEVAL_COLUMNS = ["Width", *MEASURE_COLUMNS, "MiB", "s"]
 
-GROUPS = (
-    "similarity scorers",
-    "generative models",
-    "trained",
-    "two-stage predict-then-match",
-    "direct embedders",
-)
-"""Labels of the groups of rows in the report's tables, in their order."""
-BEST = {
-    **dict.fromkeys((*FAMILY_COLUMNS, "Macro", "Micro", *RECALL_COLUMNS, "MRR"), max),
-    "Median": min,
-}
-"""The columns whose best value is marked, with the function that chooses it."""
-BEST_NOTE = "Bold: the best value of a column among these runs, and among the paper's rows."
-SELECTION_NOTE = (
-    "Wilson 95% intervals; the interval of macro is bootstrapped over scenes. Answers that cannot "
-    "be parsed count as wrong."
-)
+INTERVAL_NOTE = "95% intervals are bootstrapped over scenes."
+SELECTION_NOTE = f"{INTERVAL_NOTE} Answers that cannot be parsed count as wrong."
 RETRIEVAL_NOTE = (
-    "95% intervals are bootstrapped over scenes. A target that is not ranked counts as last. MiB: "
+    f"{INTERVAL_NOTE} A target that is not ranked counts as last. MiB: "
     "size of the database's embeddings. s: time to rank the database for all queries, at all "
     "widths together."
 )
@@ -66,7 +48,7 @@ def selection_table(results: Sequence[SelectionResult], suite: str = SUITE) -> T
 
 def selection_rows(name: str, result: SelectionResult) -> list[Row]:
     """Return a row of `SELECTION_COLUMNS`, and a row for each horizon of the time family."""
-    row = accuracy_row(name, result.families, result.macro_interval, result.micro)
+    row = accuracy_row(name, result.families, result.macro, result.micro)
     horizons = [
         {"name": f"{DETAIL}time, {horizon}", "Time": accuracy, "Items": accuracy.n, "ranked": False}
         for horizon, accuracy in result.horizons.items()
@@ -76,7 +58,7 @@ def selection_rows(name: str, result: SelectionResult) -> list[Row]:
 
 
 def accuracy_row(
-    name: str, families: Mapping[str, Interval], macro: float | Interval, micro: Interval
+    name: str, families: Mapping[str, Interval], macro: Interval, micro: Interval
 ) -> Row:
     by_family = {family.capitalize(): families.get(family) for family in FAMILIES}
     return {"name": name, **by_family, "Macro": macro, "Micro": micro, "Items": micro.n}
@@ -152,24 +134,29 @@ def calibration_table(calibrations: Mapping[str, Calibration]) -> Table:
 
 def paired_table(comparisons: Iterable[PairedComparison]) -> Table:
     """Return a table of paired differences, with a group for each pair of runs."""
+    comparisons = list(comparisons)
+    adjusted = adjust_holm([p.p for p in comparisons])
     groups: dict[str, list[Row]] = {}
-    for p in comparisons:
+    for p, holm in zip(comparisons, adjusted, strict=True):
         label = f"{p.mode}{': ' * bool(p.mode)}{p.left} (left) less {p.right} (right)"
         row = {
             "name": p.of, "Left": p.left_accuracy, "Right": p.right_accuracy,
             "Difference": f"{100 * p.difference:+.1f}",
             "95%": f"{100 * p.low:+.1f} to {100 * p.high:+.1f}",
+            "p": f"{p.p:.2g}", "Holm": f"{holm:.2g}",
             "Only left": p.only_left, "Only right": p.only_right,
-            "p": "-" if p.p is None else f"{p.p:.2g}", "Items": p.n,
+            "McNemar": "-" if p.mcnemar is None else f"{p.mcnemar:.2g}", "Items": p.n,
         }  # fmt: skip
         groups.setdefault(label, []).append(row)
     columns = [
-        "Left", "Right", "Difference", "95%", "Only left", "Only right", "p", "Items",
+        "Left", "Right", "Difference", "95%", "p", "Holm", "Only left", "Only right", "McNemar",
+        "Items",
     ]  # fmt: skip
     note = (
-        "Difference: left minus right, with an interval that is bootstrapped over scenes. Only "
-        "left, only right: items that only this side answers correctly. p: p-value of McNemar's "
-        "exact test of these two counts, which treats the items of a scene as independent."
+        "Difference: left minus right, with an interval that is bootstrapped over scenes. p: sign-"
+        "flip test over scenes. Holm: p adjusted for all tests of this table. Only left, only "
+        "right: items that only this side answers correctly. McNemar: exact test of these two "
+        "counts, which treats the items of a scene as independent."
     )
     return Table("paired", "Paired differences of accuracy (%)", columns, groups, (note,))
 
@@ -263,7 +250,7 @@ def _human_notes(summary: Mapping[str, Any]) -> tuple[str, ...]:
     kappa, alpha = summary["fleiss_kappa"], summary["krippendorff_alpha"]
     undecided = summary["majority"]["undecided"] if summary["majority"] else 0
     return (
-        "Wilson 95% intervals over items.",
+        INTERVAL_NOTE,
         f"{summary['judgments']:,} judgments of {summary['items']:,} items; items by their number "
         f"of judgments: {', '.join(depth)}.",
         f"A majority is more than half of an item's votes; {undecided} items have no majority and "
@@ -284,76 +271,3 @@ def _agreement(value: float | None) -> str:
 
 def _width(width: int | None) -> str:
     return "-" if width is None else str(width)
-
-
-def summary_table(name: str, rows: Sequence[Measurement], people: Sequence[Row] = ()) -> Table:
-    """Return the results of many runs on the same items, in the groups of the paper's tables.
-
-    Args:
-        name: Key below `tables` in `reference.yaml`.
-        people: Rows of human studies.
-    """
-    groups: dict[str, list[Row]] = {label: [] for label in GROUPS}
-    if isinstance(rows[0].result, SelectionResult):
-        columns, notes = SELECTION_COLUMNS, (SELECTION_NOTE, BEST_NOTE)
-        for m in rows:
-            groups[_group(m)] += selection_rows(m.label, m.result)
-    else:
-        columns, notes = RETRIEVAL_COLUMNS, (*retrieval_notes(rows[0].result), BEST_NOTE)
-        for m in rows:
-            groups[_group(m)].append(retrieval_row(m.name, m.result))
-    groups["people, on the items of their study"] = [*people]
-    item_set = rows[0].item_set
-    table = table_with_paper(name, f"{name}-{item_set.replace(', ', '-')}", columns, groups, notes)
-    return replace(table, caption=f"{table.caption}, on {item_set}", best=BEST)
-
-
-def _group(m: Measurement) -> str:
-    if isinstance(m.result, RetrievalResult):
-        two_stage = m.run.kind == "two_stage"
-        return "two-stage predict-then-match" if two_stage else "direct embedders"
-    if m.trained:
-        return "trained"
-    return "similarity scorers" if m.result.mode == SIMILARITY else "generative models"
-
-
-def overall_table(
-    name: str, rows: Sequence[Measurement], label: Callable[[Measurement, str], str]
-) -> Table:
-    """Return a table of the accuracies over all items of a benchmark, with a row for each model and
-    a column for each benchmark.
-
-    Args:
-        name: Key below `tables` in `reference.yaml`.
-        label: Returns the name of a result's row from the result and the name of its model.
-    """
-    names, benchmarks = shared_names(rows), _benchmark_columns(rows)
-    columns = list(dict.fromkeys(["In domain", *TRANSFER_SUITES.values(), *benchmarks]))
-    by_label: dict[str, dict[str, Any]] = {}
-    for m, model, column in zip(rows, names, benchmarks, strict=True):
-        empty = {"name": label(m, model), **dict.fromkeys(columns)}
-        by_label.setdefault(empty["name"], empty)[column] = m.result.micro
-    notes = ("Wilson 95% intervals over items.", BEST_NOTE)
-    table = table_with_paper(name, name, columns, {"": [*by_label.values()]}, notes)
-    return replace(table, best=dict.fromkeys(columns, max))
-
-
-def _benchmark_columns(rows: Sequence[Measurement]) -> list[str]:
-    """Return the column of each result: "In domain", a transfer suite, or a benchmark.
-
-    If several benchmarks would have the same column, each gets its own, with its name appended.
-    """
-    trained_on = {m.training_benchmark for m in rows if m.training_benchmark}
-
-    def column(m: Measurement) -> str:
-        # A released model has no training benchmark. It is in domain if a trained model is.
-        if m.benchmark in ({m.training_benchmark} if m.trained else trained_on):
-            return "In domain"
-        simulator = m.run.config.get("benchmark", {}).get("simulator")
-        return TRANSFER_SUITES.get(simulator, m.benchmark)
-
-    benchmarks = Counter(name for name, _ in {(column(m), m.benchmark) for m in rows})
-    return [
-        f"{name} ({m.benchmark})" if benchmarks[name] > 1 else name
-        for m, name in zip(rows, map(column, rows), strict=True)
-    ]

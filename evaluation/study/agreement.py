@@ -14,16 +14,20 @@ import numpy as np
 import pandas as pd
 
 from data.records import LETTERS
-from evaluation.metrics.results import accuracy_by_family
+from evaluation.metrics.intervals import SceneBootstrap
+from evaluation.metrics.results import Accuracy, accuracy_by_family
 
 
-def summarize_votes(votes: pd.DataFrame, items: int, annotators: Sequence[str]) -> dict[str, Any]:
+def summarize_votes(
+    votes: pd.DataFrame, items: int, annotators: Sequence[str], seed: int
+) -> dict[str, Any]:
     """Return the report of a study, ready for JSON; undefined values are None.
 
     Args:
         votes: As `storage.read_votes` returns them.
         items: Number of items in the study, with or without votes.
         annotators: All annotators, with or without votes.
+        seed: Seed of the bootstrap over scenes.
 
     Returns:
         `items`; `judgments`, the number of votes; `annotators` with votes; `depth`, the number of
@@ -41,7 +45,7 @@ def summarize_votes(votes: pd.DataFrame, items: int, annotators: Sequence[str]) 
     several = counts[depth > 1]
     items_by_depth = {0: items - len(counts), **depth.value_counts()}
     accuracy = {
-        name: asdict(accuracy_by_family(list(own.family), list(own.right)))
+        name: asdict(_accuracy(own, list(own.right), seed))
         for name, own in votes.groupby("annotator")
     }
     return {
@@ -50,7 +54,7 @@ def summarize_votes(votes: pd.DataFrame, items: int, annotators: Sequence[str]) 
         "annotators": active,
         "depth": {str(d): int(n) for d, n in sorted(items_by_depth.items()) if n},
         "accuracy": {name: accuracy[name] for name in active},
-        "majority": _majority_accuracy(votes, counts) if len(votes) else None,
+        "majority": _majority_accuracy(votes, counts, seed) if len(votes) else None,
         "fleiss_kappa": {"value": fleiss_kappa(complete), "items": len(complete)},
         "krippendorff_alpha": {"value": krippendorff_alpha(several), "items": len(several)},
         "seconds": median_seconds(votes),
@@ -93,10 +97,15 @@ def median_seconds(votes: pd.DataFrame) -> dict[str, dict[str, float | int]]:
     return once.agg(**clocks, votes=("seconds", "size")).to_dict("index")
 
 
-def _majority_accuracy(votes: pd.DataFrame, counts: pd.DataFrame) -> dict[str, Any]:
+def _accuracy(items: pd.DataFrame, credits: Sequence[float], seed: int) -> Accuracy:
+    scenes = SceneBootstrap(list(items.scene_id), seed)
+    return accuracy_by_family(list(items.family), credits, scenes)
+
+
+def _majority_accuracy(votes: pd.DataFrame, counts: pd.DataFrame, seed: int) -> dict[str, Any]:
     choices = majority(counts)
     items = votes.groupby("item_id").first().loc[counts.index]
-    accuracy = accuracy_by_family(list(items.family), list(choices == items.answer))
+    accuracy = _accuracy(items, list(choices == items.answer), seed)
     return {**asdict(accuracy), "undecided": int(choices.isna().sum())}
 
 

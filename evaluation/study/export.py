@@ -37,7 +37,7 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
     if votes.empty:
         raise UserError(f"{path} has no votes yet", code="no-votes")
     benchmark = {"benchmark": about["benchmark"], "build": about["identity"]}
-    report = benchmark | summarize_votes(votes, items, annotators)
+    report = benchmark | summarize_votes(votes, items, annotators, cfg.seed)
     rows = votes.to_json(orient="records", lines=True, double_precision=15)
     write_text(run.folder / VOTES_FILE, rows)
     write_text(run.folder / "report.json", json.dumps(report, indent=1))
@@ -46,7 +46,7 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
     log.info("%s\n\nvotes: %s", table, run.folder / VOTES_FILE)
     majority = report["majority"]
     families = {f"majority_{f}": share["value"] for f, share in majority["families"].items()}
-    return {**families, "majority_macro": majority["macro"]}
+    return {**families, "majority_macro": majority["macro"]["value"]}
 
 
 if __name__ == "__main__":

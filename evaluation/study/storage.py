@@ -190,7 +190,7 @@ def read_votes(db: sqlite3.Connection) -> pd.DataFrame:
     import pandas as pd
 
     votes = pd.read_sql(
-        "SELECT annotator, item_id, suite, family, subtype, answer, choice, letter, "
+        "SELECT annotator, item_id, scene_id, suite, family, subtype, answer, choice, letter, "
         "max(0.0, answered - loaded) AS seconds, client_seconds, loads, "
         "strftime('%Y-%m-%dT%H:%M:%S+00:00', CAST(answered AS INTEGER), 'unixepoch') AS answered "
         "FROM turn JOIN item USING (item_id) "

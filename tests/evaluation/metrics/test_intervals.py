@@ -1,21 +1,8 @@
-import math
-
 import numpy as np
 import pytest
 
-from evaluation.metrics.intervals import SceneBootstrap, macro_by_scene, mean_with_wilson
-from evaluation.metrics.results import accuracy_by_family
+from evaluation.metrics.intervals import SceneBootstrap
 from tests.evaluation.metrics.reference import scene_interval
-
-
-@pytest.mark.parametrize(("successes", "n"), [(0, 5), (5, 5), (7, 20), (92, 249), (2.5, 10)])
-def test_wilson_intervals_equal_the_published_formula(successes, n):
-    z, p = 1.959963984540054, successes / n
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-    found = mean_with_wilson(np.full(n, p))
-    assert (found.value, found.n) == (pytest.approx(p), n)
-    assert (found.low, found.high) == pytest.approx((centre - half, centre + half), abs=1e-12)
 
 
 @pytest.mark.parametrize("items", [1, 2, 40, 401])
@@ -27,8 +14,10 @@ def test_bootstrap_intervals_equal_those_of_explicit_resampling(items):
     intervals = (bootstrap.mean(values), np.mean), (bootstrap.median(values), np.median)
     for found, statistic in intervals:
         resampled = scene_interval(values, scenes, statistic, seed=7, resamples=300)
-        assert found == pytest.approx(resampled, abs=1e-12)
-        assert found[0] <= statistic(values) <= found[1]
+        assert (found.low, found.high) == pytest.approx(resampled, abs=1e-12)
+        assert found.value == pytest.approx(statistic(values))
+        assert found.low <= found.value <= found.high
+        assert found.n == items
 
 
 @pytest.mark.parametrize("items", [1, 3, 40, 401])
@@ -41,14 +30,35 @@ def test_macro_is_the_mean_of_the_families_means(items):
     def macro(rows):
         return np.mean([rows[rows[:, 0] == f, 1].astype(float).mean() for f in set(rows[:, 0])])
 
-    found = macro_by_scene(credits, families, scenes, seed=7)
-    assert found.value == pytest.approx(accuracy_by_family(families, credits).macro)
+    bootstrap = SceneBootstrap(scenes, seed=7)
+    found = bootstrap.macro(credits, families)
+    means = bootstrap.group_means(credits, families)
+    assert found.value == pytest.approx(np.mean([mean.value for mean in means.values()]))
     assert found.n == items
     table = np.stack([families, credits.astype(str)], axis=1)
     resampled = scene_interval(table, scenes, macro, seed=7)
     assert (found.low, found.high) == pytest.approx(resampled, abs=1e-12)
     # With a single family, macro is the mean of all items.
-    single = macro_by_scene(credits, ["time"] * items, scenes, seed=7)
+    single = bootstrap.macro(credits, ["time"] * items)
     assert (single.low, single.high) == pytest.approx(
         scene_interval(credits, scenes, np.mean, seed=7)
     )
+
+
+def test_intervals_of_group_means_equal_those_of_explicit_resampling():
+    rng = np.random.default_rng(5)
+    scenes = np.array([f"scene {k}" for k in rng.integers(12, size=200)])
+    groups = rng.choice(["b", "a"], size=200, p=[0.97, 0.03])
+    credits = rng.integers(2, size=200).astype(float)
+    found = SceneBootstrap(scenes, seed=7).group_means(credits, groups)
+    assert list(found) == ["a", "b"]
+    for name, interval in found.items():
+        own = groups == name
+        assert (interval.value, interval.n) == (pytest.approx(credits[own].mean()), own.sum())
+        # A resample without an item of the group has no mean.
+        table = np.stack([credits, own], axis=1)
+        picked = [np.flatnonzero(scenes == scene) for scene in np.unique(scenes)]
+        sampled = np.random.default_rng(7).integers(len(picked), size=(2000, len(picked)))
+        rows = [table[np.concatenate([picked[i] for i in picks])] for picks in sampled]
+        means = [part[part[:, 1] == 1, 0].mean() for part in rows if part[:, 1].any()]
+        assert (interval.low, interval.high) == pytest.approx(np.percentile(means, [2.5, 97.5]))

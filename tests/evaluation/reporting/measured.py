@@ -30,7 +30,8 @@ from data.store import Store
 from evaluation import report
 from evaluation.generators.response_log import score_response
 from evaluation.metrics.results import SIMILARITY, compare_retrievers, retrieval_results
-from evaluation.reporting.selection_report import Choices, write_report
+from evaluation.metrics.selection import Choices, selection_report
+from evaluation.reporting.selection_report import write_report
 from evaluation.retrieval import nearest_candidate
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.select import limit_items
@@ -97,8 +98,9 @@ def select_run(
     finish(folder, settings)
     answers = [score_response(item, mode, GeneratedText(respond(item), False)) for item in items]
     choices = Choices.from_answers(model or "small base", mode, None, answers)
-    about = {"build": store.identity, "asked": [[mode, None, "k1"]]}
-    write_report([choices], items, store.name, 0, folder, suite, **about)
+    asked = [(mode, None, "k1")]
+    report = selection_report([choices], items, store.name, store.identity, 0, suite, asked)
+    write_report(report, folder, items[0].suite)
     keys = {"key": "k1", "mode": mode}
     lines = [{**keys, "asked": {"control": None, "seed": 0}}]
     lines += [{**keys, "item_id": i.item_id, "text": respond(i), "cut": False} for i in items]
@@ -137,7 +139,8 @@ def similarity_run(
         rows += nearest_candidate.score_rows(title, items, by_item)
     folder = root / "similarity" / (model or name)
     finish(folder, settings)
-    write_report(choices, items, store.name, 0, folder, build=store.identity)
+    report = selection_report(choices, items, store.name, store.identity, 0)
+    write_report(report, folder, items[0].suite)
     write_json_lines(folder / "scores.jsonl", rows)
     return folder
 

@@ -23,7 +23,7 @@ def test_results_of_a_model_on_two_benchmarks_share_a_row(runs):
     # The second run of the model on the same items has another interval, as with another seed.
     shutil.copytree(runs / "select" / "cot", runs / "select" / "again")
     macro = {"value": 1.0, "low": 0.9, "high": 1.0, "n": 8}
-    change_first_row(runs / "select" / "again" / "report.json", macro_interval=macro)
+    change_first_row(runs / "select" / "again" / "report.json", macro=macro)
     shutil.copytree(runs / "select" / "cot", runs / "select" / "elsewhere")
     change_first_row(runs / "select" / "elsewhere" / "report.json", benchmark="elsewhere")
     folder = run_report(runs, runs, items=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -82,8 +83,9 @@ def test_students_are_compared_with_their_bases_and_with_other_regimes(
     ablated, plain = "cot_no_candidate_analysis (reasoning)", "answer_only (answer)"
     expected = {
         (cot, plain): f"| {100 * wrong / len(items):+.1f} |", (cot, ablated): f"| {wrong} | 0 |",
-        (cot, base): "| +0.0 | +0.0 to +0.0 | 0 | 0 | 1 |", (ablated, base): f"| 0 | {wrong} |",
-        (ablated, plain): "| +0.0 | +0.0 to +0.0 | 0 | 0 | 1 |",
+        (cot, base): "| +0.0 | +0.0 to +0.0 | 1 | 1 | 0 | 0 | 1 |",
+        (ablated, base): f"| 0 | {wrong} |",
+        (ablated, plain): "| +0.0 | +0.0 to +0.0 | 1 | 1 | 0 | 0 | 1 |",
     }  # fmt: skip
     # No base was measured in answer mode, and no student in record mode.
     groups = read_groups(read_table(folder, "paired-micro").replace("\\", ""))
@@ -182,12 +184,12 @@ def test_the_report_has_controls_and_their_differences(runs, report):
     controls = [
         {"mode": "reasoning", "left": "unchanged", "right": "candidate_only", "n": 63,
          "of": "all", "left_accuracy": 0.75, "right_accuracy": 0.5, "difference": 0.25,
-         "low": 0.1, "high": 0.375, "p": 0.001, "only_left": 20,
+         "low": 0.1, "high": 0.375, "p": 0.002, "mcnemar": 0.001, "only_left": 20,
          "only_right": 4},
     ]  # fmt: skip
     update_report(path, rows=[row, row | {"control": "candidate_only"}], controls=controls)
     folder = report(items=1)
-    row = "| all | 75.0 | 50.0 | +25.0 | +10.0 to +37.5 | 20 | 4 | 0.001 | 63 |"
+    row = "| all | 75.0 | 50.0 | +25.0 | +10.0 to +37.5 | 0.002 | 0.002 | 20 | 4 | 0.001 | 63 |"
     assert row in read_table(folder, "paired-select-cot")
     assert read_table(folder, "control-micro-candidate_only")
 
@@ -251,17 +253,22 @@ def test_a_failing_report_keeps_the_previous_one(runs, report):
     before = {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()}
     (runs / "select" / "cot" / "answers.jsonl").unlink()
     with raises_user_error("damaged-file", contains="answers.jsonl"):
-        report(items=1)
+        report(runs=["select/*"], items=1)
     assert {path: path.read_bytes() for path in folder.rglob("*.*") if path.is_file()} == before
 
 
-def test_runs_over_different_items_are_refused(runs, micro, micro_store, report):
+def test_runs_over_different_items_have_separate_tables(runs, micro, micro_store, report):
+    before = read_table(report(items=1), "selection-micro")
     items = micro_store.selection("test")
-    few = select_run(runs, micro_store, micro, "few", right, items[3:])
-    missing = (str(few), "3 only in", *(item.item_id for item in items[:3]))
-    with raises_user_error("different-items", contains=missing):
-        report()
-    assert report(runs=["select/few"], items=1)
+    select_run(runs, micro_store, micro, "few", right, items[3:], model="cot", mode="answer")
+    folder = report(items=500)
+    assert read_table(folder, "selection-micro") == before
+    [few] = (folder / "tables").glob(f"distillation-selection-micro-{len(items) - 3}-items-*.md")
+    assert "cot (answer)" in few.read_text()
+    assert "cot (reasoning)" not in few.read_text()
+    counts = Counter(entry["benchmark"] for entry in page_data(folder)["items"])
+    assert sorted(counts.values()) == [len(items) - 3, len(items)]
+    assert len(read_table(report(runs=["select/few"], items=1), "distillation-selection-micro"))
 
 
 def test_a_retriever_is_compared_with_its_untrained_base(runs, micro, micro_store, report):
@@ -287,11 +294,16 @@ def test_a_retriever_is_compared_with_its_untrained_base(runs, micro, micro_stor
 
 
 @pytest.mark.parametrize("kind", ["select", "similarity", "retrieve", "two_stage"])
-def test_runs_on_different_builds_are_refused(runs, kind, report):
-    [newest] = sorted((runs / kind).iterdir())[-1:]
-    update_report(newest / "report.json", build="later")
-    with raises_user_error("different-builds", contains=("benchmark micro", newest.name)):
-        report()
+def test_runs_on_different_builds_have_separate_tables(runs, kind, report):
+    name = "retrieval" if kind in ("retrieve", "two_stage") else "selection"
+    [other] = sorted((runs / kind).iterdir())[:1]
+    update_report(other / "report.json", build="earlier-build")
+    (other / "run.json").write_text('{"started": "2020-01-01", "earlier_starts": []}')
+    folder = report(items=1)
+    tables = {path.stem for path in (folder / "tables").glob("*.md")}
+    assert {table for table in tables if "build-earlier" in table and name in table}
+    # The build of the most recent run keeps the plain names.
+    assert any(table.endswith(f"{name}-micro") for table in tables)
 
 
 @pytest.mark.parametrize(
@@ -318,8 +330,13 @@ def test_a_damaged_file_is_named(runs, file, content, report):
     else:
         (runs / file).write_text(content)
     with raises_user_error("damaged-file", contains=file):
-        report()
+        report(runs=["select/*", "similarity/*"])
     assert not (runs / "report" / "default" / "report.html").exists()
+    # A report on all runs leaves this one out and says so.
+    page = (report(items=1) / "report.html").read_text()
+    run, _, name = file.rpartition("/")
+    assert f"{run} is left out" in page
+    assert name in page
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_markdown_and_latex_show_every_cell():
 
 
 def test_html_shows_every_cell_as_text():
-    page = render_page([Section("One", [TABLE])], ItemBrowser(), [])
+    page = render_page([Section("One", [TABLE])], ItemBrowser(), [], [])
     table = re.search(r"<table>.*</table>", page, re.DOTALL)[0]
     rows = [
         re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row)

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
-from evaluation.metrics.intervals import mean_with_wilson
+from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.results import (
     RECALLS,
@@ -22,9 +22,9 @@ from evaluation.metrics.results import (
     from_json,
     retrieval_results,
 )
+from evaluation.metrics.selection import Choices, selection_report
 from evaluation.reporting import figures
 from evaluation.reporting.reference import COT_STUDENT
-from evaluation.reporting.selection_report import Choices, selection_result
 from evaluation.reporting.tables import rank_differences_table, retrieval_table, selection_table
 from evaluation.retrieval.exact_search import Ranks
 from tests.evaluation.metrics.reference import ranking_metrics, scene_interval
@@ -46,7 +46,7 @@ def selection() -> SelectionResult:
         for k, family in enumerate(FAMILIES)
     ]  # fmt: skip
     choices = Choices("one", "answer", None, CREDITS, ["A"] * len(items))
-    return selection_result(choices, items, "tiny", seed=4)
+    return selection_report([choices], items, "tiny", "build", seed=4).rows[0]
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +108,11 @@ def test_selection_results_have_horizons_and_an_interval_of_macro(selection):
         family = "time" if name.endswith(" s") else "window"
         parity = name in ("2 s", "16 frames")
         credits = [c for k, c in enumerate(CREDITS) if FAMILIES[k] == family and k % 2 == parity]
-        assert accuracy == mean_with_wilson(np.array(credits))
-    assert selection.families == accuracy_by_family(FAMILIES, CREDITS).families
-    assert selection.macro_interval.value == pytest.approx(selection.macro)
+        assert (accuracy.value, accuracy.n) == (pytest.approx(np.mean(credits)), len(credits))
+    scenes = SceneBootstrap([f"s{k % 9}" for k in range(len(CREDITS))], seed=4)
+    accuracy = accuracy_by_family(FAMILIES, CREDITS, scenes)
+    assert selection.families == accuracy.families
+    assert (selection.macro, selection.micro) == (accuracy.macro, accuracy.micro)
     table = str(selection_table([selection]))
     own, paper = table.split("paper (full benchmark)")
     assert COT_STUDENT in paper

@@ -26,14 +26,15 @@ def vote(
 ) -> dict[str, Any]:
     """Return a vote on an item whose first candidate is correct."""
     return {
-        "annotator": annotator, "item_id": f"i{item}", "family": family, "answer": 0,
+        "annotator": annotator, "item_id": f"i{item}", "scene_id": f"s{item}", "answer": 0,
+        "family": family,
         "choice": choice, "right": choice == 0, "seconds": 10.0 + item,
         "client_seconds": 9.0 + item, "loads": 1, **changes,
     }  # fmt: skip
 
 
 def summarize(votes: list[dict[str, Any]], items: int, annotators: list[str]) -> dict[str, Any]:
-    return summarize_votes(pd.DataFrame(votes), items, annotators)
+    return summarize_votes(pd.DataFrame(votes), items, annotators, seed=0)
 
 
 def sample_votes(rng, items: int, depths: list[int]) -> list[list[int]]:

@@ -1,0 +1,33 @@
+"""Selection accuracies of the baselines, as rows of the report's tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from data.records import SelectionItem
+from data.store import Store
+from data.tracks.baselines import score_baselines
+from evaluation.metrics.results import BASELINE, SelectionResult
+from evaluation.metrics.selection import Choices, selection_report
+
+TITLES = {
+    "nearest": "nearest to the last observed frame",
+    "odd": "odd one out",
+    "first": "first candidate",
+    "latest": "latest candidate",
+    "velocity": "constant velocity to the target's moment",
+}
+"""Name in tables of each reported baseline. Only `velocity` predicts, and it knows the moment."""
+
+
+def baseline_results(
+    items: Sequence[SelectionItem], store: Store, seed: int
+) -> list[SelectionResult]:
+    """Return the accuracies of the baselines on items. `seed` is that of the resampling."""
+    scores = [score_baselines(item, store) for item in items]
+    letters = [None] * len(items)
+    choices = [
+        Choices(title, BASELINE, None, [s[name] for s in scores], letters)
+        for name, title in TITLES.items()
+    ]
+    return selection_report(choices, items, store.name, store.identity, seed).rows

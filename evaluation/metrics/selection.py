@@ -1,0 +1,138 @@
+"""Selection results: the accuracies of a model's choices, and the details of a report."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from data.records import SelectionItem
+from data.tracks.controls import MATCHED_ANCHOR
+from data.tracks.selection.time import CELLS
+from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
+from evaluation.metrics.intervals import SceneBootstrap
+from evaluation.metrics.results import SelectionReport, SelectionResult, accuracy_by_family
+from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
+
+if TYPE_CHECKING:
+    from evaluation.generators.response_log import Answer
+
+
+@dataclass(frozen=True)
+class Choices:
+    """The choices of a model for all items, in one mode and under one control.
+
+    Attributes:
+        credits: For each item, 1 for a correct choice, 1/m if the target is one of m candidates
+            with the highest score, and 0 otherwise.
+        letters: The chosen letters; None for a tie or a response that cannot be parsed.
+        answers: The responses of a student to the items; empty for a retriever.
+    """
+
+    name: str
+    mode: str
+    control: str | None
+    credits: Sequence[float]
+    letters: Sequence[str | None]
+    answers: Sequence[Answer] = ()
+
+    @classmethod
+    def from_answers(
+        cls, name: str, mode: str, control: str | None, answers: Sequence[Answer]
+    ) -> Choices:
+        credits = [float(answer.right) for answer in answers]
+        return cls(name, mode, control, credits, [a.letter for a in answers], answers)
+
+
+def selection_report(
+    choices: Sequence[Choices],
+    items: Sequence[SelectionItem],
+    benchmark: str,
+    build: str,
+    seed: int,
+    suite: str | None = None,
+    asked: Sequence[tuple[str, str | None, str]] = (),
+) -> SelectionReport:
+    """Return the report of the choices of one or several models on the same items.
+
+    Args:
+        benchmark, suite: As in `SelectionResult`.
+        build, asked: As in `SelectionReport`.
+        seed: Seed of the resampling of scenes.
+    """
+    scenes = SceneBootstrap([i.scene_id for i in items], seed)
+    results = [_selection_result(c, items, scenes, benchmark, suite) for c in choices]
+    by_key = {result.key: c for result, c in zip(results, choices, strict=True)}
+    subtypes, letters = [f"{i.family}/{i.subtype}" for i in items], [i.letter for i in items]
+    calibrations = {key: _calibrate(c.answers) for key, c in by_key.items()}
+    return SelectionReport(
+        build,
+        results,
+        controls=_compare_controls(by_key, items, seed),
+        subtypes={key: scenes.group_means(c.credits, subtypes) for key, c in by_key.items()},
+        readings={key: count_readings(c.answers) for key, c in by_key.items() if c.answers},
+        positions={key: measure_position_bias(c.letters, letters) for key, c in by_key.items()},
+        calibration={key: of for key, of in calibrations.items() if of},
+        asked=[*asked],
+    )
+
+
+def _selection_result(
+    choices: Choices,
+    items: Sequence[SelectionItem],
+    scenes: SceneBootstrap,
+    benchmark: str,
+    suite: str | None,
+) -> SelectionResult:
+    accuracy = accuracy_by_family([i.family for i in items], choices.credits, scenes)
+    by_horizon = scenes.group_means(choices.credits, [horizon_of(i) or "" for i in items])
+    # Horizons in frames come first: they are all shorter than one second.
+    ordered = sorted(filter(None, by_horizon), key=lambda h: (h.endswith(" s"), int(h.split()[0])))
+    letters = choices.letters
+    parse_rate = sum(x is not None for x in letters) / len(letters) if choices.answers else None
+    return SelectionResult(
+        benchmark, choices.name, choices.mode, accuracy.families, accuracy.macro, accuracy.micro,
+        parse_rate, len(items), {h: by_horizon[h] for h in ordered}, suite, choices.control,
+    )  # fmt: skip
+
+
+def horizon_of(item: SelectionItem) -> str | None:
+    """Return the horizon in seconds (time family) or in frames (window family), else None."""
+    if item.family == "time":
+        return f"{CELLS[item.subtype]} s"
+    return f"{item.horizon} frames" if item.family == "window" else None
+
+
+def count_readings(answers: Sequence[Answer]) -> dict[str, int]:
+    """Count parsed responses, valid records if the mode requests them, and the others by reason."""
+    counts = {"with a letter": sum(a.letter is not None for a in answers)}
+    if answers[0].valid is not None:
+        counts["  in a valid record"] = sum(a.valid for a in answers)
+    reasons = Counter(f"without: {a.reason}" for a in answers if a.letter is None)
+    return counts | dict(reasons.most_common())
+
+
+def _calibrate(answers: Sequence[Answer]) -> Calibration | None:
+    """Return the calibration of the confidences in valid records; None without valid records."""
+    valid = [answer for answer in answers if answer.valid]
+    return measure_calibration([a.record.confidence for a in valid], [a.right for a in valid])
+
+
+def _compare_controls(
+    choices: Mapping[str, Choices], items: Sequence[SelectionItem], seed: int
+) -> list[PairedComparison]:
+    """Compare the choices without a control with those under each control, and, for matched-anchor
+    items, the choices for the two questions of each pair."""
+    ids = [item.item_id for item in items]
+    credits = {key: dict(zip(ids, c.credits, strict=True)) for key, c in choices.items()}
+    compared = []
+    for key, c in choices.items():
+        if c.control is not None:
+            pair, names = (credits[c.mode], credits[key]), ("unchanged", c.control)
+            differences = compare_runs(items, *pair, names, seed)
+            compared += [replace(p, mode=c.mode) for p in differences]
+        if items[0].suite == MATCHED_ANCHOR:
+            differences = compare_anchors(items, credits[key], seed)
+            compared += [replace(p, mode=key) for p in differences]
+    return compared

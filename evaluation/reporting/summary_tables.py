@@ -1,0 +1,120 @@
+"""The report's tables of several runs, in the paper's groups."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from evaluation.metrics.results import SIMILARITY, RetrievalResult, SelectionResult
+from evaluation.reporting.measurements import TRANSFER_SUITES, Measurement, shared_names
+from evaluation.reporting.reference import table_with_paper
+from evaluation.reporting.table import Row, Table, file_stem
+from evaluation.reporting.tables import (
+    FAMILY_COLUMNS,
+    INTERVAL_NOTE,
+    RECALL_COLUMNS,
+    RETRIEVAL_COLUMNS,
+    SELECTION_COLUMNS,
+    SELECTION_NOTE,
+    retrieval_notes,
+    retrieval_row,
+    selection_rows,
+)
+
+GROUPS = (
+    "similarity scorers",
+    "generative models",
+    "trained",
+    "two-stage predict-then-match",
+    "direct embedders",
+)
+"""Labels of the groups of rows in the report's tables, in their order."""
+BEST = {
+    **dict.fromkeys((*FAMILY_COLUMNS, "Macro", "Micro", *RECALL_COLUMNS, "MRR"), max),
+    "Median": min,
+}
+"""The columns whose best value is marked, with the function that chooses it."""
+BEST_NOTE = "Bold: the best value of a column among these runs, and among the paper's rows."
+
+
+def summary_table(
+    name: str,
+    rows: Sequence[Measurement],
+    people: Sequence[Row] = (),
+    baselines: Sequence[SelectionResult] = (),
+) -> Table:
+    """Return the results of many runs on the same items, in the groups of the paper's tables.
+
+    Args:
+        name: Key below `tables` in `reference.yaml`.
+        people: Rows of human studies.
+        baselines: Results of the baselines on the same items.
+    """
+    groups: dict[str, list[Row]] = {label: [] for label in GROUPS}
+    if isinstance(rows[0].result, SelectionResult):
+        columns, notes = SELECTION_COLUMNS, (SELECTION_NOTE, BEST_NOTE)
+        for m in rows:
+            groups[_group(m)] += selection_rows(m.label, m.result)
+    else:
+        columns, notes = RETRIEVAL_COLUMNS, (*retrieval_notes(rows[0].result), BEST_NOTE)
+        for m in rows:
+            groups[_group(m)].append(retrieval_row(m.name, m.result))
+    baseline_rows = [row for r in baselines for row in selection_rows(r.name, r)]
+    groups["baselines, from the oracle"] = [{**row, "ranked": False} for row in baseline_rows]
+    groups["people, on the items of their study"] = [*people]
+    item_set = rows[0].item_set
+    table = table_with_paper(name, file_stem(f"{name}-{item_set}"), columns, groups, notes)
+    return replace(table, caption=f"{table.caption}, on {item_set}", best=BEST)
+
+
+def _group(m: Measurement) -> str:
+    if isinstance(m.result, RetrievalResult):
+        two_stage = m.run.kind == "two_stage"
+        return "two-stage predict-then-match" if two_stage else "direct embedders"
+    if m.trained:
+        return "trained"
+    return "similarity scorers" if m.result.mode == SIMILARITY else "generative models"
+
+
+def overall_table(
+    name: str, rows: Sequence[Measurement], label: Callable[[Measurement, str], str]
+) -> Table:
+    """Return a table of the accuracies over all items of a benchmark, with a row for each model and
+    a column for each benchmark.
+
+    Args:
+        name: Key below `tables` in `reference.yaml`.
+        label: Returns the name of a result's row from the result and the name of its model.
+    """
+    names, benchmarks = shared_names(rows), _benchmark_columns(rows)
+    columns = list(dict.fromkeys(["In domain", *TRANSFER_SUITES.values(), *benchmarks]))
+    by_label: dict[str, dict[str, Any]] = {}
+    for m, model, column in zip(rows, names, benchmarks, strict=True):
+        empty = {"name": label(m, model), **dict.fromkeys(columns)}
+        by_label.setdefault(empty["name"], empty)[column] = m.result.micro
+    notes = (INTERVAL_NOTE, BEST_NOTE)
+    table = table_with_paper(name, name, columns, {"": [*by_label.values()]}, notes)
+    return replace(table, best=dict.fromkeys(columns, max))
+
+
+def _benchmark_columns(rows: Sequence[Measurement]) -> list[str]:
+    """Return the column of each result: "In domain", a transfer suite, or a benchmark.
+
+    If several benchmarks would have the same column, each gets its own, with its name appended.
+    """
+    trained_on = {m.training_benchmark for m in rows if m.training_benchmark}
+
+    def column(m: Measurement) -> str:
+        # A released model has no training benchmark. It is in domain if a trained model is.
+        if m.benchmark in ({m.training_benchmark} if m.trained else trained_on):
+            return "In domain"
+        simulator = m.run.config.get("benchmark", {}).get("simulator")
+        return TRANSFER_SUITES.get(simulator, m.group)
+
+    benchmarks = Counter(name for name, _ in {(column(m), m.group) for m in rows})
+    return [
+        f"{name} ({m.group})" if benchmarks[name] > 1 else name
+        for m, name in zip(rows, map(column, rows), strict=True)
+    ]
