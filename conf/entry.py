@@ -19,9 +19,10 @@ from omegaconf import DictConfig
 from conf.compose import config_name, preflight, register, validate_settings
 from conf.errors import SettingsError, UserError
 from conf.failures import report_failures
+from conf.files import write_json
 from conf.help import help_text
 from conf.multirun.sweep import run_sweep
-from conf.runs import Run, lock_folder, open_run, rank, run_name, world_size, write_json
+from conf.runs import Run, lock_folder, open_run, rank, run_name, world_size
 
 Metrics = dict[str, float]
 Main = Callable[[Any, Run], Metrics | None]

@@ -10,7 +10,7 @@ import os
 import platform
 import re
 import subprocess
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,6 +21,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from conf.errors import SettingsError, UserError
+from conf.files import write_json, write_text
 
 log = logging.getLogger(__name__)
 
@@ -223,36 +224,6 @@ def compare_settings(before: Any, now: Any) -> list[str]:
         for key in sorted((before.keys() | now.keys()) - RESULT_NEUTRAL_KEYS)
         if before.get(key) != now.get(key)
     ]
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON with sorted keys, atomically."""
-    write_text(path, json.dumps(value, indent=2, sort_keys=True) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically."""
-    part = path.with_name(path.name + ".tmp")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
-
-
-def write_json_lines(path: Path, rows: Iterable[dict[str, Any]]) -> None:
-    """Write one JSON object per line, atomically."""
-    write_text(path, "".join(f"{json.dumps(row)}\n" for row in rows))
-
-
-def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the objects in a file of JSON lines; skip damaged lines, such as a last line that a
-    killed process wrote only in part."""
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for line in file:
-            try:
-                row = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(row, dict):
-                yield row
 
 
 def run_id(run: Run) -> str:

@@ -27,6 +27,7 @@ from data.store import (
     PARTS,
     PLAN,
     Store,
+    built_files,
     component_versions,
     hash_files,
     load_scene,
@@ -56,7 +57,7 @@ Other settings may change, because the name of a file in `PARTS` is a hash of it
 @command("data.build", BuildCommand)
 def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
     workers = Workers(cfg.workers, cfg.parallel)
-    store = ensure_items(cfg.benchmark, Path(cfg.store), workers, cfg.strict)
+    store = ensure_items(cfg.benchmark, Path(cfg.store), workers, cfg.strict, cfg.verify)
     prerender_frames(store, cfg.frames, cfg.frames_gb, workers)
     log.info(summarize_store(store))
     return {name: float(count) for name, count in store.manifest["counts"].items()}
@@ -70,7 +71,9 @@ def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
     return store
 
 
-def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers, strict: bool = False) -> Store:
+def ensure_items(
+    cfg: BenchmarkConfig, root: Path, workers: Workers, strict: bool = False, verify: bool = False
+) -> Store:
     """Open the benchmark `root / cfg.name`; build it first, without frames, if it is missing.
 
     Raises:
@@ -81,7 +84,7 @@ def ensure_items(cfg: BenchmarkConfig, root: Path, workers: Workers, strict: boo
     folder = root / cfg.name
     if not folder.exists():
         build(cfg, folder, workers, strict)
-    store = open_store(folder)
+    store = open_store(folder, verify)
     # The release may have moved since the build.
     config = store.manifest["config"] | ({"folder": cfg.folder} if cfg.folder else {})
     check_same_settings(
@@ -129,7 +132,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
             "counts": counts | invalid | dropped | left_out,
             "shortfalls": shortfalls,
             "scenes": scene_ids,
-            "files": hash_files(partial),
+            "files": hash_files(partial, built_files(partial)),
         }
         write_atomically(partial / MANIFEST, json.dumps(with_checksum(manifest), indent=1).encode())
         partial.rename(folder)

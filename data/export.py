@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 
 from conf.entry import Run, command
-from conf.runs import write_text
+from conf.files import write_text
 from conf.schema import ExportCommand
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from conf.entry import Run, command
-from conf.runs import write_text
+from conf.files import write_text
 from conf.schema import GalleryCommand
 from data.store import write_atomically
 

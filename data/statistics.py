@@ -8,7 +8,7 @@ from pathlib import Path
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import write_text
+from conf.files import write_text
 from conf.schema import StatisticsCommand
 
 log = logging.getLogger(__name__)

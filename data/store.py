@@ -8,8 +8,9 @@
         embeddings/          cache of embeddings of frames and queries
         rationales.jsonl     every response of a teacher
         rationales.parquet   accepted rationales of the last narration
+        checked.json         sizes and times of the files at the last check
 
-The manifest does not cover the last four, which may change after the build.
+The manifest does not cover the last five, which may change after the build.
 
 A build writes to the folder `.<name>.partial` beside the store and renames it when the benchmark is
 complete. Every file is written atomically, so that a killed build resumes with the complete files.
@@ -19,11 +20,12 @@ the release of another simulator.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -47,6 +49,8 @@ from data.tracks.selection.distractors import BUILDERS_VERSION
 from data.world.standins import generator_version
 
 MANIFEST = "manifest.json"
+CHECKED = "checked.json"
+"""Hash, size and time of change of each file when it was last hashed; made by `open_store`."""
 CHECKSUM_KEY = "sha256"
 PLAN = "plan.json"
 """Settings of a build in progress; absent from a complete store."""
@@ -142,13 +146,18 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def hash_files(folder: Path) -> dict[str, str]:
-    """SHA-256 of every scene and every parquet file of a store, by relative path."""
-    paths = [*(folder / SCENES_FOLDER).glob("*.npz"), *folder.glob("*.parquet")]
-    names = sorted(p.relative_to(folder).as_posix() for p in paths)
+def hash_files(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """SHA-256 of files of a store, by relative path."""
+    names = list(names)
     with ThreadPoolExecutor(4) as pool:
         hashes = pool.map(lambda name: hash_file(folder / name), names)
         return dict(zip(names, hashes, strict=True))
+
+
+def built_files(folder: Path) -> list[str]:
+    """Relative paths of every scene and every table of a store, in order."""
+    paths = [*(folder / SCENES_FOLDER).glob("*.npz"), *folder.glob("*.parquet")]
+    return sorted(p.relative_to(folder).as_posix() for p in paths)
 
 
 def with_checksum(manifest: dict[str, Any]) -> dict[str, Any]:
@@ -214,8 +223,14 @@ cached_scene = lru_cache(maxsize=512)(load_scene)
 """`load_scene` that keeps the most recently used scenes in memory."""
 
 
-def open_store(folder: Path) -> Store:
-    """Open a built benchmark and verify the hash of every file that its manifest lists.
+def open_store(folder: Path, verify: bool = False) -> Store:
+    """Open a built benchmark, and check every file that its manifest lists.
+
+    A file is hashed if its size or its time of change differs from those at the last check. Thus
+    all files are hashed when a benchmark is opened for the first time, and few or none later.
+
+    Args:
+        verify: Hash all files.
 
     Raises:
         UserError: `folder` is not a benchmark, was built by another version of the code, or has a
@@ -249,11 +264,40 @@ def open_store(folder: Path) -> Store:
             )
     if manifest != with_checksum(manifest):
         raise refusal(f"{path} was changed after the build", "damaged-file")
-    expected, actual = manifest["files"], hash_files(folder)
-    if missing := expected.keys() - actual.keys():
+    expected = manifest["files"]
+    stats = {name: _size_and_time(folder / name) for name in expected}
+    if missing := [name for name, stat in stats.items() if stat is None]:
         problem = f"{len(missing)} files are missing, such as {folder / min(missing)}"
         raise refusal(problem, "missing-file")
-    if damaged := [name for name in expected if actual[name] != expected[name]]:
+    checked = {} if verify else _read_checked(folder)
+    changed = [name for name in expected if checked.get(name) != [expected[name], *stats[name]]]
+    hashes = hash_files(folder, changed)
+    if damaged := [name for name in changed if hashes[name] != expected[name]]:
         problem = f"{len(damaged)} files differ from the manifest, such as {folder / damaged[0]}"
         raise refusal(problem, "damaged-file")
+    if changed:
+        _write_checked(folder, {name: [expected[name], *stats[name]] for name in expected})
     return Store(folder, manifest)
+
+
+def _size_and_time(path: Path) -> tuple[int, int] | None:
+    """Size in bytes and time of change in ns of a file; None if it is missing."""
+    try:
+        stat = path.stat()
+    except FileNotFoundError:
+        return None
+    return stat.st_size, stat.st_mtime_ns
+
+
+def _read_checked(folder: Path) -> dict[str, list[str | int]]:
+    """Hash, size and time of change of each file at the last check, by relative path."""
+    try:
+        return dict(json.loads((folder / CHECKED).read_text()))
+    except (OSError, ValueError, TypeError):
+        return {}
+
+
+def _write_checked(folder: Path, checked: dict[str, list[str | int]]) -> None:
+    # A store may be read-only: its files are then hashed each time.
+    with contextlib.suppress(OSError):
+        write_atomically(folder / CHECKED, json.dumps(checked).encode())

@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 from conf.entry import Run, command
-from conf.runs import write_text
+from conf.files import write_text
 from conf.schema import ReportCommand
 
 log = logging.getLogger(__name__)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 
 from conf.entry import Run, command
-from conf.runs import write_json_lines
+from conf.files import write_json_lines
 from conf.schema import SimilarityCommand
 
 log = logging.getLogger(__name__)
@@ -17,7 +17,12 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from data.records import FrameRef
     from evaluation.embedders.base import open_retriever
     from evaluation.metrics.results import SIMILARITY
-    from evaluation.metrics.selection import Choices, selection_report
+    from evaluation.metrics.selection import (
+        Choices,
+        choose_letters,
+        credit_choices,
+        selection_report,
+    )
     from evaluation.reporting.selection_report import write_report
     from evaluation.retrieval import nearest_candidate
     from evaluation.select import select_items
@@ -32,9 +37,9 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         embeddings = embedder.embed_frames(candidates)
         log.info("scoring %s items with %s", f"{len(items):,}", name)
         scores = nearest_candidate.score_candidates(items, queries, embeddings, preset)
-        credits = nearest_candidate.credit_choices(scores, [item.answer for item in items])
+        credits = credit_choices(scores, [item.answer for item in items])
         score_rows += nearest_candidate.score_rows(name, items, scores)
-        letters = nearest_candidate.choose_letters(scores)
+        letters = choose_letters(scores)
         choices.append(Choices(name, SIMILARITY, None, credits, letters))
 
     write_json_lines(run.folder / "scores.jsonl", score_rows)

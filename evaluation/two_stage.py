@@ -9,7 +9,7 @@ from pathlib import Path
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import write_json_lines
+from conf.files import write_json_lines
 from conf.schema import ContrastiveCommand, SftCommand, TwoStageCommand
 from conf.schema.evaluation import ROUTES
 

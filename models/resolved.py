@@ -20,7 +20,7 @@ from pathlib import Path
 import yaml
 
 from conf.errors import UserError
-from conf.runs import write_text
+from conf.files import write_text
 from models.fingerprints import Preset, is_hub_model, model_id, pin_revisions, weights_digest
 from models.precision import resolve_precision
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from conf.runs import write_json, write_text
+from conf.files import write_json, write_text
 from data.records import COLORS, MATERIALS, Rationale, SelectionItem
 from teacher.predicates import extract_predicates
 from teacher.validation.validator import WORD

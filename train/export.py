@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import lock_folder, resolve_run_name, runs_folder, write_json
+from conf.files import write_json
+from conf.runs import lock_folder, resolve_run_name, runs_folder
 from conf.schema import ContrastiveCommand, ExportModelCommand, SftCommand
 
 if TYPE_CHECKING:

@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any
 from hydra.core.override_parser.types import Override, RangeSweep
 
 from conf.errors import SettingsError, UserError, import_extra
+from conf.files import write_json
 from conf.gpus import visible_gpus
 from conf.multirun.table import is_lower_better
-from conf.runs import compare_settings, other_settings_error, write_json
+from conf.runs import compare_settings, other_settings_error
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution

@@ -19,10 +19,11 @@ from hydra.utils import instantiate
 
 from conf.compose import compose, compose_config, open_hydra
 from conf.errors import SettingsError
+from conf.files import write_json
 from conf.multirun.launchers import Job
 from conf.multirun.search import Search
 from conf.multirun.table import JOB_FILE, read_job, read_jobs, write_sweep_table
-from conf.runs import changed_settings, run_name, write_json
+from conf.runs import changed_settings, run_name
 
 log = logging.getLogger(__name__)
 

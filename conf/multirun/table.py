@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from conf.runs import write_text
+from conf.files import write_text
 
 JOB_FILE = "job.json"
 AT_START_SUFFIX = "_at_start"

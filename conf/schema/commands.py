@@ -41,6 +41,9 @@ class BuildCommand(CommandConfig):
     """Maximum disk space (GB) of rendered frames; null sets no limit."""
     strict: bool = False
     """Stop the build at an invalid record of a release instead of logging and skipping it."""
+    verify: bool = False
+    """Hash every file of a built benchmark. Otherwise, only files whose size or time of change
+    differs from the last check are hashed."""
     parallel: str = setting("loky", PARALLEL_BACKENDS)
     """loky runs the work in processes of this machine, ray on a Ray cluster."""
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from conf.runs import read_json_lines
+from conf.files import read_json_lines
 from data.records import FrameRef, RetrievalQuery, SelectionItem
 from evaluation.generators.response_schema import Record, read_record
 from models.fingerprints import settings_key

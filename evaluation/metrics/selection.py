@@ -7,12 +7,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from data.records import SelectionItem
+import numpy as np
+
+from data.records import LETTERS, SelectionItem
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.selection.time import CELLS
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
 from evaluation.metrics.intervals import SceneBootstrap
-from evaluation.metrics.results import SelectionReport, SelectionResult, accuracy_by_family
+from evaluation.metrics.results import (
+    BASELINE,
+    SIMILARITY,
+    SelectionReport,
+    SelectionResult,
+    accuracy_by_family,
+)
 from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
 
 if TYPE_CHECKING:
@@ -43,6 +51,23 @@ class Choices:
     ) -> Choices:
         credits = [float(answer.right) for answer in answers]
         return cls(name, mode, control, credits, [a.letter for a in answers], answers)
+
+
+def credit_choices(scores: np.ndarray, answers: Sequence[int]) -> np.ndarray:
+    """Return credits (items,): 1 if the target alone has the highest score, 1/m if m candidates
+    with the target among them have it, and 0 otherwise."""
+    best = is_best(scores)
+    return best[np.arange(len(best)), answers] / best.sum(axis=1)
+
+
+def choose_letters(scores: np.ndarray) -> list[str | None]:
+    """Return the letter of each item's highest score; None for a tie."""
+    return [LETTERS[row.argmax()] if row.sum() == 1 else None for row in is_best(scores)]
+
+
+def is_best(scores: np.ndarray) -> np.ndarray:
+    """Return which candidates (items, candidates) have their item's highest score."""
+    return scores == scores.max(axis=1, keepdims=True)
 
 
 def selection_report(
@@ -89,8 +114,9 @@ def _selection_result(
     by_horizon = scenes.group_means(choices.credits, [horizon_of(i) or "" for i in items])
     # Horizons in frames come first: they are all shorter than one second.
     ordered = sorted(filter(None, by_horizon), key=lambda h: (h.endswith(" s"), int(h.split()[0])))
-    letters = choices.letters
-    parse_rate = sum(x is not None for x in letters) / len(letters) if choices.answers else None
+    letters, parse_rate = choices.letters, None
+    if choices.mode not in (BASELINE, SIMILARITY):
+        parse_rate = sum(x is not None for x in letters) / len(letters)
     return SelectionResult(
         benchmark, choices.name, choices.mode, accuracy.families, accuracy.macro, accuracy.micro,
         parse_rate, len(items), {h: by_horizon[h] for h in ordered}, suite, choices.control,

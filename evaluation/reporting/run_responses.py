@@ -7,11 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
-
 from conf.errors import UserError
-from conf.runs import read_json_lines
+from conf.files import read_json_lines
 from data.records import LETTERS
 from evaluation.metrics.results import SelectionReport, variant_name
 from models.student.answer_parser import Reason, parse_choice
@@ -43,6 +40,8 @@ class ItemResponse:
         return (letter in self.letters) / max(1, len(self.letters))
 
 
+FAILED = ItemResponse("", "", "no scores")
+"""The response of a model of the library that gave no scores for an item."""
 Responses = Mapping[str, ItemResponse]
 """Responses by item id."""
 
@@ -66,7 +65,9 @@ def read_responses(folder: Path, kind: str, report: SelectionReport) -> dict[str
     with reading(folder, file):
         for row in read_json_lines(folder / file):
             if kind == "similarity":
-                variant, response = row["by"], nearest_candidates(row["scores"])
+                scores = row["scores"]
+                response = FAILED if scores is None else nearest_candidates(scores)
+                variant = row["by"]
             elif "text" in row and row["key"] in variants:
                 variant = variants[row["key"]]
                 response = parse_response(str(row["text"]), bool(row["cut"]))
@@ -93,10 +94,9 @@ def parse_response(text: str, truncated: bool) -> ItemResponse:
 @contextmanager
 def reading(folder: Path, file: str = "report.json") -> Iterator[None]:
     """Turn an error in the block, which reads `file` of a run, into a UserError that names it."""
-    failures = (OSError, ValueError, KeyError, TypeError, AttributeError)
     try:
         yield
-    except (*failures, YAMLError, OmegaConfBaseException) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
             f"{folder / file} is missing, damaged or of another version: delete {folder} and run "
             "its command again, or leave the run out with runs=[...]",

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from conf.errors import UserError
 from evaluation.metrics.results import RetrievalReport, SelectionReport, from_json
@@ -127,7 +129,10 @@ def _read_run(folder: Path, title: str) -> FinishedRun:
 
 def _read_settings(folder: Path) -> dict[str, Any]:
     with reading(folder, "config.yaml"):
-        return dict(OmegaConf.to_container(OmegaConf.load(folder / "config.yaml")))
+        try:
+            return dict(OmegaConf.to_container(OmegaConf.load(folder / "config.yaml")))
+        except (YAMLError, OmegaConfBaseException) as error:
+            raise ValueError(str(error)) from error
 
 
 def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:

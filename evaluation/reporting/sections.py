@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
-from conf.runs import read_json_lines
+from conf.files import read_json_lines
 from evaluation.reporting import figures, summary_tables, tables
 from evaluation.reporting.item_browser import ItemBrowser
 from evaluation.reporting.measurements import (

@@ -8,7 +8,7 @@ import logging
 from dataclasses import asdict
 from pathlib import Path
 
-from conf.runs import write_text
+from conf.files import write_text
 from evaluation.metrics.results import SelectionReport
 from evaluation.reporting import tables
 from evaluation.reporting.figures import accuracy_figure

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from conf.schema import RetrieverConfig
-from data.records import LETTERS, SelectionItem
+from data.records import SelectionItem
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.retrieval.exact_search import GridEmbeddings, pair_scores
 
@@ -34,23 +34,6 @@ def score_candidates(
             grids = [GridEmbeddings(r, preset.widths[:1]) for r in (query_rows, frame_rows)]
             columns += pair_scores(*grids)
     return np.stack(columns, axis=1)
-
-
-def credit_choices(scores: np.ndarray, answers: Sequence[int]) -> np.ndarray:
-    """Return credits (items,): 1 if the target alone has the highest score, 1/m if m candidates
-    with the target among them have it, and 0 otherwise."""
-    best = is_best(scores)
-    return best[np.arange(len(best)), answers] / best.sum(axis=1)
-
-
-def choose_letters(scores: np.ndarray) -> list[str | None]:
-    """Return the letter of each item's highest score; None for a tie."""
-    return [LETTERS[row.argmax()] if row.sum() == 1 else None for row in is_best(scores)]
-
-
-def is_best(scores: np.ndarray) -> np.ndarray:
-    """Return which candidates (items, candidates) have their item's highest score."""
-    return scores == scores.max(axis=1, keepdims=True)
 
 
 def score_rows(name: str, items: Sequence[SelectionItem], scores: np.ndarray) -> list[dict]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from conf.runs import write_json_lines, write_text
+from conf.files import write_json_lines, write_text
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store

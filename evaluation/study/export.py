@@ -8,7 +8,8 @@ from pathlib import Path
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.runs import resolve_run_name, write_text
+from conf.files import write_text
+from conf.runs import resolve_run_name
 from conf.schema import ExportStudyCommand
 
 log = logging.getLogger(__name__)

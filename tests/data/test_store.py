@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -13,9 +14,18 @@ import psutil
 import pytest
 
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
+from data import store as stores
 from data.build import build, ensure_benchmark, ensure_items, lock_partial_build
 from data.parallel import Workers
-from data.store import MANIFEST, hash_file, hash_files, open_store, write_atomically
+from data.store import (
+    CHECKED,
+    MANIFEST,
+    built_files,
+    hash_file,
+    hash_files,
+    open_store,
+    write_atomically,
+)
 from data.world.sampling import format_scene_id
 from data.world.scenes import split_scenes
 from tests.user_errors import raises_user_error
@@ -46,10 +56,14 @@ def copy(built: Path, tmp_path: Path) -> Path:
     return tmp_path / "small"
 
 
+def file_hashes(folder: Path) -> dict[str, str]:
+    return hash_files(folder, built_files(folder))
+
+
 def content_hashes(folder: Path) -> dict[str, str]:
     """Hashes of all files of a store by name, and the text of its manifest."""
     frames = {p.name: hash_file(p) for p in (folder / "frames").glob("*.zip")}
-    return {**hash_files(folder), **frames, MANIFEST: (folder / MANIFEST).read_text()}
+    return {**file_hashes(folder), **frames, MANIFEST: (folder / MANIFEST).read_text()}
 
 
 @pytest.mark.slow
@@ -120,7 +134,7 @@ def test_concurrent_builds_make_one_store(tmp_path, built) -> None:
     for other in others:
         other.join(timeout=300)
     assert len(stores) == 2
-    assert hash_files(tmp_path / "small") == hash_files(built)
+    assert file_hashes(tmp_path / "small") == file_hashes(built)
     assert os.listdir(tmp_path) == ["small"]
 
 
@@ -151,6 +165,44 @@ def test_damaged_or_missing_file_is_named(copy, part) -> None:
     path.unlink()
     with raises_user_error("missing-file", contains=path.name):
         open_store(copy)
+
+
+def test_only_files_that_changed_since_the_last_check_are_hashed(copy, monkeypatch) -> None:
+    (copy / CHECKED).unlink(missing_ok=True)
+    hashed: list[str] = []
+
+    def record(path: Path) -> str:
+        hashed.append(path.name)
+        return hash_file(path)
+
+    monkeypatch.setattr(stores, "hash_file", record)
+    files = built_hashes(copy)
+    open_store(copy)
+    assert len(hashed) == len(files)
+    hashed.clear()
+    open_store(copy)
+    assert not hashed
+    table = copy / "selection.parquet"
+    os.utime(table, ns=(0, 0))
+    open_store(copy)
+    assert hashed == [table.name]
+    # Other bytes with the same size and time are found only if all files are hashed.
+    table.write_bytes(b"x" * table.stat().st_size)
+    os.utime(table, ns=(0, 0))
+    open_store(copy)
+    with raises_user_error("damaged-file", contains=table.name):
+        open_store(copy, verify=True)
+
+
+@pytest.mark.parametrize("content", ["", "[1]", "{", '{"selection.parquet": 3}'])
+def test_damaged_record_of_the_last_check_is_replaced(copy, content) -> None:
+    (copy / CHECKED).write_text(content)
+    open_store(copy)
+    assert json.loads((copy / CHECKED).read_text()).keys() == built_hashes(copy).keys()
+
+
+def built_hashes(folder: Path) -> dict[str, str]:
+    return json.loads((folder / MANIFEST).read_text())["files"]
 
 
 VERSION_KEYS = {name: f'"{name}": "'.encode() for name in ("generator", "renderer", "builders")}

@@ -10,7 +10,7 @@ from transformers import ProgressCallback, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf.errors import UserError
-from conf.runs import write_json_lines
+from conf.files import write_json_lines
 from train.common.curves import plot_curves
 from train.common.journal import ANSWERS, CURVES, JOURNAL, read_journal, read_lines
 

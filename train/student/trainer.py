@@ -21,7 +21,8 @@ from torch.utils.data import DataLoader, Sampler
 from transformers import EvalPrediction, Trainer
 
 from conf.errors import UserError
-from conf.runs import rank, write_json
+from conf.files import write_json
+from conf.runs import rank
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
 from train.student.held_out_answers import HeldOutAnswers

@@ -9,7 +9,7 @@ import jsonschema
 import pytest
 
 from conf.entry import Run
-from conf.runs import read_json_lines
+from conf.files import read_json_lines
 from conf.schema import SelectCommand
 from evaluation import select
 from evaluation.generators.response_log import ResponseLog

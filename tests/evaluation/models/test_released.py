@@ -17,7 +17,7 @@ from transformers import AutoModel, AutoProcessor, CLIPModel, Qwen2VLForConditio
 
 from conf.entry import Run
 from conf.errors import UserError
-from conf.runs import read_json_lines
+from conf.files import read_json_lines
 from conf.schema import (
     ContrastiveTrainConfig,
     LoraConfig,
@@ -32,7 +32,7 @@ from evaluation.embedders.base import EMBEDDINGS
 from evaluation.embedders.dual_encoder import unit_rows
 from evaluation.embedders.joint_encoder import load_encoder
 from evaluation.embedders.languagebind import LanguageBindVideo, spread
-from evaluation.retrieval import nearest_candidate
+from evaluation.metrics.selection import choose_letters, credit_choices
 from tests.evaluation.models import released
 from tests.user_errors import raises_user_error
 
@@ -243,15 +243,15 @@ def test_a_released_model_is_measured_by_retrieval(measure, presets) -> None:
 
 def test_tied_candidates_share_the_credit() -> None:
     scores = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [0, 2, 1, 0], [3, 3, 3, 4]], np.float32)
-    assert nearest_candidate.credit_choices(scores, [1, 0, 1, 0]).tolist() == [0.5, 0.25, 1, 0]
+    assert credit_choices(scores, [1, 0, 1, 0]).tolist() == [0.5, 0.25, 1, 0]
 
 
 def test_a_tie_is_not_a_choice() -> None:
     rng = np.random.default_rng(0)
     scores, answers = rng.integers(3, size=(200, 4)).astype(np.float32), rng.integers(4, size=200)
-    chosen = nearest_candidate.choose_letters(scores)
+    chosen = choose_letters(scores)
     # The chosen letter is right exactly where the credit is 1.
-    credits = nearest_candidate.credit_choices(scores, answers)
+    credits = credit_choices(scores, answers)
     right = [c == LETTERS[a] for c, a in zip(chosen, answers, strict=True)]
     assert right == (credits == 1).tolist()
 

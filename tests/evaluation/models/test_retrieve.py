@@ -14,7 +14,7 @@ import torch
 from omegaconf import OmegaConf
 from sentence_transformers import SentenceTransformer
 
-from conf.runs import read_json_lines
+from conf.files import read_json_lines
 from conf.schema import ContrastiveTrainConfig, LateConfig, RetrieveCommand, RetrieverConfig
 from data.render.frame_cache import FrameReader
 from data.store import open_store

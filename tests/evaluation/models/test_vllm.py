@@ -11,7 +11,7 @@ import torch
 from transformers import AutoModelForImageTextToText, AutoProcessor
 
 from conf.entry import Run
-from conf.runs import read_json_lines
+from conf.files import read_json_lines
 from conf.schema import LoraConfig, SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import FrameReader
 from evaluation import select

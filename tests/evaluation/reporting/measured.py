@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from conf.entry import Run
-from conf.runs import write_json_lines
+from conf.files import write_json_lines
 from conf.schema import (
     ContrastiveCommand,
     ReportCommand,
@@ -30,7 +30,12 @@ from data.store import Store
 from evaluation import report
 from evaluation.generators.response_log import score_response
 from evaluation.metrics.results import SIMILARITY, compare_retrievers, retrieval_results
-from evaluation.metrics.selection import Choices, selection_report
+from evaluation.metrics.selection import (
+    Choices,
+    choose_letters,
+    credit_choices,
+    selection_report,
+)
 from evaluation.reporting.selection_report import write_report
 from evaluation.retrieval import nearest_candidate
 from evaluation.retrieval.exact_search import Ranks
@@ -133,8 +138,8 @@ def similarity_run(
         scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
     choices, rows = [], []
     for title, by_item in scores.items():
-        credits = nearest_candidate.credit_choices(by_item, answers)
-        letters = nearest_candidate.choose_letters(by_item)
+        credits = credit_choices(by_item, answers)
+        letters = choose_letters(by_item)
         choices.append(Choices(title, SIMILARITY, None, credits, letters))
         rows += nearest_candidate.score_rows(title, items, by_item)
     folder = root / "similarity" / (model or name)
