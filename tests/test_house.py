@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("conf", "data", "teacher", "models", "train", "evaluation")
+PACKAGES = ("conf", "data", "teacher", "models", "train", "evaluation", "dynapix")
 """The packages in the order of the data flow: each imports only from itself and those before it."""
 HEAVY = {"torch", "transformers", "sentence_transformers", "pybullet", "matplotlib", "datasets"}
 """Packages that take long to import."""

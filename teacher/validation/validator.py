@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from conf.schema import TeacherConfig
 from data.records import LETTERS, SelectionItem
 from teacher.candidate_letters import find_letters
 from teacher.numbers.detection import find_numbers
@@ -13,6 +13,9 @@ from teacher.predicates import Predicates
 from teacher.reading.grounding import Claim
 from teacher.sections import HEADING, SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
+
+if TYPE_CHECKING:
+    from conf.schema import TeacherConfig
 
 VALIDATOR_VERSION = "4"
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")

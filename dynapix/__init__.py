@@ -1,0 +1,81 @@
+"""Measure models that must pick the exact future frame of a physical scene.
+
+    import dynapix
+
+    bench = dynapix.load("tiny", split="test")
+    result = dynapix.evaluate(bench.selection, predict=lambda item: "A")
+    print(result)
+
+Importing this package imports nothing heavy: a module is imported when one of its names is used.
+Reading a built benchmark needs numpy, pyarrow and pillow; building one needs the extra `simulate`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from conf.errors import UserError
+    from dynapix.benchmark import Benchmark, Frame, Item, Query, load
+    from dynapix.rationales import RationaleScore, score_rationale
+    from dynapix.retrieval import RetrievalScores, evaluate_retrieval
+    from dynapix.selection import Comparison, Failure, Outcome, Result, evaluate
+    from evaluation.metrics.ranking import rank_metrics
+    from models.student.answer_parser import ParsedAnswer, parse_choice
+    from teacher.numbers.detection import find_numbers
+
+_HOMES = {
+    "Benchmark": "dynapix.benchmark",
+    "Comparison": "dynapix.selection",
+    "Failure": "dynapix.selection",
+    "Frame": "dynapix.benchmark",
+    "Item": "dynapix.benchmark",
+    "Outcome": "dynapix.selection",
+    "ParsedAnswer": "models.student.answer_parser",
+    "Query": "dynapix.benchmark",
+    "RationaleScore": "dynapix.rationales",
+    "Result": "dynapix.selection",
+    "RetrievalScores": "dynapix.retrieval",
+    "UserError": "conf.errors",
+    "evaluate": "dynapix.selection",
+    "evaluate_retrieval": "dynapix.retrieval",
+    "find_numbers": "teacher.numbers.detection",
+    "load": "dynapix.benchmark",
+    "parse_choice": "models.student.answer_parser",
+    "rank_metrics": "evaluation.metrics.ranking",
+    "score_rationale": "dynapix.rationales",
+}
+"""The module that defines each public name."""
+
+__all__ = [
+    "Benchmark",
+    "Comparison",
+    "Failure",
+    "Frame",
+    "Item",
+    "Outcome",
+    "ParsedAnswer",
+    "Query",
+    "RationaleScore",
+    "Result",
+    "RetrievalScores",
+    "UserError",
+    "evaluate",
+    "evaluate_retrieval",
+    "find_numbers",
+    "load",
+    "parse_choice",
+    "rank_metrics",
+    "score_rationale",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

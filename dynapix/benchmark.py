@@ -1,0 +1,286 @@
+"""Read a benchmark: its selection items, retrieval queries and database of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Generic, TypeVar, overload
+
+import numpy as np
+
+from conf.errors import UserError
+from data.records import (
+    FAMILIES,
+    SPLITS,
+    FrameRef,
+    RetrievalQuery,
+    SelectionItem,
+    sample_prefix_frames,
+)
+from data.render.frame_cache import FrameReader
+from data.store import MANIFEST, Store, open_store
+
+Record = TypeVar("Record")
+
+
+def load(
+    benchmark: str | Path,
+    split: str = "test",
+    *,
+    store: str | Path = "store",
+    frames: int = 12,
+    image_size: int | None = None,
+) -> Benchmark:
+    """Open a benchmark, and build it first if it is a preset that has not been built.
+
+    Args:
+        benchmark: The name of a preset, such as `tiny`, or the folder of a built benchmark.
+        split: `train` or `test`.
+        store: The folder of the built benchmarks.
+        frames: The number of frames of a prefix, evenly spaced. A shorter prefix has all its
+            frames.
+        image_size: Frames are resized to `image_size` x `image_size` px; None keeps their size.
+
+    Raises:
+        UserError: There is no such benchmark, the benchmark is damaged or of another version, or an
+            argument is invalid. Building a benchmark also requires the extra `simulate`.
+    """
+    if split not in SPLITS:
+        raise UserError(f"split={split!r}: choose {' or '.join(SPLITS)}", code="unknown-option")
+    for name, value in (("frames", frames), ("image_size", image_size)):
+        if value is not None and value < 1:
+            raise UserError(f"{name}={value}: give 1 or more", code="invalid-setting")
+    folder = Path(benchmark)
+    if not (folder / MANIFEST).exists():
+        folder = Path(store) / benchmark
+    if not (folder / MANIFEST).exists():
+        return Benchmark(_build(str(benchmark), Path(store)), split, frames, image_size)
+    return Benchmark(open_store(folder), split, frames, image_size)
+
+
+def preset_names() -> list[str]:
+    """Return the names of the benchmark presets."""
+    return sorted(p.name.removesuffix(".yaml") for p in (files("conf") / "benchmark").iterdir())
+
+
+def _build(name: str, root: Path) -> Store:
+    presets = preset_names()
+    if name not in presets:
+        built = sorted(path.parent.name for path in root.glob(f"*/{MANIFEST}"))
+        raise UserError(
+            f"there is no benchmark {name!r}: give a preset ({', '.join(presets)}), a built "
+            f"benchmark in {root} ({', '.join(built) or 'none'}), or the folder of one",
+            code="unknown-benchmark",
+        )
+    try:
+        from conf.compose import compose
+        from conf.schema import BuildCommand
+        from data.build import ensure_benchmark
+    except ImportError as error:
+        raise UserError(
+            f"{root / name} is not built, and building it needs {error.name}: "
+            "pip install 'dynapix[simulate]'",
+            code="missing-package",
+        ) from error
+    cfg = compose("data.build", BuildCommand, [f"benchmark={name}"])
+    return ensure_benchmark(cfg.benchmark, root, cfg.workers)
+
+
+class Lazy(Sequence, Generic[Record]):
+    """A sequence whose elements are made when they are accessed. Slices are such sequences, too."""
+
+    def __init__(self, make: Callable[[Any], Record], records: Sequence[Any]) -> None:
+        self._make, self._records = make, records
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    @overload
+    def __getitem__(self, index: int) -> Record: ...
+    @overload
+    def __getitem__(self, index: slice) -> Lazy[Record]: ...
+    def __getitem__(self, index: int | slice) -> Record | Lazy[Record]:
+        if isinstance(index, slice):
+            return Lazy(self._make, self._records[index])
+        return self._make(self._records[index])
+
+    def __iter__(self) -> Iterator[Record]:
+        return map(self._make, self._records)
+
+    def __repr__(self) -> str:
+        return f"<{len(self):,} records>"
+
+
+@dataclass(frozen=True, repr=False)
+class Clip:
+    """The observed part of a scene: the base class of `Item` and `Query`.
+
+    Attributes:
+        record: The row of the benchmark's table.
+    """
+
+    record: SelectionItem | RetrievalQuery
+    _benchmark: Benchmark = field(compare=False)
+
+    @property
+    def question(self) -> str:
+        return self.record.question
+
+    @property
+    def scene_id(self) -> str:
+        return self.record.scene_id
+
+    @cached_property
+    def _prefix_frames(self) -> list[int]:
+        start, stop = self.record.prefix_start, self.record.prefix_stop
+        return sample_prefix_frames(start, stop, self._benchmark.frames)
+
+    @property
+    def prefix(self) -> np.ndarray:
+        """The observed frames in the order of time: (T, H, W, 3) uint8."""
+        return self._benchmark.reader.stack(self.scene_id, self._prefix_frames)
+
+    @property
+    def times(self) -> np.ndarray:
+        """The time of each frame of `prefix` in seconds from the start of the scene: (T,)."""
+        scene = self._benchmark.store.scene(self.scene_id)
+        return np.array(self._prefix_frames) / scene.fps
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.record.name}: {self.question}>"
+
+
+class Item(Clip):
+    """A selection item: an observed clip, a question and four candidate frames, one of which is
+    right."""
+
+    record: SelectionItem
+
+    @property
+    def item_id(self) -> str:
+        return self.record.item_id
+
+    @property
+    def candidates(self) -> list[np.ndarray]:
+        """The four candidates in the order of the letters A to D, each (H, W, 3) uint8."""
+        reader = self._benchmark.reader
+        return [reader.array(c.scene_id, c.frame) for c in self.record.candidates]
+
+    @property
+    def answer(self) -> str:
+        """The letter of the right candidate, A to D."""
+        return self.record.letter
+
+    @property
+    def index(self) -> int:
+        """The index of the right candidate in `candidates`, 0 to 3."""
+        return self.record.answer
+
+    @property
+    def family(self) -> str:
+        """event, time or window."""
+        return self.record.family
+
+    @property
+    def subtype(self) -> str:
+        """The kind of item within its family."""
+        return self.record.subtype
+
+
+class Query(Clip):
+    """A retrieval query: an observed clip and a question that a frame of the database answers."""
+
+    record: RetrievalQuery
+
+    @property
+    def query_id(self) -> str:
+        return self.record.query_id
+
+    @property
+    def target(self) -> Frame:
+        """The frame that answers the query."""
+        return Frame(self.record.target, self._benchmark)
+
+    @property
+    def hard_negatives(self) -> list[Frame]:
+        """Similar frames that do not answer the query."""
+        return [Frame(ref, self._benchmark) for ref in self.record.hard_negatives]
+
+
+@dataclass(frozen=True, repr=False)
+class Frame:
+    """A frame of a database."""
+
+    ref: FrameRef
+    _benchmark: Benchmark = field(compare=False)
+
+    @property
+    def name(self) -> str:
+        """SCENE_ID/FRAME_INDEX."""
+        return self.ref.name
+
+    @property
+    def image(self) -> np.ndarray:
+        """(H, W, 3) uint8."""
+        return self._benchmark.reader.array(self.ref.scene_id, self.ref.frame)
+
+    def __repr__(self) -> str:
+        return f"<Frame {self.name}>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Benchmark:
+    """One split of a built benchmark. `load` returns it.
+
+    Attributes:
+        store: The benchmark on the disk.
+        split: train or test.
+        frames, image_size: As in `load`.
+    """
+
+    store: Store
+    split: str
+    frames: int
+    image_size: int | None
+
+    @property
+    def name(self) -> str:
+        return self.store.name
+
+    @cached_property
+    def reader(self) -> FrameReader:
+        """Reads pixels, and keeps the most recently used frames in memory."""
+        return FrameReader(self.store, self.image_size)
+
+    @cached_property
+    def selection(self) -> Lazy[Item]:
+        """The selection items of the split."""
+        return Lazy(lambda record: Item(record, self), self.store.selection(self.split))
+
+    @cached_property
+    def retrieval(self) -> Lazy[Query]:
+        """The retrieval queries of the split; of the test split, those of the standard test, whose
+        targets are in `database`."""
+        test = self.split == "test"
+        records = self.store.standard_test() if test else self.store.retrieval(self.split)
+        return Lazy(lambda record: Query(record, self), records)
+
+    @cached_property
+    def database(self) -> Lazy[Frame]:
+        """The frames to rank for `retrieval`: the standard test's database, or, of the train split,
+        the database of all future-state queries."""
+        name = "test" if self.split == "test" else "future"
+        return Lazy(lambda ref: Frame(ref, self), self.store.database(name))
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{self._count(family)} {family}" for family in FAMILIES)
+        return (
+            f"<Benchmark {self.name}, {self.split}: {len(self.selection):,} selection items "
+            f"({counts}), {len(self.retrieval):,} queries over {len(self.database):,} frames>"
+        )
+
+    def _count(self, family: str) -> int:
+        return sum(item.family == family for item in self.selection)

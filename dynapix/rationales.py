@@ -1,0 +1,72 @@
+"""Score a rationale by what the simulator knows about its item."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from conf.errors import UserError
+from dynapix.benchmark import Item
+from teacher.numbers.detection import find_numbers
+from teacher.predicates import extract_predicates
+from teacher.reading.grounding import VERDICTS, Claim
+from teacher.validation.claim_extraction import extract_claims
+
+
+@dataclass(frozen=True)
+class RationaleScore:
+    """What a rationale states.
+
+    Attributes:
+        numbers: The numbers in the text, such as "two", as they are written.
+        claims: The statements that predicates can confirm or refute, each with its verdict.
+    """
+
+    numbers: tuple[str, ...]
+    claims: tuple[Claim, ...]
+
+    @property
+    def supported(self) -> list[Claim]:
+        """The claims that the predicates confirm."""
+        return self._with_verdict("supported")
+
+    @property
+    def contradicted(self) -> list[Claim]:
+        """The claims that the predicates refute."""
+        return self._with_verdict("contradicted")
+
+    @property
+    def unknown(self) -> list[Claim]:
+        """The claims that the predicates neither confirm nor refute."""
+        return self._with_verdict("unknown")
+
+    def _with_verdict(self, verdict: str) -> list[Claim]:
+        return [claim for claim in self.claims if claim.verdict == verdict]
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{len(self._with_verdict(name))} {name}" for name in VERDICTS)
+        parts = [f"claims: {counts}", f"numbers: {', '.join(self.numbers) or 'none'}"]
+        if self.contradicted:
+            parts.append(f"contradicted: {', '.join(map(str, self.contradicted))}")
+        return "; ".join(parts)
+
+
+def score_rationale(item: Item, text: str) -> RationaleScore:
+    """Find the numbers and the claims of a rationale, and compare the claims with the oracle.
+
+    Args:
+        item: The selection item that the rationale is about.
+        text: The rationale. Claims are read in sections with headings such as "Prediction:", as
+            the teacher writes them. A text without headings has no claims.
+
+    Raises:
+        UserError: The item has no predicates, because a collision follows its prefix too early.
+    """
+    store = item._benchmark.store
+    predicates = extract_predicates(item.record, store.scene(item.scene_id), store.scene)
+    if predicates is None:
+        raise UserError(
+            f"{item.item_id} has no predicates: a collision follows its prefix too early",
+            code="no-predicates",
+        )
+    numbers = tuple(text[start:stop] for start, stop in find_numbers(text))
+    return RationaleScore(numbers, extract_claims(text, predicates))

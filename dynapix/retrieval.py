@@ -1,0 +1,135 @@
+"""Evaluate the embeddings of a model on retrieval queries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from conf.errors import UserError
+from dynapix.benchmark import Benchmark, Query
+from evaluation.metrics.results import RetrievalResult, retrieval_results
+from evaluation.retrieval.exact_search import Ranks, exact_ranks
+
+Embeddings = np.ndarray | Mapping[str, Sequence[float]]
+"""An array with a row for each query or frame, or vectors by `Query.query_id` or `Frame.name`."""
+
+
+@dataclass(frozen=True, repr=False)
+class RetrievalScores:
+    """The result of `evaluate_retrieval`. Printing it shows the table of
+    `python -m evaluation.retrieve`.
+
+    Attributes:
+        rows: The measures with 95% intervals over scenes: over all queries at each width, widest
+            first, then for each builder.
+        ranks: The number of frames above each query's target, and tied with it, at each width.
+    """
+
+    rows: list[RetrievalResult]
+    ranks: Ranks
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """`recall@k`, `mrr`, `median_rank` and `tie_rate` over all queries, at the widest width."""
+        return {name: measure.value for name, measure in self.rows[0].measures.items()}
+
+    def __str__(self) -> str:
+        from evaluation.reporting.tables import retrieval_table
+
+        return str(retrieval_table(self.rows))
+
+    def __repr__(self) -> str:
+        return f"<RetrievalScores {self.metrics}>"
+
+
+def evaluate_retrieval(
+    queries: Sequence[Query],
+    query_embeddings: Embeddings,
+    frame_embeddings: Embeddings,
+    *,
+    widths: Sequence[int] | None = None,
+    name: str = "model",
+    seed: int = 0,
+) -> RetrievalScores:
+    """Rank every frame of the database for each query by cosine similarity.
+
+    Frames that tie with the target count by their mean over all orders of the tied frames.
+
+    Args:
+        queries: `Benchmark.retrieval`, or some of its queries.
+        query_embeddings: (queries, width), in the order of `queries`, or vectors by query id.
+        frame_embeddings: (frames, width), in the order of `Benchmark.database`, or vectors by the
+            name of the frame.
+        widths: The Matryoshka widths to rank at; None ranks at the width of the embeddings.
+        name: The model's name in tables.
+        seed: Seed of the bootstrap over scenes.
+
+    Raises:
+        UserError: There are no queries, or the embeddings have another shape, are not finite, or
+            are not those of the queries and of the database.
+    """
+    queries = list(queries)
+    if not queries:
+        raise UserError("there are no queries to evaluate", code="no-items")
+    benchmark: Benchmark = queries[0]._benchmark
+    names = [frame.name for frame in benchmark.database]
+    query_rows = _rows(query_embeddings, [q.query_id for q in queries], "query")
+    frame_rows = _rows(frame_embeddings, names, "frame")
+    width = query_rows.shape[1]
+    if width != frame_rows.shape[1]:
+        raise UserError(
+            f"query embeddings have the width {width}, and frame embeddings "
+            f"{frame_rows.shape[1]}: embed both with one model",
+            code="invalid-embeddings",
+        )
+    ranked_widths = sorted(set(widths or [width]), reverse=True)
+    if ranked_widths[-1] < 1 or ranked_widths[0] > width:
+        raise UserError(
+            f"widths={list(widths or [])}: give widths from 1 to {width}", code="invalid-setting"
+        )
+    index = {frame: k for k, frame in enumerate(names)}
+    if missing := [q.target.name for q in queries if q.target.name not in index]:
+        raise UserError(
+            f"the database lacks {len(missing)} targets, such as {missing[0]}: evaluate "
+            "Benchmark.retrieval of the test split",
+            code="missing-targets",
+        )
+    targets = frame_rows[[index[q.target.name] for q in queries]]
+    ranks = exact_ranks(query_rows, targets, [frame_rows], ranked_widths)
+    records = [q.record for q in queries]
+    return RetrievalScores(retrieval_results(benchmark.name, name, ranks, records, seed), ranks)
+
+
+def _rows(embeddings: Embeddings, names: Sequence[str], kind: str) -> np.ndarray:
+    """Return the embeddings as finite fp32 rows in the order of `names`."""
+    if isinstance(embeddings, Mapping):
+        if missing := [name for name in names if name not in embeddings]:
+            raise UserError(
+                f"{len(missing)} of {len(names)} {kind} embeddings are missing, such as that of "
+                f"{missing[0]}: embed the queries and the database of this benchmark",
+                code="invalid-embeddings",
+            )
+        embeddings = [embeddings[name] for name in names]
+    try:
+        rows = np.asarray(embeddings, np.float32)
+    except (TypeError, ValueError) as error:
+        raise UserError(
+            f"{kind} embeddings are not an array of numbers: {error}", code="invalid-embeddings"
+        ) from error
+    if rows.ndim != 2 or len(rows) != len(names) or not rows.shape[1]:
+        expected = "queries" if kind == "query" else "frames of the database"
+        raise UserError(
+            f"{kind} embeddings have the shape {rows.shape}: give one row for each of the "
+            f"{len(names)} {expected}",
+            code="invalid-embeddings",
+        )
+    finite = np.isfinite(rows).all(axis=1)
+    if not finite.all():
+        raise UserError(
+            f"{int((~finite).sum())} {kind} embeddings have NaN or infinite entries, such as that "
+            f"of {names[int(np.argmin(finite))]}",
+            code="invalid-embeddings",
+        )
+    return rows

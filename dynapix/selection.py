@@ -1,0 +1,351 @@
+"""Evaluate a model on selection items."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from conf.errors import UserError
+from conf.files import write_json, write_json_lines, write_text
+from data.records import LETTERS
+from dynapix.benchmark import Benchmark, Item
+from evaluation.metrics.results import SIMILARITY, SelectionReport, SelectionResult
+from evaluation.metrics.selection import Choices, choose_letters, credit_choices, selection_report
+from evaluation.metrics.significance import PairedComparison, compare_runs
+from models.student.answer_parser import parse_choice
+
+TEXT = "text"
+"""Mode of results whose predictions are letters or texts."""
+SYSTEMATIC = 8
+"""An evaluation stops if at least this many items, and all items so far, have failed."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An item for which `predict` gave no usable prediction. The item counts as wrong."""
+
+    item_id: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a model predicted for an item.
+
+    Attributes:
+        text: The predicted letter or text; None for scores and failures.
+        scores: The four scores; None for texts and failures.
+        letter: The chosen letter; None for a tie, a failure, or a text without a clear letter.
+        credit: 1 for a correct choice, 1/m if the target is one of m candidates with the highest
+            score, and 0 otherwise.
+        reason: Why a text has no letter, or why the item failed.
+    """
+
+    item_id: str
+    text: str | None
+    scores: tuple[float, ...] | None
+    letter: str | None
+    credit: float
+    reason: str | None = None
+
+    @property
+    def failed(self) -> bool:
+        return self.text is None and self.scores is None
+
+
+def evaluate(
+    items: Sequence[Item],
+    predict: Callable[[Any], Any],
+    *,
+    batch_size: int | None = None,
+    name: str = "model",
+    seed: int = 0,
+    progress: bool = True,
+) -> Result:
+    """Evaluate a model on selection items of one benchmark.
+
+    Args:
+        items: `Benchmark.selection`, or some of its items.
+        predict: Returns the prediction for an item: a letter, a text that states one (it is parsed
+            by `parse_choice`), or four scores, of which the highest is chosen. With `batch_size`,
+            it receives a list of items and returns a list of predictions. If it raises an exception
+            or returns anything else, the items count as wrong and are in `Result.failures`.
+        batch_size: The number of items per call; None passes one item at a time.
+        name: The model's name in tables.
+        seed: Seed of the resampling of scenes.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        UserError: There are no items or items of several benchmarks, `predict` returns another
+            number of predictions than it received items, or the first items all fail.
+    """
+    items = list(items)
+    if not items or len({id(item._benchmark) for item in items}) > 1:
+        problem = "items of several benchmarks" if items else "no items"
+        raise UserError(
+            f"{problem}: give Benchmark.selection or some of its items", code="invalid-items"
+        )
+    if batch_size is not None and batch_size < 1:
+        raise UserError(f"batch_size={batch_size}: give 1 or more", code="invalid-setting")
+    outcomes: list[Outcome] = []
+    size = batch_size or 1
+    with tqdm(total=len(items), desc=name, unit="item", disable=not progress) as bar:
+        for start in range(0, len(items), size):
+            batch = items[start : start + size]
+            outcomes += _predict_batch(predict, batch, single=batch_size is None)
+            bar.update(len(batch))
+            _stop_if_all_failed(outcomes, len(items))
+    return Result(items[0]._benchmark, name, tuple(items), tuple(outcomes), seed)
+
+
+def _predict_batch(predict: Callable[[Any], Any], batch: list[Item], single: bool) -> list[Outcome]:
+    try:
+        predictions = [predict(batch[0])] if single else list(predict(batch))
+    except Exception as error:
+        reason = f"predict raised {type(error).__name__}: {error}"
+        return [_failure(item, reason) for item in batch]
+    if len(predictions) != len(batch):
+        raise UserError(
+            f"predict returned {len(predictions)} predictions for a batch of {len(batch)} items: "
+            "return one for each item, in their order",
+            code="invalid-prediction",
+        )
+    return [_read(item, of_item) for item, of_item in zip(batch, predictions, strict=True)]
+
+
+def _read(item: Item, prediction: Any) -> Outcome:
+    if isinstance(prediction, str):
+        parsed = parse_choice(prediction)
+        reason = str(parsed.reason) if parsed.letter is None else None
+        right = float(parsed.letter == item.answer)
+        return Outcome(item.item_id, prediction, None, parsed.letter, right, reason)
+    try:
+        scores = np.asarray(prediction, float)
+    except (TypeError, ValueError):
+        return _failure(item, f"predict returned {_shorten(prediction)}")
+    if scores.shape != (len(LETTERS),):
+        return _failure(item, f"predict returned {_shorten(prediction)}")
+    if not np.isfinite(scores).all():
+        return _failure(item, f"predict returned the scores {scores.tolist()}, not all finite")
+    [letter], credit = choose_letters(scores[None]), credit_choices(scores[None], [item.index])
+    reason = None if letter else "tied scores"
+    return Outcome(item.item_id, None, tuple(scores.tolist()), letter, float(credit[0]), reason)
+
+
+def _failure(item: Item, reason: str) -> Outcome:
+    return Outcome(item.item_id, None, None, None, 0.0, reason)
+
+
+def _shorten(prediction: Any) -> str:
+    text, kind = repr(prediction), type(prediction).__name__
+    shortened = text if len(text) <= 60 else f"{text[:57]}..."
+    return f"{shortened} ({kind}) instead of a letter, a text, or four scores"
+
+
+def _stop_if_all_failed(outcomes: Sequence[Outcome], total: int) -> None:
+    if len(outcomes) >= min(SYSTEMATIC, total) and all(o.failed for o in outcomes):
+        raise UserError(
+            f"all of the first {len(outcomes)} items failed; {outcomes[0].item_id}: "
+            f"{outcomes[0].reason}",
+            code="invalid-prediction",
+        )
+
+
+class Comparison(tuple[PairedComparison, ...]):
+    """Paired comparisons of two results, which are printed as a table."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        from evaluation.reporting.tables import paired_table
+
+        return str(paired_table(self))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result:
+    """The result of `evaluate`. Printing it shows the table of `python -m evaluation.select`.
+
+    Attributes:
+        benchmark: The benchmark of the items.
+        name: The model's name.
+        items: The items, in the order of evaluation.
+        outcomes: The model's prediction for each item, with its credit.
+        seed: Seed of the resampling of scenes.
+    """
+
+    benchmark: Benchmark
+    name: str
+    items: tuple[Item, ...]
+    outcomes: tuple[Outcome, ...]
+    seed: int = 0
+    _texts: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        kinds = {o.scores is None for o in self.outcomes if not o.failed}
+        if len(kinds) > 1:
+            raise UserError(
+                "predict returned texts for some items and scores for others: return one of both",
+                code="invalid-prediction",
+            )
+        object.__setattr__(self, "_texts", kinds != {False})
+
+    @cached_property
+    def failures(self) -> list[Failure]:
+        """The items without a usable prediction, and why."""
+        return [Failure(o.item_id, o.reason or "") for o in self.outcomes if o.failed]
+
+    @cached_property
+    def report(self) -> SelectionReport:
+        """All tables' numbers: accuracies with intervals, by subtype, by letter."""
+        mode = TEXT if self._texts else SIMILARITY
+        credits = [o.credit for o in self.outcomes]
+        letters = [o.letter for o in self.outcomes]
+        choices = Choices(self.name, mode, None, credits, letters)
+        records = [item.record for item in self.items]
+        name, build = self.benchmark.name, self.benchmark.store.identity
+        asked = [(TEXT, None, TEXT)] if self._texts else []
+        return selection_report([choices], records, name, build, self.seed, asked=asked)
+
+    @property
+    def accuracy(self) -> SelectionResult:
+        """Accuracy by family, macro and micro, with 95% intervals over scenes."""
+        return self.report.rows[0]
+
+    def compare(self, other: Result) -> Comparison:
+        """Compare with another result on the same items, by family, macro, and over all items.
+
+        Returns:
+            Comparisons with the paired difference (this result minus `other`), its 95% interval
+            over scenes, the p-value of the sign-flip test over scenes, and McNemar's p-value.
+            Printing them shows a table.
+
+        Raises:
+            UserError: `other` is on other items, or on another build of the benchmark.
+        """
+        builds = [r.benchmark.store.identity for r in (self, other)]
+        if builds[0] != builds[1]:
+            raise UserError(
+                f"{self.name} and {other.name} are results on different benchmarks or builds "
+                f"({self.benchmark.name} {builds[0]}, {other.benchmark.name} {builds[1]})",
+                code="different-builds",
+            )
+        left, right = ({o.item_id: o.credit for o in r.outcomes} for r in (self, other))
+        records = [item.record for item in self.items]
+        return Comparison(compare_runs(records, left, right, (self.name, other.name), self.seed))
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the result as a run, and return its folder.
+
+        `python -m evaluation.report` shows the results in the folder runs/ beside other runs.
+        `Result.load` reads it.
+
+        Raises:
+            UserError: The folder exists and contains something else.
+        """
+        folder = Path(folder)
+        if folder.exists() and any(folder.iterdir()) and not (folder / "run.json").exists():
+            raise UserError(
+                f"{folder} contains other files: choose a new folder", code="other-files"
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        # The run counts as finished when metrics.json exists.
+        (folder / "metrics.json").unlink(missing_ok=True)
+        settings = {"benchmark": self.benchmark.store.manifest["config"], "model": None}
+        write_text(folder / "config.yaml", json.dumps(settings, indent=1) + "\n")
+        started = datetime.now(UTC).isoformat(timespec="seconds")
+        kind = "select" if self._texts else "similarity"
+        record = {"command": "dynapix.evaluate", "kind": kind, "name": self.name, "seed": self.seed}
+        write_json(folder / "run.json", {**record, "started": started, "earlier_starts": []})
+        if self._texts:
+            rows = [
+                {
+                    "key": TEXT,
+                    "mode": TEXT,
+                    "item_id": o.item_id,
+                    "text": o.text or "",
+                    "cut": False,
+                }
+                for o in self.outcomes
+            ]
+            write_json_lines(folder / "answers.jsonl", rows)
+        else:
+            rows = [
+                {"by": self.name, "item_id": o.item_id, "scores": o.scores} for o in self.outcomes
+            ]
+            write_json_lines(folder / "scores.jsonl", rows)
+        write_json_lines(folder / "failures.jsonl", map(asdict, self.failures))
+        write_json(folder / "report.json", asdict(self.report))
+        write_text(folder / "report.txt", f"{self}\n")
+        write_json(folder / "metrics.json", self.accuracy.metrics)
+        return folder
+
+    @classmethod
+    def load(cls, folder: str | Path, benchmark: Benchmark) -> Result:
+        """Read a result that `save` wrote.
+
+        Args:
+            benchmark: The benchmark that the result is on.
+
+        Raises:
+            UserError: The folder has no saved result, or its items are not those of `benchmark`.
+        """
+        folder = Path(folder)
+        try:
+            record = json.loads((folder / "run.json").read_text())
+            report = json.loads((folder / "report.json").read_text())
+            kind, name, seed = record["kind"], record["name"], record["seed"]
+            file = "answers.jsonl" if kind == "select" else "scores.jsonl"
+            rows = [json.loads(line) for line in (folder / file).read_text().splitlines()]
+            lines = (folder / "failures.jsonl").read_text().splitlines()
+            failed = {row["item_id"]: row["reason"] for row in map(json.loads, lines)}
+            build = report["build"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(
+                f"{folder} is not a saved result, or it is damaged: {error}", code="damaged-file"
+            ) from error
+        if build != benchmark.store.identity:
+            raise UserError(
+                f"{folder} is a result on another benchmark or build than {benchmark.store.folder}",
+                code="different-builds",
+            )
+        by_id = {item.item_id: item for item in benchmark.selection}
+        if missing := [row["item_id"] for row in rows if row["item_id"] not in by_id]:
+            raise UserError(
+                f"{folder} has {len(missing)} items that the {benchmark.split} split of "
+                f"{benchmark.name} does not have, such as {missing[0]}",
+                code="different-items",
+            )
+        items = [by_id[row["item_id"]] for row in rows]
+        outcomes = [
+            _failure(item, failed[item.item_id])
+            if item.item_id in failed
+            else _read(item, row["text"] if kind == "select" else row["scores"])
+            for item, row in zip(items, rows, strict=True)
+        ]
+        return cls(benchmark, name, tuple(items), tuple(outcomes), seed)
+
+    def __str__(self) -> str:
+        from evaluation.reporting.tables import selection_table
+
+        lines = [str(selection_table([self.accuracy], self.items[0].record.suite))]
+        if self.failures:
+            reasons = Counter(failure.reason for failure in self.failures)
+            [(reason, count)] = reasons.most_common(1)
+            lines.append(
+                f"{len(self.failures)} items failed and count as wrong. Most frequent reason "
+                f"({count}): {reason}."
+            )
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"<Result of {self.name}: macro {self.accuracy.macro.value:.3f}>"

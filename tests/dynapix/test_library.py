@@ -1,0 +1,345 @@
+"""The library: it imports fast, reads a benchmark, and scores as the commands do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dynapix
+from data.render.frame_cache import FrameReader
+from data.store import MANIFEST
+from dynapix.__main__ import COMMANDS, overview
+from dynapix.selection import SYSTEMATIC
+from evaluation.metrics.selection import Choices, selection_report
+from evaluation.reporting.tables import selection_table
+from tests.evaluation.reporting.measured import run_report
+from tests.test_house import COMMANDS as ALL_COMMANDS
+from tests.user_errors import raises_user_error
+
+READING = {"numpy", "pyarrow", "PIL"}
+"""The packages that reading a benchmark may import."""
+OWN = {"conf", "data", "dynapix", "evaluation", "models", "teacher"}
+
+
+@pytest.fixture(scope="module")
+def bench(micro_store) -> dynapix.Benchmark:
+    return dynapix.load(micro_store.folder)
+
+
+def always_a(item: dynapix.Item) -> str:
+    return "A"
+
+
+def nearest(item: dynapix.Item) -> list[float]:
+    last = item.prefix[-1].astype(float)
+    return [-np.abs(candidate - last).mean() for candidate in item.candidates]
+
+
+def imported_packages(code: str, folder: Path) -> set[str]:
+    """Return the packages outside the standard library that a process imports."""
+    report = (
+        "\nimport json, sys\n"
+        "roots = {name.split('.')[0] for name in sys.modules} - set(sys.stdlib_module_names)\n"
+        "print(json.dumps(sorted(roots)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code + report],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    roots = set(json.loads(done.stdout.splitlines()[-1]))
+    return {r for r in roots if not r.startswith("_")} - OWN - {"cython_runtime", "cloudpickle"}
+
+
+def test_importing_the_library_imports_no_other_package() -> None:
+    assert imported_packages("import dynapix; dir(dynapix)", Path.cwd()) == set()
+
+
+def test_reading_a_benchmark_needs_three_packages(micro_store) -> None:
+    code = (
+        f"import dynapix; bench = dynapix.load({str(micro_store.folder)!r})\n"
+        "item = bench.selection[0]; item.prefix, item.times, item.candidates\n"
+        "bench.retrieval[0].target.image, bench.database[0].image"
+    )
+    assert imported_packages(code, Path.cwd()) == READING
+
+
+def test_every_public_name_exists_and_has_a_docstring() -> None:
+    assert dir(dynapix) == sorted(dynapix.__all__)
+    for name in dynapix.__all__:
+        assert getattr(dynapix, name).__doc__, name
+    with pytest.raises(AttributeError, match="has no attribute 'evaluat'"):
+        dynapix.evaluat  # noqa: B018
+
+
+def test_the_overview_names_every_command_and_public_name() -> None:
+    text = overview()
+    assert sorted(COMMANDS) == ALL_COMMANDS
+    assert all(name in text for name in (*ALL_COMMANDS, *dynapix.__all__, "tiny", "make run"))
+    assert max(map(len, text.splitlines()[:5])) <= 100
+
+
+def test_items_are_those_of_the_store(bench, micro_store) -> None:
+    records = micro_store.selection("test")
+    assert [item.record for item in bench.selection] == records
+    frames = FrameReader(micro_store)
+    for item, record in zip(bench.selection, records, strict=True):
+        count = min(12, record.prefix_stop - record.prefix_start + 1)
+        assert item.prefix.shape == (count, 128, 192, 3)
+        assert item.prefix.dtype == np.uint8
+        first = frames.array(record.scene_id, record.prefix_start)
+        assert np.array_equal(item.prefix[0], first)
+        assert item.times[0] == record.prefix_start / 25
+        assert item.times[-1] == record.prefix_stop / 25
+        target = frames.array(record.scene_id, record.target_frame)
+        assert np.array_equal(item.candidates["ABCD".index(item.answer)], target)
+        assert (item.question, item.family) == (record.question, record.family)
+    few = bench.selection[2:5]
+    assert [item.item_id for item in few] == [record.item_id for record in records[2:5]]
+
+
+def test_queries_and_frames_are_those_of_the_store(bench, micro_store) -> None:
+    assert [query.record for query in bench.retrieval] == micro_store.standard_test()
+    names = {frame.name for frame in bench.database}
+    assert names == {ref.name for ref in micro_store.database("test")}
+    assert all(query.target.name in names for query in bench.retrieval)
+    train = dynapix.load(micro_store.folder, split="train")
+    assert [query.record for query in train.retrieval] == micro_store.retrieval("train")
+    names = {frame.name for frame in train.database}
+    assert all(query.target.name in names for query in train.retrieval)
+
+
+def test_a_result_is_the_report_of_the_command(bench, micro_store) -> None:
+    result = dynapix.evaluate(bench.selection, always_a, progress=False, seed=3)
+    items = micro_store.selection("test")
+    credits = [float(item.letter == "A") for item in items]
+    choices = Choices("model", "text", None, credits, ["A"] * len(items))
+    report = selection_report([choices], items, "micro", micro_store.identity, 3)
+    assert result.accuracy == report.rows[0]
+    assert str(selection_table(report.rows)) in str(result)
+
+
+def test_letters_texts_and_scores_give_equal_credits(bench) -> None:
+    def scores(item: dynapix.Item) -> np.ndarray:
+        return np.eye(4)[item.index]
+
+    def text(item: dynapix.Item) -> str:
+        return f"The ball rolls on.\nAnswer: {item.answer}"
+
+    for predict in (scores, text, lambda item: item.answer):
+        result = dynapix.evaluate(bench.selection, predict, progress=False)
+        assert result.accuracy.macro.value == 1
+    tied = dynapix.evaluate(bench.selection, lambda item: [1, 1, 1, 1], progress=False)
+    assert tied.accuracy.micro.value == 0.25
+    batches: list[int] = []
+
+    def in_batches(items: list[dynapix.Item]) -> list[str]:
+        batches.append(len(items))
+        return [item.answer for item in items]
+
+    result = dynapix.evaluate(bench.selection, in_batches, batch_size=7, progress=False)
+    assert result.accuracy.macro.value == 1
+    assert sum(batches) == len(bench.selection)
+    assert set(batches[:-1]) == {7}
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        (lambda: 1 / 0, "ZeroDivisionError"),
+        (lambda: None, "None (NoneType) instead of"),
+        (lambda: {"A": 1}, "(dict) instead of"),
+        (lambda: [0.1, 0.2, 0.7], "[0.1, 0.2, 0.7] (list) instead of"),
+        (lambda: [0.1, float("nan"), 0.2, 0.3], "not all finite"),
+    ],
+)
+def test_items_that_fail_are_kept_and_count_as_wrong(bench, bad, reason) -> None:
+    failing = {item.item_id for item in bench.selection[1:4]}
+
+    def predict(item: dynapix.Item) -> str:
+        return bad() if item.item_id in failing else item.answer
+
+    result = dynapix.evaluate(bench.selection, predict, progress=False)
+    assert {failure.item_id for failure in result.failures} == failing
+    assert all(reason in failure.reason for failure in result.failures)
+    count = len(bench.selection)
+    assert result.accuracy.micro.value == pytest.approx(1 - 3 / count)
+    assert "3 items failed and count as wrong" in str(result)
+    # An evaluation whose items all fail stops early.
+    calls: list[str] = []
+
+    def always_fails(item: dynapix.Item) -> str:
+        calls.append(item.item_id)
+        return bad()
+
+    with raises_user_error("invalid-prediction", contains=(reason, bench.selection[0].item_id)):
+        dynapix.evaluate(bench.selection, always_fails, progress=False)
+    assert len(calls) == SYSTEMATIC
+
+
+def test_results_are_compared_on_the_same_items(bench) -> None:
+    one = dynapix.evaluate(bench.selection, always_a, name="one", progress=False)
+    two = dynapix.evaluate(bench.selection, nearest, name="two", progress=False)
+    comparison = one.compare(two)
+    assert [c.of for c in comparison] == ["event", "time", "window", "macro", "all"]
+    overall = comparison[-1]
+    difference = one.accuracy.micro.value - two.accuracy.micro.value
+    assert overall.difference == pytest.approx(difference)
+    assert "one (left) less two (right)" in str(comparison)
+    few = dynapix.evaluate(bench.selection[:-2], always_a, name="few", progress=False)
+    with raises_user_error("different-items", contains=("2 only in one",)):
+        one.compare(few)
+
+
+@pytest.mark.parametrize("predict", [always_a, nearest])
+def test_a_saved_result_is_read_back(bench, tmp_path, predict) -> None:
+    def sometimes(item: dynapix.Item) -> object:
+        return None if item.item_id == bench.selection[3].item_id else predict(item)
+
+    result = dynapix.evaluate(bench.selection, sometimes, name="mine", progress=False)
+    folder = result.save(tmp_path / "mine")
+    again = dynapix.Result.load(folder, bench)
+    assert (again.name, again.outcomes) == (result.name, result.outcomes)
+    assert again.failures == result.failures
+    assert again.report == result.report
+    # Saving again replaces the result; a folder with other files is left alone.
+    assert result.save(folder) == folder
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").touch()
+    with raises_user_error("other-files"):
+        result.save(tmp_path / "other")
+
+
+def test_the_report_shows_a_saved_result_beside_the_baselines(bench, tmp_path) -> None:
+    for name, predict in (("letters", always_a), ("scores", nearest)):
+        dynapix.evaluate(bench.selection, predict, name=name, progress=False).save(
+            tmp_path / "runs" / name
+        )
+    folder = run_report(tmp_path, bench.store.folder.parent, items=3, saved=str(tmp_path / "runs"))
+    table = (folder / "tables" / "selection-micro.md").read_text()
+    assert "letters (text)" in table
+    assert "scores (similarity)" in table
+    assert "nearest to the last observed frame" in table
+    page = (folder / "report.html").read_text()
+    assert "letters (text)" in page
+
+
+def test_damaged_results_and_results_on_other_builds_are_refused(bench, tmp_path) -> None:
+    folder = dynapix.evaluate(bench.selection, always_a, progress=False).save(tmp_path / "mine")
+    report = json.loads((folder / "report.json").read_text())
+    (folder / "report.json").write_text(json.dumps({**report, "build": "other"}))
+    with raises_user_error("different-builds", contains=str(folder)):
+        dynapix.Result.load(folder, bench)
+    (folder / "answers.jsonl").unlink()
+    with raises_user_error("damaged-file", contains="answers.jsonl"):
+        dynapix.Result.load(folder, bench)
+    with raises_user_error("damaged-file", contains=str(tmp_path / "none")):
+        dynapix.Result.load(tmp_path / "none", bench)
+
+
+@pytest.mark.parametrize("as_mapping", [False, True])
+def test_embeddings_that_find_every_target_have_full_recall(bench, as_mapping) -> None:
+    frames = np.eye(len(bench.database), dtype=np.float32)
+    names = [frame.name for frame in bench.database]
+    queries = frames[[names.index(query.target.name) for query in bench.retrieval]]
+    embeddings = (queries, frames)
+    if as_mapping:
+        ids = [query.query_id for query in bench.retrieval]
+        embeddings = (
+            dict(zip(ids, queries, strict=True)), dict(zip(names, frames, strict=True))
+        )  # fmt: skip
+    scores = dynapix.evaluate_retrieval(bench.retrieval, *embeddings)
+    expected = {"recall@1": 1, "recall@10": 1, "recall@50": 1, "mrr": 1, "median_rank": 1}
+    assert scores.metrics == {**expected, "tie_rate": 0}
+    assert "Recall" in str(scores) or "R@1" in str(scores)
+    constant = dynapix.evaluate_retrieval(
+        bench.retrieval, np.ones_like(queries), np.ones_like(frames)
+    )
+    assert constant.metrics["recall@1"] == pytest.approx(1 / len(names))
+
+
+def test_embeddings_of_another_shape_or_database_are_refused(bench) -> None:
+    rng = np.random.default_rng(0)
+    queries = rng.normal(size=(len(bench.retrieval), 8))
+    frames = rng.normal(size=(len(bench.database), 8))
+    bad = queries.copy()
+    bad[1, 2] = np.nan
+    by_name = {f"other/{k}": row for k, row in enumerate(frames)}
+    for embeddings, hint in (
+        ((queries[1:], frames), f"({len(queries) - 1}, 8)"),
+        ((queries, frames[:, :7]), "7"),
+        ((queries.ravel(), frames), "shape"),
+        ((bad, frames), bench.retrieval[1].query_id),
+        ((queries, by_name), bench.database[0].name),
+        ((queries, "frames"), "not an array of numbers"),
+    ):
+        with raises_user_error("invalid-embeddings", contains=hint):
+            dynapix.evaluate_retrieval(bench.retrieval, *embeddings)
+    with raises_user_error("invalid-setting", contains="1 to 8"):
+        dynapix.evaluate_retrieval(bench.retrieval, queries, frames, widths=[9])
+
+
+def test_a_rationale_is_scored_by_the_oracle(micro_store) -> None:
+    from teacher.narrator import write_rationale
+    from teacher.predicates import extract_predicates
+
+    train = dynapix.load(micro_store.folder, split="train")
+    item = next(
+        i
+        for i in train.selection
+        if extract_predicates(i.record, micro_store.scene(i.scene_id), micro_store.scene)
+    )
+    scene = micro_store.scene(item.scene_id)
+    predicates = extract_predicates(item.record, scene, micro_store.scene)
+    text = write_rationale(predicates, item.record, 0, 0)
+    score = dynapix.score_rationale(item, text)
+    assert score.supported
+    assert not score.contradicted
+    assert not score.numbers
+    wrong = "BCDA"["ABCD".index(item.answer)]
+    false = text.replace(f"Answer: {item.answer}", f"Answer: {wrong}")
+    score = dynapix.score_rationale(item, f"{false} It took two seconds.")
+    assert "two" in score.numbers[0]
+    assert "numbers: two" in str(score)
+
+
+def test_unknown_and_damaged_benchmarks_are_refused(micro_store, tmp_path) -> None:
+    with raises_user_error("unknown-benchmark", contains=("tinny", "tiny", "micro")):
+        dynapix.load("tinny", store=micro_store.folder.parent)
+    with raises_user_error("unknown-option", contains="train or test"):
+        dynapix.load(micro_store.folder, split="validation")
+    with raises_user_error("invalid-setting", contains="frames=0"):
+        dynapix.load(micro_store.folder, frames=0)
+    copy = tmp_path / "copy"
+    shutil.copytree(micro_store.folder, copy)
+    manifest = (copy / MANIFEST).read_text()
+    (copy / MANIFEST).write_text(manifest.replace('"builders": "', '"builders": "0', 1))
+    with raises_user_error("different-version", contains="builders"):
+        dynapix.load(copy)
+    (copy / MANIFEST).write_text("{")
+    with raises_user_error("damaged-file", contains=MANIFEST):
+        dynapix.load(copy)
+
+
+def test_items_of_two_benchmarks_and_wrong_batches_are_refused(bench, micro_store) -> None:
+    other = dynapix.load(micro_store.folder)
+    with raises_user_error("invalid-items"):
+        dynapix.evaluate([], always_a)
+    with raises_user_error("invalid-items"):
+        dynapix.evaluate([bench.selection[0], other.selection[0]], always_a)
+    with raises_user_error("invalid-prediction", contains=("3", "4")):
+        dynapix.evaluate(bench.selection, lambda items: ["A"] * 3, batch_size=4, progress=False)
+    with raises_user_error("invalid-prediction", contains="texts for some items"):
+        dynapix.evaluate(
+            bench.selection,
+            lambda item: "A" if item.family == "time" else [0, 0, 0, 1],
+            progress=False,
+        )
