@@ -11,10 +11,10 @@ import platform
 import re
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -145,7 +145,7 @@ def open_run(run: Run, settings: dict[str, Any], command: str) -> None:
         "git": _git(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "packages": {name: version(name) for name in PACKAGES},
+        "packages": _installed_versions(),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "earlier_starts": [*earlier["earlier_starts"], earlier["started"]] if earlier else [],
     }
@@ -244,3 +244,12 @@ def _git() -> dict[str, Any] | None:
         return {"commit": git("rev-parse", "HEAD").strip(), "dirty": bool(git("status", "-s"))}
     except (OSError, subprocess.CalledProcessError):
         return None
+
+
+def _installed_versions() -> dict[str, str]:
+    versions = {}
+    for name in PACKAGES:
+        # Which packages are installed depends on the extras.
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, TypeVar, overload
 
@@ -46,13 +47,20 @@ def load(
 
     Raises:
         UserError: There is no such benchmark, the benchmark is damaged or of another version, or an
-            argument is invalid. Building a benchmark also requires the extra `simulate`.
+            argument is invalid. Building a benchmark requires the extra `simulate`, and
+            `image_size` the extra `train`.
     """
     if split not in SPLITS:
         raise UserError(f"split={split!r}: choose {' or '.join(SPLITS)}", code="unknown-option")
     for name, value in (("frames", frames), ("image_size", image_size)):
         if value is not None and value < 1:
             raise UserError(f"{name}={value}: give 1 or more", code="invalid-setting")
+    if image_size is not None and find_spec("torchvision") is None:
+        raise UserError(
+            f"image_size={image_size} needs torchvision, so that frames equal those of the "
+            "commands: pip install 'dynapix[train]', or leave it out and resize frames yourself",
+            code="missing-package",
+        )
     folder = Path(benchmark)
     if not (folder / MANIFEST).exists():
         folder = Path(store) / benchmark

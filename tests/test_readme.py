@@ -15,7 +15,8 @@ from conf.runs import TRAINER_FOLDERS, run_name
 from tests.conf.test_presets import SCHEMAS
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINE = re.compile(r"^    python -m (\S+)(.*)$", re.MULTILINE)
 LINES = sorted({line for page in PAGES for line in LINE.findall(page.read_text())})
 COMMANDS = [(command, shlex.split(rest, comments=True)) for command, rest in LINES]
@@ -33,7 +34,8 @@ def test_named_modules_exist() -> None:
         for module in re.findall(r"python -m\s+([\w.]+)", page.read_text()):
             is_benchmark = module.startswith("benchmarks.")
             path = ROOT / f"{module.replace('.', '/')}.py"
-            assert path.exists() if is_benchmark else module in SCHEMAS, f"{page.name}: {module}"
+            is_command = module in SCHEMAS or module == "dynapix"
+            assert path.exists() if is_benchmark else is_command, f"{page.name}: {module}"
 
 
 @pytest.mark.slow
@@ -65,3 +67,20 @@ def test_link_targets_exist() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_python_examples_run(micro_store, tmp_path, monkeypatch, capsys) -> None:
+    # The examples load the tiny benchmark; a smaller one stands in its folder.
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "tiny").symlink_to(micro_store.folder)
+    monkeypatch.chdir(tmp_path)
+    examples = [code for page in PAGES for code in PYTHON.findall(page.read_text())]
+    assert examples
+    for code in examples:
+        exec(compile(code, "example", "exec"), {})
+    assert "Selection accuracy (%)" in capsys.readouterr().out
+    assert (tmp_path / "runs" / "nearest" / "report.json").exists()
+
+
+def test_the_readme_fits_its_length() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150

@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 from PIL import Image
 
+from conf.errors import UserError
 from data.records import Scene
 from data.render import get_renderer
 from data.store import FRAMES_FOLDER, Store, write_atomically
@@ -109,7 +110,14 @@ def render_frames(
         images = reader.load_images(scene, Path(config["folder"]), frames)
     else:
         view = standin_view(config["standin"])
-        renderer = get_renderer(config["renderer"], config["width"], config["height"], view)
+        try:
+            renderer = get_renderer(config["renderer"], config["width"], config["height"], view)
+        except ModuleNotFoundError as error:
+            raise UserError(
+                f"frames of scene {scene.scene_id} are not in the cache, and rendering them needs "
+                f"{error.name}: pip install 'dynapix[simulate]'",
+                code="missing-package",
+            ) from error
         images = {frame: renderer.render(scene, frame) for frame in frames}
     return {frame: np.asarray(image) for frame, image in images.items()}
 
