@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from data.records import LETTERS, Candidate, Scene, SelectionItem
+from data.world.visibility import MIN_VISIBLE
 
 CUT_MARGIN = 12
 """Minimum number of frames from the cut to the next collision (paper, Rationale construction)."""
@@ -36,8 +37,6 @@ COURSE_HORIZON = 60
 """Number of frames over which straight paths are extrapolated."""
 VERY_CLOSE = 0.6
 """Ground-plane distance (simulator units) below which two objects are very close."""
-MIN_VISIBLE = 0.05
-"""Visible fraction up to which an object in view counts as hidden."""
 IMAGE_SIZE = 336
 """Side (px) of the square image in which displacements are measured: the models' input size."""
 STAYS, SHIFTS = 8.0, 60.0
@@ -365,6 +364,13 @@ def _close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
     )
 
 
+def _index_by_name(scene: Scene) -> dict[tuple[str, int], int]:
+    """Return the index of each object by its noun phrase and its number among objects with the same
+    one: other simulators' scenes have such objects."""
+    names = [o.noun_phrase for o in scene.objects]
+    return {(name, names[:k].count(name)): k for k, name in enumerate(names)}
+
+
 def _candidate_facts(
     letter: str,
     scene: Scene,
@@ -374,11 +380,10 @@ def _candidate_facts(
 ) -> CandidateFacts:
     other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
     frame = candidate.frame
-    in_target = {o.noun_phrase: i for i, o in enumerate(scene.objects)}
-    in_candidate = {o.noun_phrase: i for i, o in enumerate(other.objects)}
+    in_target, in_candidate = _index_by_name(scene), _index_by_name(other)
     ranked: list[tuple[tuple[bool, bool, float], Difference]] = []
-    for name in {**in_target, **in_candidate}:
-        i, j = in_target.get(name), in_candidate.get(name)
+    for key in {**in_target, **in_candidate}:
+        (name, _), i, j = key, in_target.get(key), in_candidate.get(key)
         expected = i is not None and _sight(scene, target, i) == "shown"
         visible = j is not None and _sight(other, frame, j) == "shown"
         if expected != visible:

@@ -7,42 +7,44 @@ from functools import lru_cache
 import numpy as np
 
 from data.records import Scene, SceneObject
+from data.world.visibility import is_hidden
 
 MODEL_SIZE = 336
 """Side in px of the square image in which displacements are measured."""
 DIAGONAL = MODEL_SIZE * 2**0.5
 
 
-def on_screen_positions(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (F, N, 2), px at 336 x 336, and whether centres are on screen (F, N)."""
+def visible_positions(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (F, N, 2), px at 336 x 336, and whether each object is visible (F, N): its
+    centre is on screen, and no other objects hide it."""
     positions = scene.image_positions * (MODEL_SIZE / np.array(scene.image_size))
     inside = (positions >= 0).all(-1) & (positions <= MODEL_SIZE).all(-1)
-    return positions, scene.in_view & inside
+    return positions, scene.in_view & inside & ~is_hidden(scene)
 
 
 @lru_cache(maxsize=64)
 def frame_displacements(scene: Scene, about: tuple[int, ...] | None = None) -> np.ndarray:
     """Return the largest displacement of an object between any two frames, (F, F) px at 336 x 336.
 
-    Only objects whose centre is on screen in at least one of the two frames count, because the
-    visible edge of an object does not suffice to distinguish frames. The image's diagonal is the
-    maximum.
+    Only objects that are visible (see `visible_positions`) in at least one of the two frames count,
+    because the edge of an object on the border of the image, or an object behind another one, does
+    not suffice to distinguish frames. The image's diagonal is the maximum.
 
     Args:
         about: Indices of the objects that count; all by default.
     """
-    positions, on_screen = on_screen_positions(scene)
+    positions, visible = visible_positions(scene)
     if about is not None:
-        positions, on_screen = positions[:, about], on_screen[:, about]
+        positions, visible = positions[:, about], visible[:, about]
     distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-    counts = on_screen[:, None] | on_screen[None]
+    counts = visible[:, None] | visible[None]
     return np.minimum(np.where(counts, distance, 0.0).max(axis=-1, initial=0.0), DIAGONAL)
 
 
 def cross_scene_displacement(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:
     """Return the largest displacement of an object between frames of two scenes, px at 336 x 336.
 
-    As in `frame_displacements`, but with objects matched by appearance. An object that is on screen
+    As in `frame_displacements`, but with objects matched by appearance. An object that is visible
     in one scene and does not exist in the other counts as displaced by the image's diagonal.
     """
     first = _positions_by_appearance(scene, frame)
@@ -50,9 +52,9 @@ def cross_scene_displacement(scene: Scene, frame: int, other: Scene, other_frame
     absent = (np.full(2, np.inf), False)
     displacement = 0.0
     for key in first.keys() | second.keys():
-        position, on_screen = first.get(key, absent)
-        other_position, other_on_screen = second.get(key, absent)
-        if on_screen or other_on_screen:
+        position, visible = first.get(key, absent)
+        other_position, other_visible = second.get(key, absent)
+        if visible or other_visible:
             distance = float(np.linalg.norm(position - other_position))
             displacement = max(displacement, distance)
     return min(displacement, DIAGONAL)
@@ -61,10 +63,10 @@ def cross_scene_displacement(scene: Scene, frame: int, other: Scene, other_frame
 def _positions_by_appearance(
     scene: Scene, frame: int
 ) -> dict[tuple[SceneObject, int], tuple[np.ndarray, bool]]:
-    """Map appearances, numbered where objects look alike, to positions and whether on screen."""
-    positions, on_screen = on_screen_positions(scene)
+    """Map appearances, numbered where objects look alike, to positions and whether visible."""
+    positions, visible = visible_positions(scene)
     return {
-        (each, scene.objects[:k].count(each)): (positions[frame, k], bool(on_screen[frame, k]))
+        (each, scene.objects[:k].count(each)): (positions[frame, k], bool(visible[frame, k]))
         for k, each in enumerate(scene.objects)
     }
 

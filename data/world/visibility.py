@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from data.records import SceneObject
+from data.records import Scene, SceneObject
 from data.world.camera import Camera
 from data.world.shapes import BOUNDING_RADIUS, intersect_rays
 
+MIN_VISIBLE = 0.05
+"""Visible fraction up to which an object in view counts as hidden."""
 STRIDE = 2
 """Step in px between the rays that measure visibility. One ray for every 2 x 2 pixels gives visible
 fractions within 2% of those from one ray per pixel."""
+
+
+def is_hidden(scene: Scene) -> np.ndarray:
+    """Return whether other objects hide each object (F, N). A fraction that the simulator does not
+    record (NaN) counts as visible."""
+    return scene.visible_fraction <= MIN_VISIBLE
 
 
 def compute_visibility(

@@ -282,6 +282,21 @@ def test_differences_of_candidates_agree_with_the_oracle(benchmark_store):
     assert checked > 50
 
 
+def test_objects_with_equal_noun_phrases_are_compared_one_by_one(benchmark_store):
+    compared = 0
+    for item in benchmark_store.selection()[:40]:
+        if len({c.scene_id for c in item.candidates}) > 1:
+            continue
+        scene = benchmark_store.scene(item.scene_id)
+        alike = replace(scene, objects=(scene.objects[0],) * len(scene.objects))
+        both = (extract_predicates(item, s, lambda name, s=s: s) for s in (scene, alike))
+        one, other = both
+        for a, b in zip(one.candidates, other.candidates, strict=True) if one else ():
+            assert len(a.differences) == len(b.differences)
+            compared += len(a.differences) > 1
+    assert compared
+
+
 def test_displacement_has_a_direction_and_an_extent():
     start = synthetic.on_ground((220, 160))[:2]
     scene = synthetic.scene([start, (0, -1)], [toward(start, (340, 160), 100), (0, 0)])

@@ -14,7 +14,7 @@ from data.records import FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.quota import CellInputs, named_rng
 from data.tracks.retrieval.queries import fill_query_quota
 from data.tracks.selection.time import spell_seconds
-from data.world.displacement import DIAGONAL, on_screen_positions
+from data.world.displacement import DIAGONAL, visible_positions
 
 LATEST_STOP = 2 * FPS
 """Maximum index of the last frame of a prefix."""
@@ -23,11 +23,11 @@ HORIZONS = (1, 2, 3)
 
 
 def removed_object(scene: Scene, seed: int) -> int | None:
-    """Sample the object to remove among those that are on screen at the end of a prefix of at
+    """Sample the object to remove among those that are visible at the end of a prefix of at
     least a second before their first contact. Return its index; None if there is no such object."""
     stops = {k: _prefix_stop(scene, k) for k in range(len(scene.objects))}
-    on_screen = on_screen_positions(scene)[1]
-    eligible = [k for k, stop in stops.items() if stop is not None and on_screen[stop, k]]
+    visible = visible_positions(scene)[1]
+    eligible = [k for k, stop in stops.items() if stop is not None and visible[stop, k]]
     if not eligible:
         return None
     return int(named_rng(seed, "removed", scene.scene_id).choice(eligible))
@@ -48,12 +48,12 @@ def _prefix_stop(scene: Scene, removed: int) -> int | None:
 def removal_displacement(scene: Scene, counterfactual: Scene, removed: int) -> np.ndarray:
     """Return the largest displacement of another object by the removal, (F,) px at 336 x 336.
 
-    Only objects whose centre is on screen in at least one of the two scenes count.
+    Only objects that are visible in at least one of the two scenes count.
     """
-    positions, on_screen = (np.delete(a, removed, axis=1) for a in on_screen_positions(scene))
-    other_positions, other_on_screen = on_screen_positions(counterfactual)
+    positions, visible = (np.delete(a, removed, axis=1) for a in visible_positions(scene))
+    other_positions, other_visible = visible_positions(counterfactual)
     distance = np.linalg.norm(positions - other_positions, axis=-1)
-    return np.minimum(np.where(on_screen | other_on_screen, distance, 0.0).max(axis=-1), DIAGONAL)
+    return np.minimum(np.where(visible | other_visible, distance, 0.0).max(axis=-1), DIAGONAL)
 
 
 def make_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:

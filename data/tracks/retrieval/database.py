@@ -20,7 +20,7 @@ from conf.schema import BenchmarkConfig
 from data.records import POOLS, FrameRef, RetrievalQuery, Scene
 from data.tracks.build_items import builder_name, cell_quotas
 from data.tracks.quota import named_rng, round_robin
-from data.world.displacement import on_screen_positions
+from data.world.displacement import visible_positions
 
 DUPLICATE_DISTANCE = 1.0
 """Near-duplicates differ by less than this in all coordinates of objects, px at 336 x 336."""
@@ -75,7 +75,7 @@ def _appearances(scene: Scene, frame: int) -> Iterable[tuple[tuple, np.ndarray]]
     visible = scene.visible_fraction[frame]
     # NaN means that the simulator records only whether the object is in view.
     visible = np.where(np.isnan(visible), 1.0, visible) * scene.in_view[frame]
-    positions = on_screen_positions(scene)[0][frame]
+    positions = visible_positions(scene)[0][frame]
     order = sorted(range(len(scene.objects)), key=lambda k: str(scene.objects[k]))
     for bound in VISIBLE_FRACTIONS:
         present = [k for k in order if visible[k] >= bound]

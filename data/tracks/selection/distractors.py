@@ -13,10 +13,10 @@ from data.records import Candidate, FrameRef, Scene, SelectionItem
 from data.world.displacement import (
     cross_scene_displacement,
     frame_displacements,
-    on_screen_positions,
+    visible_positions,
 )
 
-BUILDERS_VERSION = "5"
+BUILDERS_VERSION = "6"
 """Version of the code that makes items and queries. Increase it when a change gives other items or
 queries for the same scenes."""
 
@@ -160,13 +160,13 @@ def balance_in_time(
 
 
 def visible_objects(scene: Scene, timing: Timing) -> tuple[int, ...]:
-    """Return the indices of the objects that are on screen in at least one frame of the prefix.
+    """Return the indices of the objects that are visible in at least one frame of the prefix.
 
     Only these objects may distinguish candidates of one scene, because a model cannot predict that
     another object will enter.
     """
-    on_screen = on_screen_positions(scene)[1][timing.start : timing.stop + 1]
-    return tuple(np.flatnonzero(on_screen.any(axis=0)).tolist())
+    visible = visible_positions(scene)[1][timing.start : timing.stop + 1]
+    return tuple(np.flatnonzero(visible.any(axis=0)).tolist())
 
 
 def scene_candidates(scene: Scene, frames: Iterable[int], source: str) -> Iterator[Candidate]:

@@ -24,7 +24,7 @@ from data.tracks.selection.distractors import (
     scene_candidates,
     visible_objects,
 )
-from data.world.displacement import object_match_scores, on_screen_positions
+from data.world.displacement import object_match_scores, visible_positions
 from data.world.events import collisions_in, window_group
 
 QUESTION = "Which image best matches the next scene state?"
@@ -88,7 +88,7 @@ def make_item(
 def subject_objects(cell: WindowCell, scene: Scene, timing: Timing) -> tuple[int, ...] | None:
     """Return the indices of the objects that the window family selects; None for all objects.
 
-    The tuple is empty if no collision occurs up to the target (B), or nothing on screen moves (C).
+    The tuple is empty if no collision occurs up to the target (B), or nothing visible moves (C).
     """
     stop, target = timing.stop, timing.target
     if cell.window_family == "A":
@@ -96,9 +96,9 @@ def subject_objects(cell: WindowCell, scene: Scene, timing: Timing) -> tuple[int
     if cell.window_family == "B":
         ahead = collisions_in(scene, stop + 1, target)
         return ahead[0].objects if ahead else ()
-    positions, on_screen = on_screen_positions(scene)
+    positions, visible = visible_positions(scene)
     moved = np.linalg.norm(positions[target] - positions[stop], axis=-1)
-    moved[~(on_screen[target] & on_screen[stop])] = 0
+    moved[~(visible[target] & visible[stop])] = 0
     return (int(moved.argmax()),) if moved.max() > 0 else ()
 
 

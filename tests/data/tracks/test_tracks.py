@@ -20,6 +20,7 @@ from data.world.displacement import (
     cross_scene_displacement,
     frame_displacements,
     object_match_scores,
+    visible_positions,
 )
 from data.world.events import window_group
 
@@ -186,6 +187,24 @@ def test_displacement_across_scenes_with_different_objects_is_the_diagonal(bench
     assert scene.objects != other.objects
     assert cross_scene_displacement(scene, 60, other, 60) == pytest.approx(336 * 2**0.5)
     assert cross_scene_displacement(scene, 60, scene, 60) == 0
+
+
+def test_hidden_objects_do_not_distinguish_frames(benchmark_store) -> None:
+    for name in benchmark_store.scene_ids("train")[:4]:
+        scene = benchmark_store.scene(name)
+        for k in range(len(scene.objects)):
+            fraction = scene.visible_fraction.copy()
+            fraction[:, k] = 0.05
+            hidden = replace(scene, visible_fraction=fraction)
+            others = tuple(j for j in range(len(scene.objects)) if j != k)
+            assert np.array_equal(frame_displacements(hidden), frame_displacements(scene, others))
+            # Frames in which it becomes visible are distinguished by it as before.
+            fraction[-1, k] = 0.06
+            visible = frame_displacements(replace(scene, visible_fraction=fraction))[:, -1]
+            shown = replace(scene, visible_fraction=np.ones_like(fraction))
+            if visible_positions(shown)[1][-1, k]:
+                own = frame_displacements(shown, (k,))[:, -1]
+                assert (visible >= own - 1e-6).all()
 
 
 def test_builders_use_at_most_their_number_of_events_per_scene(benchmark_store) -> None:
