@@ -51,6 +51,22 @@ _THOUGHT_START = re.compile(r"[<◁]think(?:ing)?[>▷]", re.IGNORECASE)
 _THOUGHT_END = re.compile(r"[<◁]/think(?:ing)?[>▷]", re.IGNORECASE)
 
 _RECORD_START = re.compile(r"""\{\s*["']""")
+_CURLY_START = re.compile(r"\{\s*[“”‘’]")
+_STRAIGHT = str.maketrans("“”‘’", "\"\"''")
+_BARE_START = re.compile(r"\{\s*(?:forced[ _-]?)?choice\s*:", re.IGNORECASE)
+_BARE_KEY = re.compile(r"([{,]\s{0,20})([a-z_]\w{0,40})(?=\s{0,20}:)", re.IGNORECASE)
+# The only key of an object that contains the record.
+_WRAPPER = re.compile(
+    r"""\{\s*["'][a-z_ ]{0,20}(?:answer|response|result|output|record)["']\s*:\s*\{""",
+    re.IGNORECASE,
+)
+_ANSWER_TAG = re.compile(r"<answer>([^<>\n]{0,200})</answer>", re.IGNORECASE)
+# Text between two records that announces the second one as a correction of the first.
+_CORRECTION = re.compile(
+    r"\b(?:wait|actually|correction|corrected|on second thought|revised|"
+    r"(?:i made|there is|there was) an? (?:mistake|error)|let me (?:correct|fix|revise))\b",
+    re.IGNORECASE,
+)
 _STRING = r""""(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*'"""
 _JUNK = r"""[^a-z0-9"']{0,4}"""
 _CHOICE = rf"(?:{_JUNK.join('forced')}{_JUNK})?{_JUNK.join('choice')}"
@@ -128,7 +144,14 @@ def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedA
     text = strip_thought(_INVISIBLE.sub("", unicodedata.normalize("NFKC", raw)))
     if text is None:
         return ParsedAnswer(None, Reason.CUT_OFF)
-    choices, records, flag, prose = _read_records(text)
+    repaired = _quote(text)
+    choices, records, flag, prose = _read_records(repaired, letters)
+    if repaired != text:
+        if choices:
+            flag = flag or Reason.MALFORMED
+        else:
+            choices, records, flag, prose = _read_records(text, letters)
+    prose = _ANSWER_TAG.sub(r"\nAnswer: \1\n", prose)
     if choices:
         answer = _agreed([_read_statement(choice, letters) for choice in choices])
         record = records[0] if len(records) == 1 and flag is None else None
@@ -149,13 +172,29 @@ def strip_thought(text: str) -> str | None:
     return None if _THOUGHT_START.search(response) else response
 
 
-def _read_records(text: str) -> tuple[list[str | None], list[str], Reason | None, str]:
+def _quote(text: str) -> str:
+    """Return the text with straight quotes, or with quoted keys, if a record lacks them."""
+    if _CURLY_START.search(text):
+        text = text.translate(_STRAIGHT)
+    return _BARE_KEY.sub(r'\1"\2"', text) if _BARE_START.search(text) else text
+
+
+def _read_records(
+    text: str, letters: str
+) -> tuple[list[str | None], list[str], Reason | None, str]:
     """Return the choices of all records (None for an unreadable one), the complete records with a
-    choice, what is wrong with the records (None if nothing is), and the text outside of records."""
+    choice, what is wrong with the records (None if nothing is), and the text outside of records.
+
+    A record that repeats the template of the prompt, in which the choice lists all letters, does
+    not count beside another record, and neither does a record that the following text corrects.
+    """
     choices, records, prose, flag, position = [], [], [], None, 0
     while match := _RECORD_START.search(text, position):
-        prose.append(text[position : match.start()])
+        between = text[position : match.start()]
+        prose.append(between)
         values, end = _read_record(text, match.start())
+        if values and choices and (_CORRECTION.search(between) or _is_template(choices, letters)):
+            choices, records = [], []
         choices += values
         position = len(text) if end is None else end
         if end is None:
@@ -170,7 +209,8 @@ def _read_record(text: str, start: int) -> tuple[list[str | None], int | None]:
     """Return the choices in the record that begins at `start` (None for an unreadable choice), and
     the record's end (None if it is cut off).
 
-    Without a choice at its outermost level, a record has no choices. With one, choices at deeper
+    Without a choice at its outermost level, a record has no choices; in {"answer": {...}}, this is
+    the level of the inner object. With one, choices at deeper
     levels count too, because another record may begin inside a record that was broken off.
     """
     choices: list[tuple[int, str | None]] = []
@@ -185,8 +225,19 @@ def _read_record(text: str, start: int) -> tuple[list[str | None], int | None]:
         if depth == 0:
             end = token.end()
             break
-    is_outermost = any(depth == 1 for depth, _ in choices)
-    return [value for _, value in choices] if is_outermost else [], end
+    outermost = 2 if _WRAPPER.match(text, start) else 1
+    has_choice = any(depth == outermost for depth, _ in choices)
+    return [value for _, value in choices] if has_choice else [], end
+
+
+def _is_template(choices: Sequence[str | None], letters: str) -> bool:
+    """Whether each choice lists all letters, such as "A|B|C|D", and nothing else."""
+    return all(
+        choice is not None
+        and _ONLY_LETTERS.fullmatch(choice)
+        and {found.upper() for found in _ANY_LETTER.findall(choice)} == {*letters}
+        for choice in choices
+    )
 
 
 def _unquote(value: str) -> str:
