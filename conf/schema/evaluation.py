@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from ipaddress import ip_address
 from urllib.parse import urlsplit
 
 from omegaconf import MISSING
@@ -150,6 +151,8 @@ class StudyCommand(CommandConfig):
     feedback; these answers are not scored."""
     rest_every: int = setting(20, least=1)
     """Number of items between two breaks."""
+    session_days: float = setting(14.0, above=0)
+    """Days after which an annotator has to sign in again, with a new link from links.txt."""
     seed: int = setting(0, least=0)
     """Seed of the sample of items and of each annotator's order of items and candidates."""
     host: str = "127.0.0.1"
@@ -172,15 +175,15 @@ class StudyCommand(CommandConfig):
         if not 0 < self.port < 65536:
             yield f"port={self.port} is not a port: give a number from 1 to 65535"
         example = "such as https://study.example.org"
-        if self.public is None and self.host in ("0.0.0.0", "::"):
-            yield (
-                f"host={self.host} is not an address that annotators can open in a browser: give "
-                f"public=ADDRESS, {example}"
-            )
         if self.public is not None:
             url = urlsplit(self.public)
             if not is_url(self.public) or not url.netloc or url.path not in ("", "/"):
                 yield f"public={self.public} is not the URL of a host, {example}"
+        if not _is_loopback(self.host) and not (self.public or "").startswith("https:"):
+            yield (
+                f"host={self.host} would send sign-in links unencrypted: serve the study behind an "
+                f"https proxy with public=ADDRESS, {example}, or leave host at 127.0.0.1"
+            )
 
 
 @dataclass
@@ -192,3 +195,10 @@ class ExportStudyCommand(CommandConfig):
 
     def find_problems(self, group: str) -> list[str]:
         return check_run(self.run, f"{self.checkpoints}/study")
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 import sqlite3
+import time
 from pathlib import Path
 
 from starlette.datastructures import Headers
@@ -66,16 +67,17 @@ def sign_in(db: sqlite3.Connection, token: str) -> tuple[str, str] | None:
     session = new_token()
     with transaction(db):
         row = db.execute(
-            "UPDATE annotator SET session = ?, link = ? WHERE link = ? RETURNING name",
-            (_hash(session), new_token(), token),
+            "UPDATE annotator SET session = ?, signed_in = ?, link = ? WHERE link = ? "
+            "RETURNING name",
+            (_hash(session), time.time(), new_token(), token),
         ).fetchone()
     return row and (row["name"], session)
 
 
-def find_annotator(db: sqlite3.Connection, session: str) -> sqlite3.Row | None:
-    """Return the annotator of a session, given by its secret, or None."""
-    query = "SELECT * FROM annotator WHERE session = ?"
-    return db.execute(query, (_hash(session),)).fetchone()
+def find_annotator(db: sqlite3.Connection, session: str, max_seconds: float) -> sqlite3.Row | None:
+    """Return the annotator of a session that began at most `max_seconds` ago, or None."""
+    query = "SELECT * FROM annotator WHERE session = ? AND signed_in > ?"
+    return db.execute(query, (_hash(session), time.time() - max_seconds)).fetchone()
 
 
 def _hash(session: str) -> str:

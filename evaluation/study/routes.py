@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import socket
 import sqlite3
 from collections.abc import Callable
@@ -26,15 +27,14 @@ from evaluation.study import auth, workflow
 log = logging.getLogger(__name__)
 
 COOKIE = "study"
-COOKIE_SECONDS = 90 * 24 * 3600
 MAX_FORM_BYTES = 4096
 MAX_SECONDS = 1e7
 """Upper limit of the decision times that browsers may report."""
 BACKLOG = 2048
 """Maximum number of connections that wait to be accepted."""
 REFUSALS = {
-    401: "You are not signed in on this device. Open your link; if it has been used, ask for a new "
-    "one.",
+    401: "You are not signed in on this device, or your session has ended. Open your link; if it "
+    "has been used, ask for a new one.",
     404: "This page does not exist.",
     410: "This link has been used or is not valid. Ask for a new one.",
     500: "The server failed. Try again in a moment.",
@@ -43,15 +43,16 @@ REFUSALS = {
 
 
 class Pages:
-    """The pages of one study. `on_sign_in` is called after a link was used."""
+    """The pages of one study. `on_links_changed` is called after a link was used or deleted."""
 
     def __init__(
-        self, db: sqlite3.Connection, cfg: StudyCommand, on_sign_in: Callable[[], object]
+        self, db: sqlite3.Connection, cfg: StudyCommand, on_links_changed: Callable[[], object]
     ) -> None:
         self._db = db
         self._rest_every = cfg.rest_every
         self._secure = (cfg.public or "").startswith("https:")
-        self._on_sign_in = on_sign_in
+        self._session_seconds = math.ceil(cfg.session_days * 24 * 3600)
+        self._on_links_changed = on_links_changed
         self._templates = jinja2.Environment(
             loader=jinja2.PackageLoader("evaluation.study"), autoescape=True,
             undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
@@ -65,6 +66,8 @@ class Pages:
             Route("/continue", self.leave_page, methods=["POST"]),
             Route("/loaded", self.loaded, methods=["POST"]),
             Route("/answer", self.answer, methods=["POST"]),
+            Route("/withdraw", self.confirm_withdrawal),
+            Route("/withdraw", self.withdraw, methods=["POST"]),
             Route("/media/{key}/{place}", self.media),
             Mount("/static", StaticFiles(packages=[("evaluation.study", "static")])),
         ]
@@ -90,14 +93,10 @@ class Pages:
             raise HTTPException(410)
         name, session = signed_in
         log.info("%s signed in", name)
-        try:
-            self._on_sign_in()
-        except OSError as error:
-            # The link is already used: if this request failed, its owner could not sign in.
-            log.warning("the file of links still has the used link of %s: %s", name, error)
+        self._write_links(name)
         response = RedirectResponse("/", 303)
         response.set_cookie(
-            COOKIE, session, max_age=COOKIE_SECONDS, httponly=True, samesite="lax",
+            COOKIE, session, max_age=self._session_seconds, httponly=True, samesite="lax",
             secure=self._secure,
         )  # fmt: skip
         return response
@@ -105,6 +104,7 @@ class Pages:
     async def leave_page(self, request: Request) -> Response:
         annotator, form = self._annotator(request), await read_form(request)
         workflow.leave_page(self._db, annotator, form.get("key", ""), self._rest_every)
+        workflow.open_next_item(self._db, annotator["name"], self._rest_every)
         return RedirectResponse("/", 303)
 
     async def loaded(self, request: Request) -> Response:
@@ -119,10 +119,25 @@ class Pages:
             raise HTTPException(400)
         name, key = annotator["name"], form.get("key", "")
         if workflow.record_answer(self._db, name, key, letter, seconds):
+            workflow.open_next_item(self._db, name, self._rest_every)
             stage = workflow.current_stage(self._db, annotator, self._rest_every)
             if stage.page == "done":
                 log.info("%s has answered all %d items", name, stage.total)
         return RedirectResponse("/", 303)
+
+    async def confirm_withdrawal(self, request: Request) -> Response:
+        self._annotator(request)
+        return self._render("withdraw")
+
+    async def withdraw(self, request: Request) -> Response:
+        annotator = self._annotator(request)
+        await read_form(request)
+        workflow.withdraw(self._db, annotator["name"])
+        log.info("%s has withdrawn; the answers are deleted", annotator["name"])
+        self._write_links(annotator["name"])
+        response = self._render("withdrawn")
+        response.delete_cookie(COOKIE)
+        return response
 
     async def media(self, request: Request) -> Response:
         annotator = self._annotator(request)
@@ -140,10 +155,18 @@ class Pages:
 
     def _annotator(self, request: Request) -> sqlite3.Row:
         """Return the annotator of the request's session. Raises HTTPException 401 if none."""
-        annotator = auth.find_annotator(self._db, request.cookies.get(COOKIE, ""))
+        session = request.cookies.get(COOKIE, "")
+        annotator = auth.find_annotator(self._db, session, self._session_seconds)
         if annotator is None:
             raise HTTPException(401)
         return annotator
+
+    def _write_links(self, name: str) -> None:
+        try:
+            self._on_links_changed()
+        except OSError as error:
+            # The link is already used: if this request failed, its owner could not sign in.
+            log.warning("the file of links still has the used link of %s: %s", name, error)
 
     def _render(self, template: str, status_code: int = 200, **values: object) -> HTMLResponse:
         page = self._templates.get_template(f"{template}.html").render(values)
@@ -151,10 +174,10 @@ class Pages:
 
 
 def build_app(
-    db: sqlite3.Connection, cfg: StudyCommand, on_sign_in: Callable[[], object]
+    db: sqlite3.Connection, cfg: StudyCommand, on_links_changed: Callable[[], object]
 ) -> Starlette:
     """Return the study as an ASGI application."""
-    pages = Pages(db, cfg, on_sign_in)
+    pages = Pages(db, cfg, on_links_changed)
     return Starlette(
         routes=pages.routes(),
         exception_handlers={HTTPException: pages.refuse, 500: pages.refuse},

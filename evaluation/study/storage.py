@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 DATABASE = "study.sqlite"
-VERSION = 1
+VERSION = 2
 MEDIA_PER_ITEM = 5
 """The prefix and four candidates."""
 
@@ -40,9 +40,10 @@ CREATE TABLE medium (
 ) STRICT;
 -- link: token of the unused link. session: hash of the session's secret. consented and begun: when
 -- the pages before practice and before the items were left. rests: number of breaks that were left.
+-- signed_in: when the session began.
 CREATE TABLE annotator (
     name TEXT PRIMARY KEY, link TEXT NOT NULL UNIQUE, session TEXT UNIQUE,
-    consented REAL, begun REAL, rests INTEGER NOT NULL DEFAULT 0
+    signed_in REAL, consented REAL, begun REAL, rests INTEGER NOT NULL DEFAULT 0
 ) STRICT;
 -- rank and shown: `rank` and `order` of an `Assignment`.
 CREATE TABLE plan (

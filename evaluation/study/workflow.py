@@ -51,7 +51,8 @@ class Stage:
     """An annotator's current stage.
 
     Attributes:
-        page: consent, practice, feedback (on a practice item), ready, item, rest or done.
+        page: consent, practice, feedback (on a practice item), ready, item, rest, next (no item is
+            open) or done.
         key: Identifies the page in its form. The key of an item is its token, which is random.
         number: Number of the item on the page, or else of the answered items.
         total: Number of the practice items during practice, otherwise of the items.
@@ -64,16 +65,17 @@ class Stage:
 
 
 def current_stage(db: sqlite3.Connection, annotator: sqlite3.Row, rest_every: int) -> Stage:
-    """Return an annotator's stage. If it shows an item and none is open, open the next item."""
+    """Return an annotator's stage. It changes nothing, because browsers also load pages that nobody
+    sees."""
     if annotator["consented"] is None:
         return Stage("consent", "consent")
     name = annotator["name"]
-    with transaction(db):
+    with transaction(db, read_only=True):
         answered, total = _progress(db, name, practice=True)
         if unread := [turn["token"] for turn in answered if not turn["closed"]]:
             return Stage("feedback", unread[0], len(answered), total)
         if len(answered) < total:
-            return Stage("practice", _open_item(db, name, True), len(answered) + 1, total)
+            return _item_stage(db, name, True, len(answered) + 1, total)
         answered, total = _progress(db, name, practice=False)
         done = len(answered)
         if annotator["begun"] is None:
@@ -83,7 +85,31 @@ def current_stage(db: sqlite3.Connection, annotator: sqlite3.Row, rest_every: in
         rests, items_since = divmod(done, rest_every)
         if rests > annotator["rests"] and not items_since:
             return Stage("rest", f"rest-{rests}", done, total)
-        return Stage("item", _open_item(db, name, False), done + 1, total)
+        return _item_stage(db, name, False, done + 1, total)
+
+
+def _item_stage(
+    db: sqlite3.Connection, name: str, practice: bool, number: int, total: int
+) -> Stage:
+    if token := _open_token(db, name, practice):
+        return Stage("practice" if practice else "item", token, number, total)
+    return Stage("next", f"next-{'practice' if practice else 'item'}", number, total)
+
+
+def open_next_item(db: sqlite3.Connection, name: str, rest_every: int) -> None:
+    """Open the next item of an annotator whose stage is `next`; otherwise, change nothing."""
+    annotator = db.execute("SELECT * FROM annotator WHERE name = ?", (name,)).fetchone()
+    stage = current_stage(db, annotator, rest_every)
+    if stage.page == "next":
+        with transaction(db):
+            _open_item(db, name, practice=stage.key == "next-practice")
+
+
+def withdraw(db: sqlite3.Connection, name: str) -> None:
+    """Delete an annotator with all answers."""
+    with transaction(db):
+        for table, column in (("turn", "annotator"), ("plan", "annotator"), ("annotator", "name")):
+            db.execute(f"DELETE FROM {table} WHERE {column} = ?", (name,))
 
 
 def _progress(db: sqlite3.Connection, name: str, practice: bool) -> tuple[list[sqlite3.Row], int]:
@@ -171,18 +197,21 @@ def load_medium(db: sqlite3.Connection, name: str, token: str, place: str) -> sq
     return db.execute(query, (turn["item_id"], slot)).fetchone()
 
 
-def _open_item(db: sqlite3.Connection, name: str, practice: bool) -> str:
-    """Return the token of the open item. If none is open, open the next item."""
+def _open_token(db: sqlite3.Connection, name: str, practice: bool) -> str | None:
     turn = db.execute(
         f"{TURN} WHERE annotator = ? AND practice = ? AND answered IS NULL", (name, practice)
     ).fetchone()
-    if turn:
-        return turn["token"]
-    token, now = new_token(), time.time()
+    return turn and turn["token"]
+
+
+def _open_item(db: sqlite3.Connection, name: str, practice: bool) -> None:
+    """Open the next item unless one is open."""
+    if _open_token(db, name, practice):
+        return
+    now = time.time()
     values = (name, practice, now - ABANDONED_SECONDS)
     item_id = db.execute(NEXT_ITEM, values).fetchone()["item_id"]
     db.execute(
         "INSERT INTO turn (token, annotator, item_id, opened) VALUES (?, ?, ?, ?)",
-        (token, name, item_id, now),
+        (new_token(), name, item_id, now),
     )
-    return token

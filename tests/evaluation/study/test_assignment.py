@@ -14,7 +14,7 @@ from data.records import FAMILIES, Candidate, SelectionItem
 from evaluation.study import storage
 from evaluation.study.assignment import assign_items
 from evaluation.study.setup import choose_items, item_scenes, read_item_ids, sample_items
-from evaluation.study.workflow import _open_item
+from evaluation.study.workflow import _open_item, _open_token
 from tests.user_errors import raises_user_error
 
 NAMES = ["A1", "A2", "A3", "A4", "A5"]
@@ -86,7 +86,8 @@ def test_assignment_depends_on_the_seed_the_items_and_the_annotator(items) -> No
 
 def open_next(db: sqlite3.Connection, annotator: str) -> str:
     """Open and answer the next item of an annotator, and return its id."""
-    token = _open_item(db, annotator, practice=False)
+    _open_item(db, annotator, practice=False)
+    token = _open_token(db, annotator, practice=False)
     db.execute("UPDATE turn SET loaded = opened, answered = opened WHERE token = ?", (token,))
     [row] = db.execute("SELECT item_id FROM turn WHERE token = ?", (token,))
     return row["item_id"]

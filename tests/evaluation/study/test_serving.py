@@ -360,3 +360,57 @@ def test_only_one_of_many_concurrent_answers_counts(small, visitor) -> None:
     assert asyncio.run(all_at_once()) == {200: 500, 303: 500}
     assert len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL")) == votes + 1
     assert visitor.home().status == 200
+
+
+def test_loading_a_page_opens_no_item(serve, prepared_small) -> None:
+    server = serve(prepared_small)
+    visitor = Visitor(server.port).sign_in(server.links()["A1"])
+    for _ in range(3):
+        assert visitor.home().action == "/continue"
+    assert rows(server, "SELECT * FROM turn") == []
+    visitor.to_question()
+    opened = len(rows(server, "SELECT * FROM turn"))
+    # An item that is not open, as after a restart, opens by a button only.
+    db = storage.open_study(server.folder / storage.DATABASE)
+    with storage.transaction(db):
+        db.execute("DELETE FROM turn WHERE answered IS NULL")
+    db.close()
+    page = visitor.home()
+    assert "The next question opens" in page.text
+    assert len(rows(server, "SELECT * FROM turn")) == opened - 1
+    visitor.leave(page)
+    assert visitor.home().action == "/answer"
+    assert len(rows(server, "SELECT * FROM turn")) == opened
+
+
+def test_a_session_expires(serve, prepared_small) -> None:
+    server = serve(prepared_small, "session_days=0.00002")
+    visitor = Visitor(server.port).sign_in(server.links()["A1"])
+    assert visitor.home().status == 200
+    time.sleep(2)
+    assert visitor.home().status == 401
+    assert visitor.sign_in(server.links()["A1"]).home().status == 200
+
+
+def test_withdrawal_deletes_an_annotator_and_no_one_else(serve, prepared_small) -> None:
+    server = serve(prepared_small)
+    visitors = [Visitor(server.port).sign_in(server.links()[name]) for name in ("A1", "A2")]
+    for visitor in visitors:
+        page = visitor.to_question()
+        visitor.load(page)
+        visitor.answer(page, "B")
+    mine = rows(server, "SELECT * FROM turn WHERE annotator = 'A1'")
+    theirs = rows(server, "SELECT token FROM turn WHERE annotator = 'A2'")
+    assert mine
+    # The page asks first, and a form on another site is refused.
+    assert visitors[0].request("GET", "/withdraw").action == "/withdraw"
+    foreign = {"Sec-Fetch-Site": "cross-site"}
+    assert visitors[0].request("POST", "/withdraw", {}, **foreign).status == 403
+    assert rows(server, "SELECT * FROM turn WHERE annotator = 'A1'") == mine
+    assert "deleted" in visitors[0].request("POST", "/withdraw", {}).text
+    for table, column in (("turn", "annotator"), ("plan", "annotator"), ("annotator", "name")):
+        assert rows(server, f"SELECT * FROM {table} WHERE {column} = 'A1'") == []
+    assert rows(server, "SELECT token FROM turn WHERE annotator = 'A2'") == theirs
+    assert visitors[0].home().status == 401
+    assert visitors[1].home().status == 200
+    assert "A1" not in server.links()

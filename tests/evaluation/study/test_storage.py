@@ -150,6 +150,8 @@ def test_a_port_in_use_ends_the_command_with_an_error(path) -> None:
         ({"public": "study.example.org"}, "public=study.example.org"),
         ({"public": "https://example.org/study"}, "public=https://example.org/study"),
         ({"host": "0.0.0.0"}, "host=0.0.0.0"),
+        ({"host": "192.168.1.5", "public": "http://192.168.1.5:8765"}, "host=192.168.1.5"),
+        ({"session_days": 0.0}, "session_days=0.0"),
     ],
 )
 def test_invalid_settings_are_refused(settings, named) -> None:
