@@ -17,11 +17,30 @@ from conf.compose import OVERLAYS, compose, list_presets
 
 COLUMN = 46
 """Column at which the descriptions of settings begin."""
+ALL = "all"
+"""Word after `--help` that lists every setting."""
+COMMON = (
+    "run", "seed", "limit", "model", "modes", "suite", "control", "runs", "items", "annotators",
+    "host", "port", "public", "folder", "format", "product", "verify", "frames", "frames_gb",
+    "examples", "gpus", "routes", "benchmark.name", "benchmark.scenes", "benchmark.seed",
+    "benchmark.folder", "benchmark.renderer", "teacher.url", "teacher.model", "teacher.attempts",
+    "server.url", "server.model", "student.model", "student.quantization", "student.frames",
+    "student.image_size", "student.temperature", "retriever.model", "retriever.widths",
+    "matcher.model", "train.regime", "train.lr", "train.epochs", "train.max_steps", "train.batch",
+    "train.micro_batch", "train.mini_batch", "train.hard_negatives", "train.precision",
+    "train.report_to", "batch", "workers",
+)  # fmt: skip
+"""Keys that users change often; `--help` lists those of the command."""
 
 
 def help_text(command: str, schema: type, overrides: list[str]) -> str:
-    """Help of a command, with the values that result from `overrides`. Raises SettingsError."""
-    settings = compose(command, schema, overrides)
+    """Help of a command, with the values that result from `overrides`. Raises SettingsError.
+
+    It lists the settings of `COMMON`, or every setting if `overrides` contain `ALL`.
+    """
+    settings = compose(command, schema, [o for o in overrides if o != ALL])
+    entries = list(_entries(settings))
+    common = [entry for entry in entries if entry[0] in COMMON]
     purpose = (sys.modules["__main__"].__doc__ or "").strip()
     groups = list_presets(command, schema)
     presets = [f"  {g}: {', '.join(groups[g])}" for g in groups if g not in OVERLAYS]
@@ -30,22 +49,38 @@ def help_text(command: str, schema: type, overrides: list[str]) -> str:
     lines += ["Presets, chosen with GROUP=NAME:", *presets, ""] if presets else []
     lines += ["Overlays, added with +GROUP=NAME:", *overlays, ""] if overlays else []
     lines += ["Settings, set with KEY=VALUE; with -m, KEY=VALUE,VALUE sweeps over values:"]
-    lines += _setting_lines(settings)
+    if ALL in overrides:
+        for entry in entries:
+            lines += _setting_lines(*entry)
+    else:
+        for key, value, text in common:
+            brief = textwrap.shorten(text, _description_width(), placeholder=" ...")
+            lines += _setting_lines(key, value, brief)
+        more = len(entries) - len(common)
+        lines += [f"--help {ALL} lists the other {more} settings, and describes them in full."]
     lines += ["", "-m runs a sweep, one process per job; --cfg job prints the settings and exits."]
     return "\n".join(lines)
 
 
-def _setting_lines(settings: Any, group: str = "") -> Iterator[str]:
-    width = max(100, shutil.get_terminal_size().columns) - COLUMN
+def _entries(settings: Any, group: str = "") -> Iterator[tuple[str, Any, str]]:
+    """Yield the key, the value and the description of each setting."""
     for field in fields(settings):
         value = getattr(settings, field.name)
         if is_dataclass(value):
-            yield from _setting_lines(value, f"{group}{field.name}.")
-            continue
-        text = textwrap.shorten(json.dumps(value, default=asdict), 60, placeholder=" ...")
-        first, *rest = textwrap.wrap(description(type(settings), field.name), width) or [""]
-        yield f"{f'  {group}{field.name} = {text}':<{COLUMN - 2}}  {first}".rstrip()
-        yield from (f"{'':<{COLUMN}}{line}" for line in rest)
+            yield from _entries(value, f"{group}{field.name}.")
+        else:
+            yield f"{group}{field.name}", value, description(type(settings), field.name)
+
+
+def _description_width() -> int:
+    return max(100, shutil.get_terminal_size().columns) - COLUMN
+
+
+def _setting_lines(key: str, value: Any, text: str) -> Iterator[str]:
+    shown = textwrap.shorten(json.dumps(value, default=asdict), 60, placeholder=" ...")
+    first, *rest = textwrap.wrap(text, _description_width()) or [""]
+    yield f"{f'  {key} = {shown}':<{COLUMN - 2}}  {first}".rstrip()
+    yield from (f"{'':<{COLUMN}}{line}" for line in rest)
 
 
 def description(schema: type, name: str) -> str:

@@ -22,6 +22,8 @@ COMMANDS = sorted(
     for path in MODULES
     for name in re.findall(r'^@command\("([\w.]+)"', path.read_text(), re.MULTILINE)
 )
+LONGEST_HELP = 50
+"""Maximum number of lines of a command's help."""
 LARGEST_FOLDER = 14
 """Maximum number of modules in a folder."""
 
@@ -77,6 +79,7 @@ def test_help_imports_nothing_heavy(command: str) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"python -m {command} [KEY=VALUE ...]")
+    assert len(done.stdout.splitlines()) <= LONGEST_HELP
 
 
 def test_no_file_names_a_package_registry() -> None:

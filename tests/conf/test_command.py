@@ -75,7 +75,7 @@ def test_bug_keeps_its_traceback(folder):
 
 def test_help_describes_the_settings_and_imports_nothing_heavy(folder):
     script = (
-        "import runpy, sys; sys.argv = ['toy', '--help', 'x=5']\n"
+        "import runpy, sys; sys.argv = ['toy', '--help', 'all', 'x=5']\n"
         "runpy.run_module('toy', run_name='__main__', alter_sys=True)\n"
         "heavy = {'torch', 'transformers', 'pybullet', 'matplotlib', 'pandas'} & set(sys.modules)\n"
         "assert not heavy, heavy"
@@ -86,6 +86,9 @@ def test_help_describes_the_settings_and_imports_nothing_heavy(folder):
     lines = [line.split() for line in done.stdout.splitlines()]
     assert ["x", "=", "5.0", "Number", "to", "square."] in lines
     assert not (folder / "checkpoints").exists()
+    brief = run_child([sys.executable, "-m", "toy", "--help"], check=True, cwd=folder)
+    assert "--help all lists the other" in brief.stdout
+    assert "Number to square" not in brief.stdout
 
 
 def test_help_can_be_piped_to_head(folder):

@@ -1,16 +1,18 @@
 """Every YAML file of conf/ composes with the command in its first comment; values of presets."""
 
 import shlex
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from importlib.resources import files
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 
 from conf import schema
 from conf.compose import compose, config_name, list_presets
 from conf.errors import SettingsError
-from conf.help import description
+from conf.help import COMMON, description
 from data.tracks.selection.window import CELLS
 
 CONF = Path(str(files("conf")))
@@ -162,3 +164,19 @@ def test_quotas_add_up_to_the_papers_totals():
     # Queries are divided 80/20 into training and test queries, as the scenes are.
     for quota in (*retrieval.builders.values(), without):
         assert quota.train == 4 * quota.test
+
+
+def test_every_common_setting_exists_in_a_command() -> None:
+    keys = {key for schema in SCHEMAS.values() for key in schema_keys(schema)}
+    assert set(COMMON) <= keys
+
+
+def schema_keys(schema: type, group: str = "") -> Iterator[str]:
+    """Yield the keys of the settings of a command."""
+    types = get_type_hints(schema)
+    for field in fields(schema):
+        nested = [t for t in (types[field.name], *get_args(types[field.name])) if is_dataclass(t)]
+        if nested:
+            yield from schema_keys(nested[0], f"{group}{field.name}.")
+        else:
+            yield f"{group}{field.name}"
