@@ -2,8 +2,8 @@
 
 All hooks were checked with torch 2.14 to 2.15, transformers 5.17 to 5.23, peft 0.19 to 0.21.2,
 accelerate 1.12 to 1.15, sentence-transformers 6.0 to 6.2 and bitsandbytes 0.49 to 0.50.2, unless
-a docstring says otherwise. `pyproject.toml` excludes later versions. Before it admits them,
-tests/models/test_compat.py, which has one test per hook, must pass with them.
+a docstring says otherwise. `pyproject.toml` excludes later versions. Before it admits them, all
+tests must pass with them; tests/models/test_compat.py names a hook that a library changed.
 
 Hooks in other modules, which subclass a library's classes or depend on how it passes its inputs:
 
@@ -13,9 +13,10 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
   tower then passes all frames in one call, with `cu_seq_lens_q` and `max_length_q`.
 - `train.common.training_loop` calls `Trainer._load_from_checkpoint`, which also reads the parts of
   an FSDP checkpoint.
-- `models.retriever.multi_vector` loads with `MultiVectorEncoder._load_with_module_classes`.
+- `models.retriever.multi_vector` loads with `MultiVectorEncoder._load_with_module_classes`, and a
+  forward pre-hook casts `token_embeddings` in the inputs of the projection.
 - `train.retriever.trainer` overrides `_load_from_checkpoint`, `_load_best_model`,
-  `get_batch_sampler` and `collect_features`.
+  `get_batch_sampler`, `collect_features` and `add_model_card_callback`.
 - `train.retriever.inputs` adds an input in a forward pre-hook of sentence-transformers'
   `Transformer`, which passes it on to its model.
 - `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer.
@@ -52,7 +53,8 @@ def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
 def encode_images(
     model: PreTrainedModel, pixels: torch.Tensor, grid: torch.Tensor, bf16: bool
 ) -> list[torch.Tensor]:
-    """Return the outputs of Qwen3-VL's vision tower for each image or pair of a clip's frames.
+    """Return the outputs of Qwen3-VL's vision tower for each row of `grid`: an image, a clip, or a
+    pair of a clip's frames.
 
     Args:
         bf16: Whether the tower computes in bf16.
@@ -90,7 +92,8 @@ def keep_differentiable(model: nn.Module) -> None:
 
 
 def four_bit_entries(parameter: nn.Parameter) -> int | None:
-    """Return the number of weights in a 4-bit parameter of bitsandbytes; None for other parameters.
+    """Return the number of weights in a 4-bit parameter of bitsandbytes; None for other
+    parameters and for those that are not packed yet.
 
     Loading packs the weights, two in a byte. On the meta device, the parameter keeps the shape that
     the weights have before packing.

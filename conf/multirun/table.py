@@ -35,7 +35,8 @@ def read_job(folder: Path) -> dict[str, Any]:
 
 
 def write_sweep_table(folder: Path) -> str:
-    """Write the table of a sweep to sweep.csv and, with a * at the best values, to sweep.txt.
+    """Write the table of a sweep to sweep.csv and to sweep.txt, where a * marks the best value of
+    each metric.
 
     Returns:
         The text of sweep.txt.
@@ -75,6 +76,6 @@ def varying_overrides(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
 
 
 def is_lower_better(metric: str) -> bool:
-    """Whether lower values of a metric are better: losses, ranks, and numbers of results that were
-    rejected, set aside or too short."""
+    """Whether lower values of a metric are better: losses, ranks, and the numbers of rejected
+    responses, of items that were set aside, and of items whose prefix is too short."""
     return re.search(LOWER_IS_BETTER, metric) is not None

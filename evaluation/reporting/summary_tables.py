@@ -61,7 +61,7 @@ def summary_table(
         columns, notes = RETRIEVAL_COLUMNS, (*retrieval_notes(rows[0].result), BEST_NOTE)
         for m in rows:
             groups[_group(m)].append(retrieval_row(m.name, m.result))
-    baseline_rows = [row for r in baselines for row in selection_rows(r.name, r)]
+    baseline_rows = [selection_rows(r.name, r)[0] for r in baselines]
     groups["baselines, from the oracle"] = [{**row, "ranked": False} for row in baseline_rows]
     groups["people, on the items of their study"] = [*people]
     item_set = rows[0].item_set

@@ -165,8 +165,8 @@ class Pages:
         try:
             self._on_links_changed()
         except OSError as error:
-            # The link is already used: if this request failed, its owner could not sign in.
-            log.warning("the file of links still has the used link of %s: %s", name, error)
+            # The change is stored: if this request failed, the annotator could not sign in again.
+            log.warning("the file of links still has an invalid link of %s: %s", name, error)
 
     def _render(self, template: str, status_code: int = 200, **values: object) -> HTMLResponse:
         page = self._templates.get_template(f"{template}.html").render(values)

@@ -1,7 +1,7 @@
 """Decides whether a claim is certain, that is, whether its sentence cannot mean anything else.
 
 A claim is certain if no unknown word lies between its subject and the words that state it, every
-other object before these words is listed with the subject, and a negation is next to the verb. "The
+other object between them is listed with the subject, and a negation is next to the verb. "The
 red cube is near the top" is certain; "the red cube recalls somebody near the top" is not. A claim
 that is not certain can be supported by the predicates, but not contradicted.
 """
@@ -24,18 +24,20 @@ closes closing come comes crawls crossed driven gathered gets got joins knocked 
 pushed reached rested sent set shown slipped stayed turned unmoved
 """
 PLAIN = frozenset(PLAIN_WORDS.split())
-"""Words outside phrases.yaml that leave a claim certain: adverbs, nouns of place and direction, and
-verbs for moving and being moved. Other words outside phrases.yaml are unknown words."""
+"""Words outside phrases.yaml that leave a claim certain: mostly adverbs, nouns of place and
+direction, and verbs for moving and being moved. Other words outside phrases.yaml are unknown."""
 LISTING = {"and", "comma", "object", "region", "not", "all"}
 """Tags that may lie between a subject and the next listed object."""
 BESIDE_NOT = {"be", "future", "moves", "moving", "show", "pronoun", "stays", "past", "by", "close"}
 """Tags that may lie between a negation and the words that it denies."""
 KEPT = {"leaves", "moves", "moving", "stays"}
-"""Verbs whose negation affirms the place after them: "has not left its place near the top"."""
+"""Verbs that a negation may deny without denying an affirmed claim after them, as in "has not left
+its place near the top"."""
 PAIRED = {"meeting", "course", "close", "time", "close region", "place of either"}
 """Kinds of claims about a pair of objects."""
 NEEDS_NO_SUBJECT = {"region", "direction", "displaced", "close region", "place of either"}
-"""Kinds of claims that can be contradicted without a known subject; see `truth` in grounding."""
+"""Kinds of claims about an unknown object that are contradicted if they are false of every object
+(`truth` in grounding). "No pair is on a collision course" needs no object and is always certain."""
 NAMING = {"lack", "gone", "adds", "extra", "misplace", "no_contact"}
 """Tags before an object that a candidate lacks, adds or displaces."""
 CLOSING = {"stop", "semicolon", "break", "which", "show", "lack", "adds", "extra", "candidate"}
@@ -101,7 +103,8 @@ class CertaintyCheck:
         return not qualified and (not named or letter in named | later)
 
     def _is_general(self, at: int) -> bool:
-        """Return whether a claim without a known subject affirms something of some object."""
+        """Return whether a claim without a known subject is plainly about some object: nothing
+        before it negates or doubts it, and more than "be" and unlisted words precedes it."""
         before = {tag.name for tag in self.tags[:at]}
         return not before & {"not", "contrast", "maybe", "none"} and not before <= {"word", "be"}
 
@@ -179,8 +182,9 @@ class CertaintyCheck:
         return denial.name in ("not", "contrast") or "not" in denial.words.split()
 
     def _is_denied(self, at: int, kept: set[str]) -> bool:
-        """Return whether a negation precedes the tag in its clause, as in "cannot be near the top
-        yet", but not in "near the left, not near the top". A tag in `kept` opens a clause."""
+        """Return whether a negation denies the tag: it precedes the tag in its clause, as in "it
+        cannot be near the top". A "not" directly after a comma begins a contrast and does not
+        count. A tag in `kept` also begins a clause."""
         opening = self.sentence.find(at - 1, BOUNDARIES | kept, -1) + 1
         for i in range(at - 1, opening - 1, -1):
             tag = self.tags[i]

@@ -1,8 +1,10 @@
-"""One test per hook of models.compat. It fails with an explanation if a library changed it."""
+"""The hooks of models.compat. A test fails with an explanation if a library changed its hook."""
 
 from __future__ import annotations
 
+import ctypes
 import inspect
+import sys
 
 import bitsandbytes as bnb
 import peft
@@ -12,6 +14,7 @@ from peft.tuners.lora import LoraLayer
 from peft.tuners.lora.bnb import Linear4bit
 from peft.tuners.lora.layer import Linear, LoraVariant
 from sentence_transformers import MultiVectorEncoder, SentenceTransformerTrainer
+from sentence_transformers.base.modules import Dense
 from torch import nn
 from transformers import AttentionInterface, AttentionMaskInterface, Trainer, TrainingArguments
 
@@ -107,10 +110,27 @@ def test_qwen3_vl_takes_the_vision_towers_outputs_instead_of_pixels(model) -> No
         (MultiVectorEncoder, ["_load_with_module_classes"]),
         (Trainer, ["_get_train_sampler", "_load_from_checkpoint"]),
         (SentenceTransformerTrainer,
-         ["_load_from_checkpoint", "_load_best_model", "get_batch_sampler", "collect_features"]),
+         ["_load_from_checkpoint", "_load_best_model", "get_batch_sampler", "collect_features",
+          "add_model_card_callback"]),
         (Linear4bit, ["_cast_input_dtype"]),
     ],
 )  # fmt: skip
 def test_overridden_methods_exist(kind, names) -> None:
     for name in names:
         assert hasattr(kind, name), f"{CHANGED} {kind.__name__}.{name} is gone"
+
+
+def test_the_projection_of_a_multi_vector_model_takes_a_dict_with_token_embeddings() -> None:
+    received = []
+    projection = Dense(4, 2, activation_function=None, module_input_name="token_embeddings")
+    projection.register_forward_pre_hook(lambda module, args: received.append(args))
+    projection({"token_embeddings": torch.ones(1, 3, 4)})
+    assert "token_embeddings" in received[0][0], (
+        f"{CHANGED} the projection of sentence-transformers takes another input"
+    )
+
+
+def test_freed_memory_is_kept_by_mallopt() -> None:
+    compat.keep_freed_memory()
+    if sys.platform == "linux":
+        assert hasattr(ctypes.CDLL(None), "mallopt"), f"{CHANGED} libc has no mallopt"

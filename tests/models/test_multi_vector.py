@@ -22,21 +22,17 @@ from models.retriever.embedder import (
 )
 from models.retriever.multi_vector import find_scored_tokens
 from models.retriever.scored_tokens import ScoredTokens
-from tests.tiny_models import randomize_adapters
 from train.common.audit import audit_retriever
 
 FRAME_TOKENS = 9
 """Tokens of a frame of 96 px, and of each of the six pairs of frames of a clip."""
 
 
-def load(cfg, micro_store, folder, noise: float = 0.0) -> MultiVectorEncoder:
-    """Return a retriever whose adapters, if it has any, change its outputs if `noise` is not 0."""
+def load(cfg, micro_store, folder) -> MultiVectorEncoder:
+    """Return an untrained retriever."""
     torch.manual_seed(0)
-    model = load_retriever(
-        cfg, "fp32", tokenizer_texts(micro_store.retrieval("train"), cfg), folder
-    )
-    randomize_adapters(model, noise)
-    return model
+    texts = tokenizer_texts(micro_store.retrieval("train"), cfg)
+    return load_retriever(cfg, "fp32", texts, folder)
 
 
 @pytest.fixture(scope="module")

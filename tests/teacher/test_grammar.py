@@ -18,8 +18,8 @@ BROKEN = {
     "a wrong letter": lambda t: t[:-1] + "E",
     "no answer": lambda t: t[: t.rindex("\n")],
     "an empty line": lambda t: t.replace("\n", "\n\n", 1),
-    "a missing section": lambda t: t.replace("\nPrediction:", "", 1),
-    "sections out of order": lambda t: t.replace("Prediction:", "Outcome:", 1),
+    "a missing heading": lambda t: t.replace("\nPrediction:", "", 1),
+    "a heading of another section": lambda t: t.replace("Prediction:", "Outcome:", 1),
     "no full stop": lambda t: t.replace(".\nPrediction", "\nPrediction", 1),
     "a missing candidate": lambda t: t.replace("andidate D", "andidate A"),
 }

@@ -53,7 +53,7 @@ def test_images_are_the_requested_frames(tmp_path: Path) -> None:
 
 
 DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
-    "another generator's key": (lambda r: r.update(collisions=r.pop("collision")), "collision:"),
+    "a key of another name": (lambda r: r.update(collisions=r.pop("collision")), "collision:"),
     "quaternions": (
         lambda r: r["motion_trajectory"][3]["objects"][1].update(orientation=[0.0, 0.0, 0.0, 1.0]),
         "objects.1.orientation",
