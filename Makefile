@@ -17,7 +17,7 @@ HAS_CHROMIUM := command -v chromium > /dev/null && command -v chromedriver > /de
 
 PY := $(BIN)/python -m
 
-.PHONY: help setup vllm-env run paper-tiny paper experiments releases hours test check lint format base constraints clean
+.PHONY: help setup docs vllm-env run paper-tiny paper experiments releases hours test check lint format base constraints clean
 
 help: ## Print this help
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -117,6 +117,9 @@ check: setup lint ## Lint, then run the quick tests
 	$(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile \
 		--ignore tests/train --ignore tests/models --ignore tests/evaluation/models
 
+docs: setup ## Build the documentation into site/
+	$(BIN)/python -m mkdocs build --strict --quiet
+
 lint: setup ## Check format and style
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -136,4 +139,4 @@ constraints: setup ## Write constraints.txt from the versions in .venv
 	$(BIN)/uv pip freeze --quiet --python $(BIN)/python --exclude-editable > constraints.txt
 
 clean: ## Remove built benchmarks and runs; keep the environment
-	rm -rf store exports $(filter-out %/README.md %/bases,$(wildcard checkpoints/*))
+	rm -rf store exports $(filter-out %/bases,$(wildcard checkpoints/*))

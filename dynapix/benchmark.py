@@ -246,7 +246,8 @@ class Benchmark:
     Attributes:
         store: The benchmark on the disk.
         split: train or test.
-        frames, image_size: As in `load`.
+        frames: As in `load`.
+        image_size: As in `load`.
     """
 
     store: Store

@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+import dynapix
 from conf.compose import config_name, preflight
 from conf.multirun.sweep import Sweep
 from conf.runs import TRAINER_FOLDERS, run_name
@@ -84,3 +87,17 @@ def test_python_examples_run(micro_store, tmp_path, monkeypatch, capsys) -> None
 
 def test_the_readme_fits_its_length() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+
+
+@pytest.mark.slow
+def test_the_documentation_builds_without_warnings(tmp_path) -> None:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "min_displacement" in (tmp_path / "configuration.html").read_text()
+    library = (tmp_path / "api.html").read_text()
+    assert all(name in library for name in dynapix.__all__)
+    # The pages load nothing from other hosts.
+    for page in tmp_path.glob("*.html"):
+        sources = re.findall(r'(?:src|<link[^>]+href)="(https?:[^"]*)"', page.read_text())
+        assert not sources, f"{page.name}: {sources}"
