@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import NoReturn
 
 from conf.errors import SettingsError, UserError
@@ -34,7 +35,8 @@ WRITE_ERRORS = {
 
 @contextmanager
 def report_failures(folder: str = ".") -> Iterator[None]:
-    """Exit with a message after a UserError, an interruption or a failed write in the block.
+    """Exit with a message after a UserError, an interruption, a failed write or an import of a
+    package that is not installed.
 
     Any other exception is a bug and keeps its traceback. With several ranks, one rank prints.
 
@@ -47,6 +49,15 @@ def report_failures(folder: str = ".") -> Iterator[None]:
     except UserError as error:
         lines = [f"error: {line}  [{error.code}]" for line in str(error).splitlines()]
         _exit(2 if isinstance(error, SettingsError) else 1, "\n".join(lines))
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if not package or find_spec(package):
+            raise
+        _exit(
+            1,
+            f"error: this command needs the package {package}: pip install -e '.[all]'  "
+            "[missing-package]",
+        )
     except KeyboardInterrupt:
         _exit(130, "interrupted; run the same command again to resume")
     except OSError as error:

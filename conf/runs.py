@@ -124,7 +124,7 @@ OmegaConf.register_new_resolver("runs_folder", runs_folder, replace=True)
 def open_run(run: Run, settings: dict[str, Any], command: str) -> None:
     """Write the settings (config.yaml) and the record (run.json) of a run that starts or resumes.
 
-    A folder without results may be reused with other settings; its record then starts anew.
+    A folder without results may be reused with other settings; its record then starts again.
 
     Raises:
         SettingsError: The folder contains results of a run with other settings.

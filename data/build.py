@@ -13,7 +13,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from conf.compose import nearest_key
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
 from conf.runs import compare_settings, wait_for_lock
@@ -145,6 +144,8 @@ def check_quota_names(cfg: BenchmarkConfig) -> None:
     known = {f"selection.{name}": list(f.cells) for name, f in item_families(cfg).items()}
     known["retrieval.builders"] = [str(b) for b in future.BUILDERS]
     quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
+    from conf.compose import nearest_key
+
     problems = []
     for key, named in {**quotas, "retrieval.builders": cfg.retrieval.builders}.items():
         options = known.get(key, [])

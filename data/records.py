@@ -120,6 +120,11 @@ class Scene:
     def frames(self) -> int:
         return self.positions.shape[0]
 
+    @property
+    def object_keys(self) -> list[tuple[SceneObject, int]]:
+        """The appearance of each object, with its number among the objects that look alike."""
+        return [(each, self.objects[:k].count(each)) for k, each in enumerate(self.objects)]
+
 
 @dataclass(frozen=True)
 class FrameRef:

@@ -58,7 +58,7 @@ def load(
     if image_size is not None and find_spec("torchvision") is None:
         raise UserError(
             f"image_size={image_size} needs torchvision, so that frames equal those of the "
-            "commands: pip install 'dynapix[train]', or leave it out and resize frames yourself",
+            "commands: pip install -e '.[train]', or leave it out and resize frames yourself",
             code="missing-package",
         )
     folder = Path(benchmark)
@@ -90,7 +90,7 @@ def _build(name: str, root: Path) -> Store:
     except ImportError as error:
         raise UserError(
             f"{root / name} is not built, and building it needs {error.name}: "
-            "pip install 'dynapix[simulate]'",
+            "pip install -e '.[simulate]'",
             code="missing-package",
         ) from error
     cfg = compose("data.build", BuildCommand, [f"benchmark={name}"])

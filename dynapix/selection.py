@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -89,7 +89,8 @@ def evaluate(
             number of predictions than it received items, or the first items all fail.
     """
     items = list(items)
-    if not items or len({id(item._benchmark) for item in items}) > 1:
+    benchmarks = {id(item._benchmark): item._benchmark for item in items}
+    if len({benchmark.store.identity for benchmark in benchmarks.values()}) != 1:
         problem = "items of several benchmarks" if items else "no items"
         raise UserError(
             f"{problem}: give Benchmark.selection or some of its items", code="invalid-items"
@@ -104,6 +105,7 @@ def evaluate(
             outcomes += _predict_batch(predict, batch, single=batch_size is None)
             bar.update(len(batch))
             _stop_if_all_failed(outcomes, len(items))
+            _stop_if_mixed(outcomes)
     return Result(items[0]._benchmark, name, tuple(items), tuple(outcomes), seed)
 
 
@@ -171,6 +173,14 @@ class Comparison(tuple[PairedComparison, ...]):
         return str(paired_table(self))
 
 
+def _stop_if_mixed(outcomes: Sequence[Outcome]) -> None:
+    if any(o.text is not None for o in outcomes) and any(o.scores for o in outcomes):
+        raise UserError(
+            "predict returned texts for some items and scores for others: return one of both",
+            code="invalid-prediction",
+        )
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """The result of `evaluate`. Printing it shows the table of `python -m evaluation.select`.
@@ -188,16 +198,10 @@ class Result:
     items: tuple[Item, ...]
     outcomes: tuple[Outcome, ...]
     seed: int = 0
-    _texts: bool = field(init=False)
 
-    def __post_init__(self) -> None:
-        kinds = {o.scores is None for o in self.outcomes if not o.failed}
-        if len(kinds) > 1:
-            raise UserError(
-                "predict returned texts for some items and scores for others: return one of both",
-                code="invalid-prediction",
-            )
-        object.__setattr__(self, "_texts", kinds != {False})
+    @cached_property
+    def _texts(self) -> bool:
+        return not any(outcome.scores for outcome in self.outcomes)
 
     @cached_property
     def failures(self) -> list[Failure]:

@@ -364,13 +364,6 @@ def _close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
     )
 
 
-def _index_by_name(scene: Scene) -> dict[tuple[str, int], int]:
-    """Return the index of each object by its noun phrase and its number among objects with the same
-    one: other simulators' scenes have such objects."""
-    names = [o.noun_phrase for o in scene.objects]
-    return {(name, names[:k].count(name)): k for k, name in enumerate(names)}
-
-
 def _candidate_facts(
     letter: str,
     scene: Scene,
@@ -380,10 +373,12 @@ def _candidate_facts(
 ) -> CandidateFacts:
     other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
     frame = candidate.frame
-    in_target, in_candidate = _index_by_name(scene), _index_by_name(other)
+    in_target, in_candidate = (
+        {key: k for k, key in enumerate(s.object_keys)} for s in (scene, other)
+    )
     ranked: list[tuple[tuple[bool, bool, float], Difference]] = []
     for key in {**in_target, **in_candidate}:
-        (name, _), i, j = key, in_target.get(key), in_candidate.get(key)
+        name, i, j = key[0].noun_phrase, in_target.get(key), in_candidate.get(key)
         expected = i is not None and _sight(scene, target, i) == "shown"
         visible = j is not None and _sight(other, frame, j) == "shown"
         if expected != visible:

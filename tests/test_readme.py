@@ -73,7 +73,7 @@ def test_link_targets_exist() -> None:
 
 
 def test_python_examples_run(micro_store, tmp_path, monkeypatch, capsys) -> None:
-    # The examples load the tiny benchmark; a smaller one stands in its folder.
+    # The examples load the tiny benchmark; the folder store/tiny is here a smaller one.
     (tmp_path / "store").mkdir()
     (tmp_path / "store" / "tiny").symlink_to(micro_store.folder)
     monkeypatch.chdir(tmp_path)

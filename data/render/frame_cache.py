@@ -115,7 +115,7 @@ def render_frames(
         except ModuleNotFoundError as error:
             raise UserError(
                 f"frames of scene {scene.scene_id} are not in the cache, and rendering them needs "
-                f"{error.name}: pip install 'dynapix[simulate]'",
+                f"{error.name}: pip install -e '.[simulate]'",
                 code="missing-package",
             ) from error
         images = {frame: renderer.render(scene, frame) for frame in frames}

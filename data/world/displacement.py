@@ -66,8 +66,8 @@ def _positions_by_appearance(
     """Map appearances, numbered where objects look alike, to positions and whether visible."""
     positions, visible = visible_positions(scene)
     return {
-        (each, scene.objects[:k].count(each)): (positions[frame, k], bool(visible[frame, k]))
-        for k, each in enumerate(scene.objects)
+        key: (positions[frame, k], bool(visible[frame, k]))
+        for k, key in enumerate(scene.object_keys)
     }
 
 

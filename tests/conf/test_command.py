@@ -1,5 +1,6 @@
 """The toy command as a process: the files of its run, its exit status and its error messages."""
 
+import importlib
 import json
 import shutil
 import sys
@@ -95,3 +96,23 @@ def test_help_can_be_piped_to_head(folder):
     command = "set -o pipefail; python -m toy --help | true"
     done = run_child(["bash", "-c", command.replace("python", sys.executable)], cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_package_that_is_not_installed_is_named(capsys):
+    with pytest.raises(SystemExit) as ended, report_failures():
+        importlib.import_module("not_installed.part")
+    assert ended.value.code == 1
+    error = capsys.readouterr().err
+    assert "the package not_installed" in error
+    assert error.endswith("[missing-package]\n")
+    # A missing module of an installed package is a bug.
+    with pytest.raises(ModuleNotFoundError), report_failures():
+        importlib.import_module("conf.not_there")
+
+
+def test_a_command_without_hydra_says_what_to_install(folder):
+    script = "import sys; sys.modules['hydra'] = None; import data.build"
+    done = run_child([sys.executable, "-c", script], cwd=folder)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: commands need hydra")
+    assert done.stderr.count("\n") == 1

@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -259,7 +260,7 @@ def test_embeddings_that_find_every_target_have_full_recall(bench, as_mapping) -
     scores = dynapix.evaluate_retrieval(bench.retrieval, *embeddings)
     expected = {"recall@1": 1, "recall@10": 1, "recall@50": 1, "mrr": 1, "median_rank": 1}
     assert scores.metrics == {**expected, "tie_rate": 0}
-    assert "Recall" in str(scores) or "R@1" in str(scores)
+    assert "R@1" in str(scores)
     constant = dynapix.evaluate_retrieval(
         bench.retrieval, np.ones_like(queries), np.ones_like(frames)
     )
@@ -330,7 +331,8 @@ def test_unknown_and_damaged_benchmarks_are_refused(micro_store, tmp_path) -> No
 
 
 def test_items_of_two_benchmarks_and_wrong_batches_are_refused(bench, micro_store) -> None:
-    other = dynapix.load(micro_store.folder)
+    rebuilt = replace(micro_store, manifest=micro_store.manifest | {"renderer": "other"})
+    other = dynapix.Benchmark(rebuilt, "test", frames=12, image_size=None)
     with raises_user_error("invalid-items"):
         dynapix.evaluate([], always_a)
     with raises_user_error("invalid-items"):

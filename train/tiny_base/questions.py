@@ -86,7 +86,7 @@ def build_questions(
     store: Store, items: list[SelectionItem], frame_count: int, frames: FrameReader, seed: int
 ) -> dict[str, list[LazySample]]:
     """Return samples by kind of question. In each epoch, frames, candidates and their order are
-    chosen anew."""
+    chosen again."""
     builder = QuestionBuilder(store, items, frame_count, frames, seed)
     return {kind: [s for item in items for s in builder.samples(item, kind)] for kind in KINDS}
 
