@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import psutil
@@ -29,6 +28,7 @@ from data.store import (
 from data.world.sampling import format_scene_id
 from data.world.scenes import split_scenes
 from tests.user_errors import raises_user_error
+from tests.waiting import wait_until
 
 
 def small(**changes: object) -> BenchmarkConfig:
@@ -85,8 +85,7 @@ def test_killed_build_resumes_to_identical_bytes(built, tmp_path, part) -> None:
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     child = subprocess.Popen([sys.executable, script], env=env)
     parts = tmp_path / part
-    while child.poll() is None and len(list(parts.glob("[!.]*"))) < 2:
-        time.sleep(0.005)
+    wait_until(lambda: child.poll() is not None or len(list(parts.glob("[!.]*"))) >= 2)
     workers = psutil.Process(child.pid).children()
     child.kill()
     child.wait()
@@ -117,8 +116,9 @@ def test_partial_build_with_other_scenes_is_kept(tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_concurrent_builds_make_one_store(tmp_path, built) -> None:
+def test_concurrent_builds_make_one_store(tmp_path, built, caplog) -> None:
     """While one builder holds the lock, others wait for it, as jobs of a sweep do."""
+    caplog.set_level("INFO")
     stores = []
     others = [
         threading.Thread(
@@ -129,8 +129,7 @@ def test_concurrent_builds_make_one_store(tmp_path, built) -> None:
     with lock_partial_build(small(), tmp_path / "small"):
         for other in others:
             other.start()
-        time.sleep(0.5)
-        assert all(other.is_alive() for other in others)
+        wait_until(lambda: caplog.text.count("is being built by another process; waiting") == 2)
     for other in others:
         other.join(timeout=300)
     assert len(stores) == 2

@@ -1,7 +1,6 @@
 """Narration of a benchmark in memory: resuming, damaged files, and faulty servers."""
 
 import threading
-import time
 from dataclasses import replace
 
 import pyarrow.parquet as pq
@@ -15,6 +14,7 @@ from teacher.sections import GRAMMAR, GRAMMAR_VERSION
 from tests.teacher import synthetic
 from tests.teacher.faulty_server import teacher_at
 from tests.user_errors import raises_user_error
+from tests.waiting import wait_until
 
 TEMPLATE = TeacherConfig(name="template")
 NARRATED = [f"item-{k}" for k in range(13) if k != 5]
@@ -79,16 +79,16 @@ def test_items_are_set_aside_only_under_the_settings_that_reject_their_responses
     assert journal_path(store).read_bytes() == before
 
 
-def test_second_writer_waits_for_the_journal(store):
+def test_second_writer_waits_for_the_journal(store, caplog):
     """Jobs of a sweep that start together may narrate the same benchmark."""
+    caplog.set_level("INFO")
     narrations = []
     other = threading.Thread(
         target=lambda: narrations.append(narrate_store(store, TEMPLATE)), daemon=True
     )
     with Journal(journal_path(store)):
         other.start()
-        time.sleep(0.3)
-        assert other.is_alive()
+        wait_until(lambda: "another process is writing" in caplog.text)
     other.join(timeout=120)
     assert narrations[0].rationales == narrate_store(store, TEMPLATE).rationales
 

@@ -3,7 +3,6 @@
 import asyncio
 import json
 import threading
-import time
 
 import pytest
 
@@ -12,6 +11,7 @@ from teacher.server_narrator import request_fields
 from teacher.servers.pool import ServerPool
 from tests.teacher.faulty_server import FaultyServer, completion, teacher_at
 from tests.user_errors import raises_user_error
+from tests.waiting import wait_until
 
 MESSAGES = [{"role": "user", "content": "Are you there?"}]
 
@@ -101,17 +101,17 @@ def test_broken_server_does_not_affect_the_others(store, start_server, state):
     assert narration.figures["rejected"] == {}
 
 
-def test_restart_of_a_server_rejects_no_response(store, start_server):
+def test_restart_of_a_server_rejects_no_response(store, start_server, caplog):
+    caplog.set_level("INFO")
     server = start_server()
     port = server.server_port
     server.delay = 0.05
     restarted = []
 
     def restart():
-        while len(server.requests) < 5:
-            time.sleep(0.01)
+        wait_until(lambda: len(server.requests) >= 5)
         server.stop()
-        time.sleep(0.5)
+        wait_until(lambda: "waiting for it" in caplog.text)
         restarted.append(FaultyServer(store, port=port))
 
     thread = threading.Thread(target=restart)
