@@ -7,13 +7,14 @@ import random
 import re
 import sys
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
 
 from teacher.narrator import write_description, write_rationale
 from teacher.numbers.detection import find_numbers
+from tests.scaling import SIZE, is_linear
 from tests.teacher import synthetic
 from tests.teacher.adversarial_text import PIECES, repeat_piece
 from tests.teacher.test_predicates import random_cases
@@ -159,7 +160,11 @@ def test_no_character_raises():
 
 @pytest.mark.parametrize("piece", PIECES, ids=ascii)
 def test_time_is_linear_in_adversarial_text(piece):
-    # A search of quadratic time takes minutes for this length.
-    text = repeat_piece(piece, 100_000)
-    spans = find_numbers(text)
-    assert all(0 <= start < stop <= len(text) for start, stop in spans)
+    assert is_linear(find_numbers, partial(repeat_piece, piece))
+    text = repeat_piece(piece, SIZE)
+    assert all(0 <= start < stop <= len(text) for start, stop in find_numbers(text))
+
+
+def test_quadratic_time_is_detected():
+    search = re.compile("a+$").search
+    assert not is_linear(search, lambda size: "a" * size + "b", size=1000)
