@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
 from conf.errors import UserError
+from conf.files import write_json, write_text
 from dynapix.benchmark import Benchmark, Query
-from evaluation.metrics.results import RetrievalResult, retrieval_results
-from evaluation.retrieval.exact_search import Ranks, exact_ranks
+from dynapix.saved_runs import saved_run
+from evaluation.metrics.results import RetrievalReport, RetrievalResult, retrieval_results
+from evaluation.retrieval.exact_search import Ranks, exact_ranks, write_ranks
 
 Embeddings = np.ndarray | Mapping[str, Sequence[float]]
 """An array with a row for each query or frame, or vectors by `Query.query_id` or `Frame.name`."""
@@ -25,10 +28,15 @@ class RetrievalScores:
         rows: The measures with 95% intervals over scenes: over all queries at each width, widest
             first, then for each builder.
         ranks: The number of frames above each query's target, and tied with it, at each width.
+        name, benchmark, queries, seed: What was evaluated, and the seed of the intervals.
     """
 
     rows: list[RetrievalResult]
     ranks: Ranks
+    name: str
+    benchmark: Benchmark
+    queries: list[Query]
+    seed: int
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -42,6 +50,22 @@ class RetrievalScores:
 
     def __repr__(self) -> str:
         return f"<RetrievalScores {self.metrics}>"
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the result as a run, and return its folder.
+
+        `python -m evaluation.report` shows the results in the folder runs/ beside other runs.
+
+        Raises:
+            UserError: The folder exists and contains something else.
+        """
+        folder = Path(folder)
+        store = self.benchmark.store
+        with saved_run(folder, store, "retrieve", self.name, self.seed, self.metrics):
+            write_ranks(folder, {self.name: self.ranks}, [q.record for q in self.queries])
+            write_json(folder / "report.json", asdict(RetrievalReport(store.identity, self.rows)))
+            write_text(folder / "report.txt", f"{self}\n")
+        return folder
 
 
 def evaluate_retrieval(
@@ -99,7 +123,8 @@ def evaluate_retrieval(
     targets = frame_rows[[index[q.target.name] for q in queries]]
     ranks = exact_ranks(query_rows, targets, [frame_rows], ranked_widths)
     records = [q.record for q in queries]
-    return RetrievalScores(retrieval_results(benchmark.name, name, ranks, records, seed), ranks)
+    rows = retrieval_results(benchmark.name, name, ranks, records, seed)
+    return RetrievalScores(rows, ranks, name, benchmark, queries, seed)
 
 
 def _rows(embeddings: Embeddings, names: Sequence[str], kind: str) -> np.ndarray:

@@ -6,7 +6,6 @@ import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from conf.errors import UserError
 from conf.files import write_json, write_json_lines, write_text
 from data.records import LETTERS
 from dynapix.benchmark import Benchmark, Item
+from dynapix.saved_runs import saved_run
 from evaluation.metrics.results import SIMILARITY, SelectionReport, SelectionResult
 from evaluation.metrics.selection import Choices, choose_letters, credit_choices, selection_report
 from evaluation.metrics.significance import PairedComparison, compare_runs
@@ -257,40 +257,28 @@ class Result:
             UserError: The folder exists and contains something else.
         """
         folder = Path(folder)
-        if folder.exists() and any(folder.iterdir()) and not (folder / "run.json").exists():
-            raise UserError(
-                f"{folder} contains other files: choose a new folder", code="other-files"
-            )
-        folder.mkdir(parents=True, exist_ok=True)
-        # The run counts as finished when metrics.json exists.
-        (folder / "metrics.json").unlink(missing_ok=True)
-        settings = {"benchmark": self.benchmark.store.manifest["config"], "model": None}
-        write_text(folder / "config.yaml", json.dumps(settings, indent=1) + "\n")
-        started = datetime.now(UTC).isoformat(timespec="seconds")
         kind = "select" if self._texts else "similarity"
-        record = {"command": "dynapix.evaluate", "kind": kind, "name": self.name, "seed": self.seed}
-        write_json(folder / "run.json", {**record, "started": started, "earlier_starts": []})
-        if self._texts:
-            rows = [
-                {
-                    "key": TEXT,
-                    "mode": TEXT,
-                    "item_id": o.item_id,
-                    "text": o.text or "",
-                    "cut": False,
-                }
-                for o in self.outcomes
-            ]
-            write_json_lines(folder / "answers.jsonl", rows)
-        else:
-            rows = [
-                {"by": self.name, "item_id": o.item_id, "scores": o.scores} for o in self.outcomes
-            ]
-            write_json_lines(folder / "scores.jsonl", rows)
-        write_json_lines(folder / "failures.jsonl", map(asdict, self.failures))
-        write_json(folder / "report.json", asdict(self.report))
-        write_text(folder / "report.txt", f"{self}\n")
-        write_json(folder / "metrics.json", self.accuracy.metrics)
+        record = (self.benchmark.store, kind, self.name, self.seed)
+        with saved_run(folder, *record, metrics=self.accuracy.metrics):
+            if self._texts:
+                rows = [
+                    {
+                        "key": TEXT,
+                        "mode": TEXT,
+                        "item_id": o.item_id,
+                        "text": o.text or "",
+                        "cut": False,
+                    }
+                    for o in self.outcomes
+                ]
+                write_json_lines(folder / "answers.jsonl", rows)
+            else:
+                scored = [(o.item_id, o.scores) for o in self.outcomes]
+                rows = [{"by": self.name, "item_id": i, "scores": scores} for i, scores in scored]
+                write_json_lines(folder / "scores.jsonl", rows)
+            write_json_lines(folder / "failures.jsonl", map(asdict, self.failures))
+            write_json(folder / "report.json", asdict(self.report))
+            write_text(folder / "report.txt", f"{self}\n")
         return folder
 
     @classmethod

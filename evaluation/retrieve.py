@@ -16,7 +16,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from evaluation.embedders.base import open_retriever
     from evaluation.metrics import results
     from evaluation.reporting import tables
-    from evaluation.retrieval import standard_test
+    from evaluation.retrieval import exact_search, standard_test
 
     preset, store, embedders = open_retriever(cfg, run)
     queries, database = standard_test.load_standard_test(store)
@@ -37,7 +37,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
 
     differences = results.compare_retrievers(ranks, queries, cfg.seed)
     extra = [tables.rank_differences_table(differences)] if differences else []
-    standard_test.write_ranks(run.folder, ranks, queries)
+    exact_search.write_ranks(run.folder, ranks, queries)
     entries = {"build": store.identity, "differences": differences}
     standard_test.write_report(run.folder, rows, extra, **entries)
     # The first row has the first retriever's measures over all queries, at its widest width.

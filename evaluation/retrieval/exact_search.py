@@ -9,13 +9,16 @@ with the shape of a block. Here the sums over entries are exact (see `GridEmbedd
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
+from conf.files import write_json_lines
 from data.parallel import batched
+from data.records import RetrievalQuery
 from evaluation.metrics.ranking import count_above_and_equal
 
 GRID = 2.0**26
@@ -56,6 +59,21 @@ class Ranks:
         (greater, equal), found = counts, np.ones(counts.shape[2], bool)
         seconds = time.perf_counter() - began
         return cls(tuple(widths), greater, equal - 1, found, frames, vectors, seconds)
+
+
+def write_ranks(
+    folder: Path, ranks: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
+) -> None:
+    """Write ranks.jsonl. For a retriever and a query, a row has at each width the number of frames
+    `before` the target and the number of other frames `tied` with it."""
+    rows = []
+    for name, result in ranks.items():
+        for k, query in enumerate(queries):
+            row = {"by": name, "query_id": query.query_id, "widths": result.widths}
+            row["before"] = result.greater[:, k].tolist()
+            row["tied"] = result.tied[:, k].tolist()
+            rows.append(row)
+    write_json_lines(folder / "ranks.jsonl", rows)
 
 
 class GridEmbeddings:

@@ -1,4 +1,4 @@
-"""The standard test of retrieval: its queries and database, the ranks and the report.
+"""The standard test of retrieval: its queries and database, and the report.
 
 The queries are test queries, equally many of each builder (the procedure that made a query). The
 database holds frames of test scenes, with every target among them.
@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from conf.files import write_json_lines, write_text
+from conf.files import write_text
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
@@ -47,21 +47,6 @@ def rank_targets(
 
         return late_ranks(queries, targets, database, preset.late.width)
     return exact_ranks(queries, targets, database, preset.widths)
-
-
-def write_ranks(
-    folder: Path, ranks: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
-) -> None:
-    """Write ranks.jsonl. For a retriever and a query, a row has at each width the number of frames
-    `before` the target and the number of other frames `tied` with it."""
-    rows = []
-    for name, result in ranks.items():
-        for k, query in enumerate(queries):
-            row = {"by": name, "query_id": query.query_id, "widths": result.widths}
-            row["before"] = result.greater[:, k].tolist()
-            row["tied"] = result.tied[:, k].tolist()
-            rows.append(row)
-    write_json_lines(folder / "ranks.jsonl", rows)
 
 
 def write_report(

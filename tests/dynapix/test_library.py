@@ -267,6 +267,26 @@ def test_embeddings_that_find_every_target_have_full_recall(bench, as_mapping) -
     assert constant.metrics["recall@1"] == pytest.approx(1 / len(names))
 
 
+def test_saved_retrieval_results_are_in_the_report(bench, tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    queries, frames = (rng.normal(size=(len(r), 8)) for r in (bench.retrieval, bench.database))
+    scores = dynapix.evaluate_retrieval(
+        bench.retrieval, queries, frames, widths=[4, 8], name="mine"
+    )
+    saved = scores.save(tmp_path / "runs" / "mine")
+    assert (saved / "report.txt").read_text() == f"{scores}\n"
+    assert len((saved / "ranks.jsonl").read_text().splitlines()) == len(bench.retrieval)
+    folder = run_report(tmp_path, bench.store.folder.parent, items=0, saved=str(tmp_path / "runs"))
+    table = (folder / "tables" / "retrieval-micro.md").read_text()
+    recall = 100 * scores.metrics["recall@10"]
+    [row] = [line for line in table.splitlines() if "mine" in line]
+    assert f"{recall:.1f}" in row
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "file").touch()
+    with raises_user_error("other-files", contains=str(tmp_path / "other")):
+        scores.save(tmp_path / "other")
+
+
 def test_embeddings_of_another_shape_or_database_are_refused(bench) -> None:
     rng = np.random.default_rng(0)
     queries = rng.normal(size=(len(bench.retrieval), 8))
