@@ -47,10 +47,10 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
             code="unsupported-with-fsdp",
         )
     rank_batch = split_batch(cfg.train.batch)
-    checkpoint = newest_checkpoint(run.folder)
 
     # The main rank builds the benchmark if it is missing; then every rank reads it from the disk.
     with main_first():
+        checkpoint = newest_checkpoint(run.folder)
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     training, validation = split_queries(
         store, cfg.train.batch, cfg.train.hard_negatives, cfg.train.validation_queries, cfg.seed

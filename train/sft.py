@@ -45,10 +45,10 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     compat.keep_freed_memory()
     # Check the batch now, because building the benchmark may take long.
     distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)
-    checkpoint = newest_checkpoint(run.folder)
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.
     with distributed.main_first():
+        checkpoint = newest_checkpoint(run.folder)
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
         without = cfg.train.regime in WITHOUT_RATIONALES
         rationales = [] if without else ensure_rationales(store, cfg.teacher)
