@@ -17,6 +17,9 @@ HAS_CHROMIUM := command -v chromium > /dev/null && command -v chromedriver > /de
 
 PY := $(BIN)/python -m
 
+# Every process imports torch and transformers, which takes three times as long without bytecode files.
+export PYTHONDONTWRITEBYTECODE =
+
 .PHONY: help setup docs vllm-env run paper-tiny paper experiments releases hours test check lint format base constraints clean
 
 help: ## Print this help
@@ -110,11 +113,11 @@ hours: setup ## Estimate the GPU hours of make paper from measured rates
 # One thread per test process: the tests also start servers and distributed ranks, each with threads.
 test: setup vllm-env ## Run all tests
 	@$(HAS_CHROMIUM)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 # Tests of models and trainers are left out: importing torch takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests
-	$(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile \
+	$(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder \
 		--ignore tests/train --ignore tests/models --ignore tests/evaluation/models
 
 docs: setup ## Build the documentation into site/

@@ -39,6 +39,22 @@ def micro_config(**changes: object) -> BenchmarkConfig:
     return BenchmarkConfig(**{**settings, **changes})
 
 
+LONGEST = (
+    "train/common/test_ranks.py",
+    "teacher/test_serve.py",
+    "evaluation/models/test_vllm.py",
+    "train/common/test_resume.py",
+    "evaluation/reporting/test_report.py",
+    "conf/test_sweep.py",
+)
+"""Files that take longest. They start first, so that no process has to wait for one at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    order = {Path(__file__).parent / name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path, len(order)))
+
+
 @pytest.fixture(scope="session")
 def micro() -> BenchmarkConfig:
     return micro_config()

@@ -84,7 +84,7 @@ def nf4_cfg(saved_base: str) -> StudentConfig:
         model=saved_base,
         image_size=96,
         max_length=1500,
-        max_new_tokens=24,
+        max_new_tokens=8,
         lora=LoraConfig(rank=4),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,12 @@ trainer's mean loss, which in a resumed run counts only the steps since it resum
 BAR_MEASURES = ("loss", "letter_accuracy", "token_accuracy", "recall@10")
 """Suffixes of the measures that the progress bar shows."""
 
+PLOT_INTERVAL = 30
+"""Minimum time (s) between two plots of the curves."""
+
 
 class JournalCallback(TrainerCallback):
-    """Appends what the trainer logs to metrics.jsonl, and plots the curves with each checkpoint.
+    """Appends what the trainer logs to metrics.jsonl, and plots the curves with the checkpoints.
 
     A run that resumes first deletes the lines of steps after its checkpoint from metrics.jsonl and
     samples.jsonl, and a run that starts again deletes all lines.
@@ -30,6 +34,7 @@ class JournalCallback(TrainerCallback):
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / JOURNAL
+        self._plotted = time.monotonic()
 
     def on_train_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
         resumed = state.global_step > 0
@@ -46,7 +51,12 @@ class JournalCallback(TrainerCallback):
             file.write(json.dumps({"step": state.global_step, **values}) + "\n")
 
     def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        if time.monotonic() - self._plotted >= PLOT_INTERVAL:
+            self.on_train_end(args, state, control)
+
+    def on_train_end(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
         plot_curves(read_journal(self._path.parent), self._path.with_name(CURVES))
+        self._plotted = time.monotonic()
 
 
 class BestCheckpointCallback(TrainerCallback):
