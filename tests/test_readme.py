@@ -20,10 +20,10 @@ from tests.conf.test_presets import SCHEMAS
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
-LINE = re.compile(r"^    python -m (\S+)(.*)$", re.MULTILINE)
+LINE = re.compile(r"^    (?:accelerate launch .*|python) -m (\S+)(.*)$", re.MULTILINE)
 LINES = sorted({line for page in PAGES for line in LINE.findall(page.read_text())})
 COMMANDS = [(command, shlex.split(rest, comments=True)) for command, rest in LINES]
-"""The command and the overrides of each line of a code block that starts with `python -m`."""
+"""The command and the overrides of each line of a code block that starts a command."""
 
 
 def run_folder(command: str, overrides: list[str]) -> str:
@@ -47,6 +47,15 @@ def test_settings_of_a_documented_command_are_valid(command: str, overrides: lis
     check = Sweep if "-m" in overrides else preflight
     settings = [o.replace("=RUN", "=checkpoints/sft/exp-cot") for o in overrides if o != "-m"]
     check(command, SCHEMAS[command], settings)
+
+
+def test_named_make_targets_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    named = {
+        t for page in PAGES for t in re.findall(r"(?:`| {4}|&& )make ([a-z-]+)", page.read_text())
+    }
+    assert len(named) > 5
+    assert named <= targets
 
 
 def test_named_runs_are_produced_by_other_commands() -> None:
