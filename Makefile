@@ -110,14 +110,14 @@ releases:
 hours: setup ## Estimate the GPU hours of make paper from measured rates
 	@$(PY) benchmarks.speed.hours --student $(STUDENT) --retriever $(RETRIEVER)
 
-# One thread per test process: the tests also start servers and distributed ranks, each with threads.
+# One thread per process, because the tests run in several processes and start others.
 test: setup vllm-env ## Run all tests
 	@$(HAS_CHROMIUM)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 # Tests of models and trainers are left out: importing torch takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests
-	$(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder \
 		--ignore tests/train --ignore tests/models --ignore tests/evaluation/models
 
 docs: setup ## Build the documentation into site/

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import torch
-
 
 def resolve_precision(precision: str) -> str:
     """Resolve auto to bf16 or fp32; return bf16 and fp32 unchanged.
@@ -17,6 +15,8 @@ def resolve_precision(precision: str) -> str:
 
 
 def supports_bf16() -> bool:
+    import torch
+
     if torch.cuda.is_available():
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return any(has for name, has in torch.cpu.get_capabilities().items() if "bf16" in name)

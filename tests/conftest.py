@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -78,5 +80,11 @@ def benchmark_store(request: pytest.FixtureRequest) -> Store:
 
 @pytest.fixture(scope="session")
 def micro_store(tmp_path_factory: pytest.TempPathFactory, micro: BenchmarkConfig) -> Store:
-    folder: Path = tmp_path_factory.mktemp("store") / "micro"
-    return ensure_benchmark(micro, folder.parent, workers=2)
+    # The first process of pytest-xdist builds the benchmark; the others wait for it and copy it.
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    built = ensure_benchmark(micro, shared / "built", workers=2)
+    folder = tmp_path_factory.mktemp("store") / "micro"
+    shutil.copytree(built.folder, folder)
+    return open_store(folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-SIZE, FACTOR = 12_500, 8
+SIZE, FACTOR = 5000, 8
 """Length of the shorter text, and the ratio of the two lengths."""
 ATTEMPTS = 5
 """Number of measurements; the fastest counts, because other programs only slow a measurement."""

@@ -12,8 +12,8 @@ from evaluation.generators.response_log import RECORD_MODES, SampleOf, SaveRespo
 from evaluation.generators.response_schema import instruction as record_instruction
 from evaluation.generators.response_schema import schema
 from models.precision import resolve_precision
-from models.student.generation import response_token_limit
 from models.student.prompts import Sample, instruction, selection_sample
+from models.student.responses import response_token_limit
 
 PROMPT_VERSION = 1
 """Version of the prompt layout. Increment it when the layout changes, so that earlier responses are

@@ -23,12 +23,8 @@ from models.fingerprints import model_id, pin_revisions, processor_digest, weigh
 from models.memory import explain_out_of_memory
 from models.resolved import check_base
 from models.student.collator import Collator
-from models.student.generation import (
-    THOUGHT_TAG,
-    generate,
-    response_token_limit,
-    sampling_processors,
-)
+from models.student.generation import generate, sampling_processors
+from models.student.responses import THOUGHT_TAG, response_token_limit
 from models.trained_runs import product_folder, run_title
 
 

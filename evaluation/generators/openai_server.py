@@ -20,8 +20,8 @@ from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageComm
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import schema
 from models.fingerprints import processor_digest, weights_digest
-from models.student.generation import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.student.prompts import Clip, Sample
+from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.trained_runs import product_folder, run_title
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import TRUNCATED, Response

@@ -17,8 +17,8 @@ from data.records import FrameRef, RetrievalQuery, SelectionItem
 from evaluation.generators.response_schema import Record, read_record
 from models.fingerprints import settings_key
 from models.student.answer_parser import parse_choice
-from models.student.generation import GeneratedText
 from models.student.prompts import Sample
+from models.student.responses import GeneratedText
 
 Subject = SelectionItem | RetrievalQuery | FrameRef
 """The item, query or frame that a prompt is about."""

@@ -7,7 +7,6 @@ batch nor on the response at which a killed command resumes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import nn
@@ -22,27 +21,10 @@ from transformers import (
 
 from conf.schema import StudentConfig
 from models.loading import DTYPES
+from models.student.responses import THOUGHT_TAG, GeneratedText
 
-ANSWER_TOKENS = 16
-"""Maximum number of new tokens in answer mode: enough for an answer line, even a malformed one."""
-THOUGHT_TAG = "<think>"
-"""Tag that opens a thought. Some chat templates end prompts with it."""
 TAG_SEARCH_TOKENS = 8
 """Number of tokens at the end of a prompt in which the tag is searched."""
-
-
-def response_token_limit(mode: str, max_new_tokens: int, thinking: bool = False) -> int:
-    """Return the maximum number of new tokens: `ANSWER_TOKENS` in answer mode without thinking,
-    otherwise `max_new_tokens`."""
-    return ANSWER_TOKENS if mode == "answer" and not thinking else max_new_tokens
-
-
-@dataclass(frozen=True)
-class GeneratedText:
-    """A generated text, and whether it was cut off at the token limit."""
-
-    text: str
-    cut: bool = False
 
 
 def generate(

@@ -1,7 +1,6 @@
 """The texts that the grammar of rationales accepts in xgrammar, the grammar engine of vLLM."""
 
 import pytest
-import xgrammar
 
 from teacher.narrator import write_rationale
 from teacher.sections import GRAMMAR
@@ -28,6 +27,8 @@ BROKEN = {
 @pytest.fixture(scope="module")
 def accepts():
     """A function that returns whether the grammar accepts a text."""
+    import xgrammar  # It imports torch, which takes longer than these tests.
+
     tokens = xgrammar.TokenizerInfo(["<end>"], stop_token_ids=[0])
     grammar = xgrammar.GrammarCompiler(tokens).compile_grammar(GRAMMAR)
 

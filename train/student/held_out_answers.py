@@ -17,7 +17,8 @@ from conf.schema import SftCommand
 from models.memory import explain_out_of_memory
 from models.student.answer_parser import parse_choice
 from models.student.collator import Collator
-from models.student.generation import generate, response_token_limit
+from models.student.generation import generate
+from models.student.responses import response_token_limit
 from train.common.journal import ANSWERS
 from train.student.lazy_samples import StudentDataset
 

@@ -17,7 +17,7 @@ from evaluation.generators.response_log import score_response
 from evaluation.metrics.results import SelectionResult, from_json
 from evaluation.metrics.selection import Choices, selection_report
 from evaluation.reporting.selection_report import write_report
-from models.student.generation import GeneratedText
+from models.student.responses import GeneratedText
 from tests.user_errors import raises_user_error
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)

@@ -40,7 +40,7 @@ from evaluation.reporting.selection_report import write_report
 from evaluation.retrieval import nearest_candidate
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.select import limit_items
-from models.student.generation import GeneratedText
+from models.student.responses import GeneratedText
 
 STUDENT = StudentConfig(name="small")
 Respond = Callable[[SelectionItem], str]

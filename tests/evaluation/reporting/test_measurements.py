@@ -6,10 +6,14 @@ import json
 import shutil
 from pathlib import Path
 
+import pytest
+
 from conf.schema import ExportStudyCommand
 from data.records import FAMILIES
 from tests.evaluation.reporting.measured import finish, read_table, retrieve_run, run_report
 from tests.evaluation.study.test_agreement import summarize, vote
+
+pytestmark = pytest.mark.slow
 
 
 def change_first_row(report: Path, **row: object) -> None:

@@ -23,6 +23,8 @@ from tests.evaluation.reporting.measured import (
 )
 from tests.user_errors import raises_user_error
 
+pytestmark = pytest.mark.slow
+
 
 def page_data(folder: Path) -> dict:
     """Return the data of the browser of items on the page."""
@@ -125,7 +127,6 @@ def test_the_page_is_self_contained(report):
         assert name in ids
 
 
-@pytest.mark.slow
 def test_equal_runs_give_equal_pages(report):
     page = report(items=3) / "report.html"
     content = page.read_bytes()
@@ -135,7 +136,6 @@ def test_equal_runs_give_equal_pages(report):
     assert page.read_bytes() != content
 
 
-@pytest.mark.slow
 def test_runs_are_chosen_by_name_and_pattern(runs, report):
     assert list(report(items=0).glob("tables/*retrieval*"))
     folder = report(runs=["select/cot*", "select/base"], items=1)
