@@ -13,7 +13,7 @@ from data.records import FPS, FrameRef, SelectionItem
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from data.tracks.retrieval.counterfactual import removal_displacement
-from data.tracks.retrieval.database import UniqueFrames
+from data.tracks.retrieval.database import UniqueFrames, counterfactual_database
 from data.tracks.selection import window
 from data.tracks.selection.distractors import Timing, visible_objects
 from data.world.displacement import (
@@ -317,6 +317,17 @@ def test_counterfactual_database_contains_factual_frames(benchmark_store) -> Non
     if any(unique.add(frame) for frame in train):
         others = set(database) - {q.target for q in queries}
         assert others <= {*test, *train}, "the database has other frames, but lacks factual ones"
+
+
+@pytest.mark.parametrize("more", [0, 1, 3])
+def test_counterfactual_database_has_its_configured_size(micro, micro_store, more) -> None:
+    queries = micro_store.retrieval(pool="counterfactual")
+    unique = UniqueFrames(micro_store.scene)
+    for query in queries:
+        unique.add(query.target)
+    wanted = len(unique.frames) + more
+    cfg = replace(micro, retrieval=replace(micro.retrieval, counterfactual_source=wanted))
+    assert len(counterfactual_database(cfg, queries, unique)) == wanted
 
 
 def test_frames_without_motion_are_twins(benchmark_store) -> None:
