@@ -113,6 +113,14 @@ def test_spans_index_the_original(text, stated):
     assert text[slice(*span)] == stated
 
 
+@pytest.mark.parametrize(
+    ("text", "stated"),
+    [("Only wider one moves.", ""), ("There is bluer one.", ""), ("They shed one.", "one")],
+)
+def test_one_is_a_pronoun_after_an_adjective_of_five_letters_or_more(text, stated):
+    assert "".join(text[slice(*span)] for span in find_numbers(text)) == stated
+
+
 @pytest.mark.parametrize("phrase", NUMBER_PHRASES.split("|"))
 def test_inserted_number_is_detected(phrase):
     plain = phrase.replace("[", "").replace("]", "")
