@@ -2,6 +2,7 @@
 
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -126,3 +127,16 @@ def test_broken_rationale_is_rejected(mutate, reason):
         verdict = validate_rationale(mutate(text, item), predicates, item, CFG)
         assert not verdict.accepted
         assert any(r.startswith(reason) for r in verdict.reasons), verdict.reasons
+
+
+@pytest.mark.parametrize(
+    ("fewest", "most", "reasons"),
+    [(0, 0, ()), (1, 1, ("too short",)), (-1, -1, ("too long",)), (-1, 1, ())],
+)
+def test_the_bounds_of_the_length_are_valid_lengths(fewest, most, reasons):
+    """The arguments are the bounds relative to the number of words of a rationale."""
+    item, predicates = next(random_cases(9))
+    text = write_rationale(predicates, item, 0)
+    words = len(WORD.findall(text))
+    cfg = replace(CFG, min_words=words + fewest, max_words=words + most)
+    assert validate_rationale(text, predicates, item, cfg).reasons == reasons
