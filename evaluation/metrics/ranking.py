@@ -51,7 +51,7 @@ def expected_hits(greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, k: i
     With k = 1 this is the credit of a retriever on a selection item: 1/m if the target is one of m
     candidates with the highest score. The other arguments are those of `query_metrics`.
     """
-    hits = np.clip((k - np.asarray(greater)) / (np.asarray(tied) + 1), 0, 1)
+    hits = np.clip((k - np.asarray(greater)) / (np.where(valid, tied, 0) + 1), 0, 1)
     return np.where(valid, hits, 0.0)
 
 

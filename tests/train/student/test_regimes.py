@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from conf.schema import TeacherConfig
@@ -9,6 +10,7 @@ from conf.schema.training import REGIMES, WITHOUT_RATIONALES
 from data.records import LETTERS
 from data.store import Store
 from models.student.answer_parser import parse_choice
+from models.student.collator import encode
 from models.student.prompts import answer_line, instruction
 from teacher.narrate import ensure_rationales
 from teacher.predicates import extract_predicates
@@ -105,3 +107,19 @@ def test_an_order_depends_on_seed_epoch_and_item(micro_store, frames, student_cf
         for k, s in enumerate(supervised):
             expected = s if seed is None else s.permuted(seed, 1)
             assert dataset[k].response == expected.response
+
+
+def test_estimated_lengths_differ_as_the_numbers_of_tokens(
+    micro_store, frames, processor, student_cfg
+) -> None:
+    """The estimate leaves out what all prompts have, so the differences between samples count."""
+    by_mode = items_of(micro_store, "cot")
+    supervised = by_mode["reasoning"][:3] + by_mode["answer"][:3]
+    samples = [s.lazy_sample(frames, count, None) for count in (4, 12) for s in supervised]
+    data = StudentDataset(samples)
+    estimates = np.array(data.lengths(processor.tokenizer, student_cfg.image_size))
+    size = student_cfg.max_length
+    tokens = np.array([len(encode(sample, processor, size).input_ids) for sample in data])
+    assert np.ptp(tokens) > 200
+    # Timestamps can differ by a few tokens.
+    assert np.ptp(estimates - tokens) <= 4
