@@ -121,7 +121,7 @@ check: setup lint ## Lint, then run the quick tests
 		--ignore tests/train --ignore tests/models --ignore tests/evaluation/models
 
 docs: setup ## Build the documentation into site/
-	$(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 lint: setup ## Check format and style
 	$(BIN)/ruff format --check .
