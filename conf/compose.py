@@ -139,6 +139,8 @@ def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.R
         return hydra.compose_config(config_name(command), overrides, mode, from_shell=False)
     except ValueError as error:
         nulls = " ".join(o for o in overrides if o.endswith("=null"))
+        if not nulls:
+            raise SettingsError(str(error)) from error
         raise SettingsError(f"{nulls}: give the name of a preset instead of null") from error
     except (AssertionError, AttributeError) as error:
         nested = " ".join(o for o in overrides if "." in o.partition("=")[0])

@@ -97,7 +97,7 @@ def resolve_run_name(run: str, folder: str) -> str:
 
 def is_inside(path: str, folder: str) -> bool:
     """Whether `path` is `folder` or below it."""
-    return not os.path.relpath(path, folder).startswith("..")
+    return bool(path) and not os.path.relpath(path, folder).startswith("..")
 
 
 def runs_folder(checkpoints: str, product: str) -> str:

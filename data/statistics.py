@@ -34,7 +34,7 @@ def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
         f"{baseline}_{category}": accuracy
         for category, row in statistics["baselines"].items()
         for baseline, accuracy in row.items()
-        if baseline != "items"
+        if baseline != "items" and accuracy is not None
     }
 
 

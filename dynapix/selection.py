@@ -298,6 +298,8 @@ class Result:
             kind, name, seed = record["kind"], record["name"], record["seed"]
             file = "answers.jsonl" if kind == "select" else "scores.jsonl"
             rows = [json.loads(line) for line in (folder / file).read_text().splitlines()]
+            prediction = "text" if kind == "select" else "scores"
+            predictions = [(row["item_id"], row[prediction]) for row in rows]
             lines = (folder / "failures.jsonl").read_text().splitlines()
             failed = {row["item_id"]: row["reason"] for row in map(json.loads, lines)}
             build = report["build"]
@@ -311,18 +313,16 @@ class Result:
                 code="different-builds",
             )
         by_id = {item.item_id: item for item in benchmark.selection}
-        if missing := [row["item_id"] for row in rows if row["item_id"] not in by_id]:
+        if missing := [name for name, _ in predictions if name not in by_id]:
             raise UserError(
                 f"{folder} has {len(missing)} items that the {benchmark.split} split of "
                 f"{benchmark.name} does not have, such as {missing[0]}",
                 code="different-items",
             )
-        items = [by_id[row["item_id"]] for row in rows]
+        items = [by_id[name] for name, _ in predictions]
         outcomes = [
-            _failure(item, failed[item.item_id])
-            if item.item_id in failed
-            else _read(item, row["text"] if kind == "select" else row["scores"])
-            for item, row in zip(items, rows, strict=True)
+            _failure(by_id[name], failed[name]) if name in failed else _read(by_id[name], value)
+            for name, value in predictions
         ]
         return cls(benchmark, name, tuple(items), tuple(outcomes), seed)
 

@@ -169,8 +169,8 @@ def lora_config(group: str, lora: LoraConfig, task_type: str | None = None) -> I
         )
     except (ValueError, re.error) as error:
         raise UserError(
-            f"{group}.lora.targets={lora.targets} is invalid or adapts no layer of this model: "
-            "give a pattern that matches full names of linear layers, such as "
+            f"{group}.lora.targets={lora.targets} is invalid or adapts no layer of this model "
+            f"({error}): give a pattern that matches full names of linear layers, such as "
             "model.language_model.layers.0.self_attn.q_proj",
             code="no-lora-targets",
         ) from error

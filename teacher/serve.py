@@ -156,16 +156,16 @@ def vllm_arguments(
         max_rank = next((r for r in LORA_RANKS if r >= rank), LORA_RANKS[-1])
         arguments += ["--enable-lora", "--max-lora-rank", str(max_rank)]
         arguments += ["--lora-modules", f"adapter={Path(cfg.adapter).absolute()}"]
+    if (cfg.gpus or 0) > available:
+        raise UserError(
+            f"gpus={cfg.gpus}: vLLM finds only {available} on this machine", code="too-few-gpus"
+        )
     if not available:
         cache = round(cfg.cache_gb * 2**30)
         arguments += ["--enforce-eager", "--kv-cache-memory-bytes", str(cache)]
         # With chunked prefill, vLLM 0.32 samples a token after each chunk and discards it, which
         # crashes a server without a GPU if the request has a seed.
         return [*arguments, "--no-enable-chunked-prefill"]
-    if (cfg.gpus or 1) > available:
-        raise UserError(
-            f"gpus={cfg.gpus}: vLLM finds only {available} on this machine", code="too-few-gpus"
-        )
     # A power of two, since the number of GPUs must divide the model's number of attention heads.
     gpus = cfg.gpus or 1 << (available.bit_length() - 1)
     arguments += ["--tensor-parallel-size", str(gpus)]

@@ -20,7 +20,8 @@ LOWER_IS_BETTER = r"loss|_rank$|set_aside|too_short|reject"
 
 def read_jobs(folder: Path) -> list[dict[str, Any]]:
     """The jobs of a sweep that have ended, by number."""
-    jobs = [read_job(path.parent) for path in folder.glob(f"[0-9]*/{JOB_FILE}")]
+    paths = [p for p in folder.glob(f"*/{JOB_FILE}") if p.parent.name.isdecimal()]
+    jobs = [read_job(path.parent) for path in paths]
     return sorted(jobs, key=lambda job: job["job"])
 
 

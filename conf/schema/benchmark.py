@@ -124,6 +124,13 @@ class BenchmarkConfig(Settings):
         remedy = f"set both quotas of {group}retrieval.counterfactual to 0"
         if self.simulator in SIMULATORS[1:] and has_counterfactuals:
             yield f"{simulator}: scenes of a release cannot be simulated again; {remedy}"
+        if (self.simulator in ("movi_a", "physion") or self.standin) and any(
+            quota.train + quota.test for quota in self.retrieval.builders.values()
+        ):
+            yield (
+                f"{group}retrieval.builders: queries need scenes of 128 frames at 25 fps, which "
+                f"those of {self.standin or self.simulator} are not; set their quotas to 0"
+            )
         if self.standin in STANDINS:
             standin = f"{group}standin={self.standin}"
             if self.simulator != "bullet":

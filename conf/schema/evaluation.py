@@ -176,8 +176,9 @@ class StudyCommand(CommandConfig):
             yield f"port={self.port} is not a port: give a number from 1 to 65535"
         example = "such as https://study.example.org"
         if self.public is not None:
-            url = urlsplit(self.public)
-            if not is_url(self.public) or not url.netloc or url.path not in ("", "/"):
+            # urlsplit raises an error for some texts that are no URL.
+            url = urlsplit(self.public) if is_url(self.public) else None
+            if url is None or not url.netloc or url.path not in ("", "/"):
                 yield f"public={self.public} is not the URL of a host, {example}"
         if not _is_loopback(self.host) and not (self.public or "").startswith("https:"):
             yield (

@@ -38,7 +38,7 @@ def compute_statistics(store: Store) -> dict[str, Any]:
         "answers": rows["letter"].value_counts().reindex(list(LETTERS), fill_value=0).to_dict(),
         "cells": count_cells(items, store.manifest["config"]["selection"]),
         "candidates": candidates.fillna(0).to_dict("index"),
-        "baselines": baselines.to_dict("index"),
+        "baselines": baselines.astype(object).where(baselines.notna(), None).to_dict("index"),
     }
 
 
@@ -102,7 +102,7 @@ def format_statistics(statistics: dict[str, Any]) -> str:
     """Format the statistics as text tables whose lines have at most 100 characters."""
     scenes = statistics["scenes"]
     candidates = pd.DataFrame(statistics["candidates"]).T.round().astype(int)
-    baselines = pd.DataFrame(statistics["baselines"]).T
+    baselines = pd.DataFrame(statistics["baselines"]).T.astype(float)
     baselines[list(BASELINES)] *= 100
     cells = pd.DataFrame(statistics["cells"]).T
     sections = [
@@ -113,7 +113,7 @@ def format_statistics(statistics: dict[str, Any]) -> str:
         "(minimum, quartiles, maximum)\n"
         f"Answers:              {_join(statistics['answers'])}",
         "Accuracy of baselines without prediction, %\n"
-        + baselines.astype({"items": int}).to_string(float_format="{:.1f}".format),
+        + baselines.astype({"items": int}).to_string(float_format="{:.1f}".format, na_rep="-"),
         "Candidates: median displacement in px from the target to the nearest distractor and\n"
         "between any two candidates; items by number of distractors earlier than the target\n"
         + candidates.to_string(),

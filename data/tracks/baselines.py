@@ -36,17 +36,21 @@ def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: St
 
     Positions are extrapolated from the last frame of the prefix to the target's moment, which
     questions of the event and window families do not state. An object that the candidate's scene
-    lacks has the image's diagonal as its distance, which is also the maximum.
+    lacks has the image's diagonal as its distance, which is also the maximum. The result is NaN for
+    releases of simulators whose cameras the scenes do not record.
     """
+    config = store.manifest["config"]
+    if config["simulator"] in ("movi_a", "physion"):
+        return np.nan
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
     seconds = (item.target_frame - item.prefix_stop) / scene.fps
     positions = scene.positions[item.prefix_stop] + seconds * scene.velocities[item.prefix_stop]
-    expected, _ = standin_view(store.manifest["config"].get("standin")).camera.project(positions)
-    actual = {o: other.image_positions[candidate.frame, k] for k, o in enumerate(other.objects)}
+    expected, _ = standin_view(config.get("standin")).camera.project(positions)
+    actual = dict(zip(other.object_keys, other.image_positions[candidate.frame], strict=True))
     scale = MODEL_SIZE / np.array(scene.image_size)
     distances = [
-        np.linalg.norm((expected[k] - actual[o]) * scale) if o in actual else DIAGONAL
-        for k, o in enumerate(scene.objects)
+        np.linalg.norm((expected[k] - actual[key]) * scale) if key in actual else DIAGONAL
+        for k, key in enumerate(scene.object_keys)
     ]
     return float(np.minimum(distances, DIAGONAL).mean())
 
@@ -65,10 +69,10 @@ BASELINES: dict[str, Cost] = {
 
 def score_baselines(item: SelectionItem, store: Store) -> dict[str, float]:
     """Return each baseline's score on an item: 1/m if the target is among the m candidates with the
-    lowest cost, otherwise 0."""
+    lowest cost, otherwise 0; NaN if the baseline cannot be computed for the simulator."""
     scores = {}
     for name, cost in BASELINES.items():
         costs = np.array([cost(item, candidate, store) for candidate in item.candidates])
         best = np.flatnonzero(costs == costs.min())
-        scores[name] = float(item.answer in best) / len(best)
+        scores[name] = float(item.answer in best) / len(best) if len(best) else np.nan
     return scores

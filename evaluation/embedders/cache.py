@@ -118,6 +118,12 @@ class EmbeddingCache:
     def _explain_damage(self) -> Iterator[None]:
         try:
             yield
+        except sqlite3.OperationalError as error:
+            raise UserError(
+                f"{self.path} cannot be read or written ({error}): check the free space and the "
+                "permissions, and that no other command holds the file, then run this again",
+                code="unusable-cache",
+            ) from error
         except sqlite3.DatabaseError as error:
             raise UserError(
                 f"{self.path} cannot be read or written ({error}): delete it, and run this again",

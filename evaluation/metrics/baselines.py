@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from data.records import SelectionItem
 from data.store import Store
 from data.tracks.baselines import score_baselines
@@ -29,5 +31,6 @@ def baseline_results(
     choices = [
         Choices(title, BASELINE, None, [s[name] for s in scores], letters)
         for name, title in TITLES.items()
+        if not np.isnan([s[name] for s in scores]).any()
     ]
     return selection_report(choices, items, store.name, store.identity, seed).rows

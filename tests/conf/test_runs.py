@@ -5,7 +5,7 @@ from itertools import permutations
 
 import pytest
 
-from conf.runs import Run, open_run, run_name
+from conf.runs import Run, is_inside, open_run, run_name
 from tests.user_errors import raises_user_error
 
 SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "workers": 2, "x": 1.0}
@@ -57,3 +57,17 @@ def test_other_settings_are_refused_with_both_values(tmp_path):
     (run.folder / "metrics.jsonl").touch()
     with raises_user_error("other-settings", contains="train.lr was 1.0 and is now 2.0"):
         open_run(run, SETTINGS | {"train": {"lr": 2.0}}, "train.sft")
+
+
+@pytest.mark.parametrize(
+    ("path", "inside"),
+    [
+        ("c/sft/a", True),
+        ("c/sft", True),
+        ("c/other", False),
+        ("c/sft/../other", False),
+        ("", False),
+    ],
+)
+def test_a_path_is_inside_a_folder_or_not(path, inside):
+    assert is_inside(path, "c/sft") == inside

@@ -19,7 +19,7 @@ from conf.errors import import_extra
 from conf.gpus import visible_gpus
 from conf.multirun.search import STUDY_FILE, distribution
 from conf.multirun.sweep import Sweep
-from conf.multirun.table import is_lower_better
+from conf.multirun.table import JOB_FILE, is_lower_better, read_jobs
 from conf.schema import ContrastiveCommand, SftCommand
 from conf.schema.training import REGIMES
 from tests.conf.toy_process import NO_GPU, run_toy, start_toy
@@ -110,6 +110,13 @@ def test_one_job_runs_on_each_gpu(folder):
     logs = [(runs / f"{number}/run.log").read_text() for number in range(2)]
     gpus = [line for log in logs for line in log.splitlines() if "sees GPU" in line]
     assert sorted(line[-1] for line in gpus) == ["0", "1"]
+
+
+def test_a_copied_job_folder_is_not_a_job(tmp_path):
+    for name in ("0", "1", "0.bak"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / JOB_FILE).write_text('{"overrides": [], "status": "failed"}')
+    assert [job["job"] for job in read_jobs(tmp_path)] == [0, 1]
 
 
 @pytest.mark.parametrize("rest", ["", "-1", "NoDevFiles", "-1,1"])

@@ -239,6 +239,10 @@ def test_damaged_results_and_results_on_other_builds_are_refused(bench, tmp_path
     (folder / "report.json").write_text(json.dumps({**report, "build": "other"}))
     with raises_user_error("different-builds", contains=str(folder)):
         dynapix.Result.load(folder, bench)
+    (folder / "report.json").write_text(json.dumps(report))
+    (folder / "answers.jsonl").write_text('{"text": "A"}\n')
+    with raises_user_error("damaged-file", contains="item_id"):
+        dynapix.Result.load(folder, bench)
     (folder / "answers.jsonl").unlink()
     with raises_user_error("damaged-file", contains="answers.jsonl"):
         dynapix.Result.load(folder, bench)

@@ -107,6 +107,8 @@ def test_gpu_count_is_as_given_or_the_largest_power_of_two(available, gpus, used
 def test_too_few_gpus_are_reported():
     with raises_user_error("too-few-gpus", contains="gpus=5"):
         flags(4, gpus=5)
+    with raises_user_error("too-few-gpus", contains="only 0"):
+        flags(0, gpus=2)
 
 
 def test_url_determines_the_address():

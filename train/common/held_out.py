@@ -17,7 +17,7 @@ Row = TypeVar("Row")
 
 
 def held_out_scenes(store: Store) -> set[str]:
-    """Return the names of the held-out training scenes, at least one.
+    """Return the names of the held-out training scenes, at least one if there are any scenes.
 
     Whether a scene is held out depends on its name, not on a run's seed or on the other scenes.
     The runs that train a base and a student over it thus hold out the same scenes.
@@ -25,7 +25,7 @@ def held_out_scenes(store: Store) -> set[str]:
     names = store.scene_ids("train")
     # In a small benchmark, no scene may be below the share.
     held_out = {name for name in names if name_fraction(name) < HELD_OUT_SHARE}
-    return held_out or {min(names, key=name_fraction)}
+    return held_out or set(sorted(names, key=name_fraction)[:1])
 
 
 def name_fraction(name: str) -> float:

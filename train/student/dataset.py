@@ -53,7 +53,8 @@ class SupervisedItem:
         """Return a sample that shows `frame_count` frames of the prefix. If `seed` is not None, its
         candidates are permuted in each epoch."""
         render = partial(self.render, frames, frame_count, seed)
-        return LazySample(self.text, frame_count // 2 + len(LETTERS), render, self.item.family)
+        pairs = -(-frame_count // 2)
+        return LazySample(self.text, pairs + len(LETTERS), render, self.item.family)
 
     def render(self, frames: FrameReader, frame_count: int, seed: int | None, epoch: int) -> Sample:
         s = self if seed is None else self.permuted(seed, epoch)

@@ -108,7 +108,7 @@ class QuestionBuilder:
     def samples(self, item: SelectionItem, kind: str) -> Iterator[LazySample]:
         """Yield the samples of a kind. Their length is estimated from the question of epoch 0."""
         if first := self.build(item, kind, 0, epoch=0):
-            media = len(first.pictures) + self.frame_count // 2 * first.after_clip
+            media = len(first.pictures) + -(-self.frame_count // 2) * first.after_clip
             for repeat in range(KINDS[kind][1]):
                 render = partial(self.render, item, kind, repeat)
                 yield LazySample(f"{first.text} {first.answer}", media, render)
@@ -317,7 +317,7 @@ def visible_regions(scene: Scene, frame: int) -> dict[str, str]:
     return {
         o.noun_phrase: object_region(scene, frame, k)
         for k, o in enumerate(scene.objects)
-        if scene.in_view[frame, k] and scene.visible_fraction[frame, k] > HIDDEN
+        if scene.in_view[frame, k] and not scene.visible_fraction[frame, k] <= HIDDEN
     }
 
 
@@ -334,7 +334,8 @@ def visible_objects(
 ) -> Iterator[tuple[int, tuple[float, float], tuple[str, ...]]]:
     """Yield index, place (shares of width and height) and words of each clearly visible object."""
     places = scene.image_positions[frame] / np.asarray(scene.image_size)
-    visible = scene.in_view[frame] & (scene.visible_fraction[frame] > CLEARLY_VISIBLE)
+    # A fraction that the simulator does not record is NaN.
+    visible = scene.in_view[frame] & ~(scene.visible_fraction[frame] <= CLEARLY_VISIBLE)
     for k in np.flatnonzero(visible):
         yield int(k), tuple(places[k].tolist()), tuple(scene.objects[k].noun_phrase.split())
 

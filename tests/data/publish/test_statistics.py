@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -63,6 +64,23 @@ def test_a_baseline_that_ties_scores_the_share_of_the_tied_candidates() -> None:
     still = synthetic.scene([(0, 0)], [(0, 0)])
     store = SimpleNamespace(scene=lambda _: still, manifest=STANDARD)
     assert accuracy(items, store)["nearest"] == pytest.approx(0.25)
+
+
+def test_velocity_baseline_is_unknown_for_releases_without_a_camera() -> None:
+    items, store = synthetic_store(4)
+    store.manifest = {"config": STANDARD["config"] | {"simulator": "physion"}}
+    scores = accuracy(items, store)
+    assert np.isnan(scores["velocity"])
+    assert not np.isnan([score for name, score in scores.items() if name != "velocity"]).any()
+
+
+def test_velocity_baseline_tells_objects_that_look_alike_apart() -> None:
+    """Two bowls move past each other; only the target has both where they are expected."""
+    items, store = synthetic_store(4)
+    scene = store.scene(items[0].scene_id)
+    twin = replace(scene, objects=(scene.objects[0],) * len(scene.objects))
+    same = SimpleNamespace(scene=lambda _: twin, manifest=STANDARD)
+    assert accuracy(items[:1], same)["velocity"] == accuracy(items[:1], store)["velocity"] == 1
 
 
 def test_cells_are_counted_beside_their_quotas() -> None:

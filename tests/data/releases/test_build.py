@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,21 @@ def test_an_invalid_record_stops_a_strict_build(movi, tmp_path) -> None:
     with raises_user_error("invalid-record", contains=("00007", "strict=false")):
         ensure_items(config(movi), tmp_path, Workers(1), strict=True)
     assert not (tmp_path / "movi").exists()
+
+
+def test_a_release_without_a_valid_record_names_their_number(movi, tmp_path) -> None:
+    broken = tmp_path / "release" / "movi_a"
+    shutil.copytree(movi, broken)
+    for events in broken.glob("*/events.json"):
+        events.write_text("{")
+    with raises_user_error("empty-benchmark", contains="12 bad records left out"):
+        ensure_items(config(broken), tmp_path / "store", Workers(1))
+
+
+def test_queries_of_a_release_are_refused(movi) -> None:
+    queries = replace(config(movi).retrieval, builders={"1": Quota(1, 1)})
+    [problem] = config(movi, retrieval=queries).find_problems("benchmark.")
+    assert "benchmark.retrieval.builders" in problem
 
 
 def test_a_release_may_move_after_the_build(movi, tmp_path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -106,6 +107,13 @@ def test_a_damaged_file_is_named(tmp_path, damage) -> None:
     path.write_bytes(damage(path.read_bytes()))
     with raises_user_error("damaged-file", contains=path.name):
         EmbeddingCache(tmp_path, "frame", SETTINGS).complete({"new/1": 1}, Model(), 64)
+
+
+def test_a_file_that_cannot_be_written_is_not_called_damaged(tmp_path) -> None:
+    cache = filled(tmp_path)
+    problem = raises_user_error("unusable-cache", contains=(cache.path.name, "disk"))
+    with problem, cache._explain_damage():
+        raise sqlite3.OperationalError("database or disk is full")
 
 
 def test_a_non_finite_embedding_is_named_and_not_stored(tmp_path) -> None:

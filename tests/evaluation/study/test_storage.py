@@ -148,6 +148,7 @@ def test_a_port_in_use_ends_the_command_with_an_error(path) -> None:
         ({"annotators": 0}, "annotators=0"),
         ({"port": 70000}, "port=70000"),
         ({"public": "study.example.org"}, "public=study.example.org"),
+        ({"public": "https://[example"}, "public=https://[example"),
         ({"public": "https://example.org/study"}, "public=https://example.org/study"),
         ({"host": "0.0.0.0"}, "host=0.0.0.0"),
         ({"host": "192.168.1.5", "public": "http://192.168.1.5:8765"}, "host=192.168.1.5"),

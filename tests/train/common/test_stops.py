@@ -122,6 +122,8 @@ def test_whether_a_scene_is_held_out_depends_on_its_name_only() -> None:
     assert len(held_out) == pytest.approx(HELD_OUT_SHARE * len(names), rel=0.15)
     assert held_out_scenes(Names(names[:500])) == held_out & set(names[:500])
     assert len(held_out_scenes(Names(names[:1]))) == 1
+    # A transfer suite has no training scenes.
+    assert held_out_scenes(Names([])) == set()
 
 
 @pytest.mark.parametrize(

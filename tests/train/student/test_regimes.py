@@ -115,7 +115,7 @@ def test_estimated_lengths_differ_as_the_numbers_of_tokens(
     """The estimate leaves out what all prompts have, so the differences between samples count."""
     by_mode = items_of(micro_store, "cot")
     supervised = by_mode["reasoning"][:3] + by_mode["answer"][:3]
-    samples = [s.lazy_sample(frames, count, None) for count in (4, 12) for s in supervised]
+    samples = [s.lazy_sample(frames, count, None) for count in (4, 5, 12) for s in supervised]
     data = StudentDataset(samples)
     estimates = np.array(data.lengths(processor.tokenizer, student_cfg.image_size))
     size = student_cfg.max_length

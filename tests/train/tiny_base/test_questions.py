@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from models.student.prompts import Sample
 from teacher.predicates import find_cut, object_region
 from train.student.lazy_samples import LazySample
 from train.tiny_base import questions
+from train.tiny_base.questions import visible_objects, visible_regions
 
 
 @pytest.fixture
@@ -204,3 +206,14 @@ def test_frames_vary_by_epoch_reproducibly(kinds) -> None:
     responses = [[lazy.render(epoch).response for lazy in kinds["frame"]] for epoch in (0, 1, 0)]
     assert responses[0] == responses[2]
     assert responses[0] != responses[1]
+
+
+def test_objects_of_unknown_visibility_are_described(micro_store) -> None:
+    """Releases record whether an object is in view, and NaN as its visible fraction."""
+    scene = micro_store.scene(micro_store.scene_ids("train")[0])
+    unknown = replace(scene, visible_fraction=np.full_like(scene.visible_fraction, np.nan))
+    in_view = {
+        o.noun_phrase for o, seen in zip(scene.objects, scene.in_view[0], strict=True) if seen
+    }
+    assert visible_regions(unknown, 0).keys() == in_view
+    assert len(list(visible_objects(unknown, 0))) == len(in_view) > 0
