@@ -302,15 +302,21 @@ def explain_unloadable(group: str, model: str, key: str = "model") -> Iterator[N
         UserError: The model is neither a local folder nor in the hub's cache and cannot be
             downloaded; or its files cannot be read.
     """
+    check_available(group, model, key)
+    try:
+        yield
+    except UNREADABLE as error:
+        raise _unloadable_error(f"{group}.{key}", model, error) from error
+
+
+def check_available(group: str, model: str, key: str = "model") -> None:
+    """Raise UserError if a base is neither a local folder nor in the hub's cache and cannot be
+    downloaded. The message names the setting GROUP.KEY."""
     try:
         if not Path(model).is_dir():
             find_commit(model)
     except Exception as error:
         # The hub's client raises the errors of whichever HTTP library is installed.
-        raise _unloadable_error(f"{group}.{key}", model, error) from error
-    try:
-        yield
-    except UNREADABLE as error:
         raise _unloadable_error(f"{group}.{key}", model, error) from error
 
 

@@ -31,6 +31,7 @@ from models.checks import PEFT, check_is_qwen3_vl, check_modules, check_processo
 from models.compat import keep_differentiable
 from models.distributed import main_first
 from models.loading import (
+    check_available,
     explain_damage,
     explain_unloadable,
     lora_config,
@@ -154,6 +155,9 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     """
     if (folder / EXPORT).exists() and not (folder / "adapter_config.json").exists():
         return load_merged(folder, cfg)
+    if (folder / "adapter_config.json").exists() and cfg.model is not None:
+        # Otherwise a missing base would look like a damaged run.
+        check_available("retriever", cfg.model)
     weights = weight_options(cfg, precision)
     model = _load_saved(folder, cfg, model_kwargs=weights, trust_remote_code=cfg.trust_remote_code)
     if cfg.late is not None:

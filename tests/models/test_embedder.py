@@ -17,6 +17,7 @@ from models.compat import keep_differentiable
 from models.parameter_counts import count_parameters
 from models.retriever import embedder
 from models.retriever.embedder import frame_input, query_input
+from tests.user_errors import raises_user_error
 from train.common.audit import audit_retriever
 from train.retriever.evaluator import (
     FRAME_STEP,
@@ -123,6 +124,13 @@ def test_adapters_and_projection_are_trained_in_fp32_over_a_bf16_base(
     assert next(model[0].parameters()).dtype == torch.bfloat16
     query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
     assert torch.as_tensor(model.encode_query(query)[0]).isfinite().all()
+
+
+def test_a_missing_base_is_not_called_a_damaged_run(retriever_cfg, tmp_path) -> None:
+    (tmp_path / "adapter_config.json").write_text("{}")
+    moved = replace(retriever_cfg, architecture=None, model="./moved/base", lora=LoraConfig(rank=4))
+    with raises_user_error("missing-model", contains="retriever.model=./moved/base"):
+        embedder.load_trained(moved, "fp32", tmp_path)
 
 
 def test_frames_of_the_database_look_different(micro_store) -> None:

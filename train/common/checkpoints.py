@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import re
@@ -36,6 +37,8 @@ READERS = {
     **dict.fromkeys((".pt", ".pth", ".bin"), lambda path: zipfile.ZipFile(path).close()),
 }
 """By suffix, a function that raises an error if a file is incomplete."""
+UNREADABLE = (errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE)
+"""Numbers of operating system errors that say nothing about the content of a file."""
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
@@ -77,6 +80,12 @@ def find_damage(checkpoint: Path) -> str | None:
         try:
             if read := READERS.get(path.suffix):
                 read(path)
-        except (OSError, ValueError, SafetensorError, zipfile.BadZipFile):
+        except (OSError, ValueError, SafetensorError, zipfile.BadZipFile) as error:
+            if isinstance(error, OSError) and error.errno in UNREADABLE:
+                # The checkpoint may be complete; without it, the run would start again.
+                raise UserError(
+                    f"{path} cannot be read ({error}): correct this and run the same command again",
+                    code="unreadable-checkpoint",
+                ) from error
             return f"{path.relative_to(checkpoint)} is incomplete"
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from dataclasses import replace
@@ -16,6 +17,7 @@ from conf.entry import Run
 from conf.schema import LateConfig, LoraConfig, SftCommand
 from tests.user_errors import raises_user_error
 from train import contrastive, sft
+from train.common import checkpoints
 from train.common.checkpoints import newest_checkpoint
 from train.common.journal import read_journal
 from train.student import dataset
@@ -121,6 +123,25 @@ def test_only_numbered_folders_are_checkpoints(tmp_path, caplog) -> None:
     assert not caplog.records
     (tmp_path / "metrics.jsonl").write_bytes(b'3\n{"step": 1, "loss": 2}\n\xff\n{"step": 2, "lo')
     assert read_journal(tmp_path) == [{"step": 1, "loss": 2}]
+
+
+def test_a_checkpoint_that_cannot_be_read_stops_the_run(tmp_path, monkeypatch) -> None:
+    """It is not skipped as incomplete: the run would start again and delete its journal."""
+    checkpoint = tmp_path / "checkpoint-2"
+    checkpoint.mkdir()
+    for name in ("model.safetensors", "optimizer.pt", "scheduler.pt", "rng_state.pth"):
+        (checkpoint / name).touch()
+    (checkpoint / "trainer_state.json").write_text("{}")
+    assert newest_checkpoint(tmp_path) is None
+
+    def fail(path: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setitem(checkpoints.READERS, ".json", fail)
+    for suffix in (".safetensors", ".pt", ".pth"):
+        monkeypatch.delitem(checkpoints.READERS, suffix)
+    with raises_user_error("unreadable-checkpoint", contains=("trainer_state.json", "denied")):
+        newest_checkpoint(tmp_path)
 
 
 @pytest.mark.slow
