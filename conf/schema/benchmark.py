@@ -128,8 +128,8 @@ class BenchmarkConfig(Settings):
             quota.train + quota.test for quota in self.retrieval.builders.values()
         ):
             yield (
-                f"{group}retrieval.builders: queries need scenes of 128 frames at 25 fps, which "
-                f"those of {self.standin or self.simulator} are not; set their quotas to 0"
+                f"{group}retrieval.builders: queries need scenes of 128 frames at 25 fps, unlike "
+                f"those of {self.standin or self.simulator}; set the quotas of all builders to 0"
             )
         if self.standin in STANDINS:
             standin = f"{group}standin={self.standin}"

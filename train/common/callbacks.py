@@ -52,9 +52,12 @@ class JournalCallback(TrainerCallback):
 
     def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
         if time.monotonic() - self._plotted >= PLOT_INTERVAL:
-            self.on_train_end(args, state, control)
+            self._plot()
 
     def on_train_end(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
+        self._plot()
+
+    def _plot(self) -> None:
         plot_curves(read_journal(self._path.parent), self._path.with_name(CURVES))
         self._plotted = time.monotonic()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -111,9 +110,10 @@ def test_a_damaged_file_is_named(tmp_path, damage) -> None:
 
 def test_a_file_that_cannot_be_written_is_not_called_damaged(tmp_path) -> None:
     cache = filled(tmp_path)
-    problem = raises_user_error("unusable-cache", contains=(cache.path.name, "disk"))
-    with problem, cache._explain_damage():
-        raise sqlite3.OperationalError("database or disk is full")
+    # SQLite then behaves as on a full disk.
+    cache._db.execute("PRAGMA max_page_count = 1")
+    with raises_user_error("unusable-cache", contains=(cache.path.name, "full")):
+        cache.complete({f"new/{k}": k for k in range(2500)}, Model(), 64)
 
 
 def test_a_non_finite_embedding_is_named_and_not_stored(tmp_path) -> None:
