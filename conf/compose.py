@@ -15,6 +15,7 @@ from difflib import SequenceMatcher
 from importlib.resources import files
 from typing import Any
 
+import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_module
 from hydra.core.config_loader import ConfigLoader
@@ -131,17 +132,16 @@ def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.R
     """Compose the settings of a command together with Hydra's own (`hydra.*`).
 
     Raises:
-        SettingsError: A group of presets is null, or a key is inside a group that is null. Hydra
-            raises errors for these two cases too, but their messages name no key.
+        SettingsError: The value of a group of presets is not a name, or a key is inside a group
+            that is null. Hydra's errors for these two cases name no key.
     """
     hydra = GlobalHydra.instance().hydra
     try:
         return hydra.compose_config(config_name(command), overrides, mode, from_shell=False)
     except ValueError as error:
-        nulls = " ".join(o for o in overrides if o.endswith("=null"))
-        if not nulls:
-            raise SettingsError(str(error)) from error
-        raise SettingsError(f"{nulls}: give the name of a preset instead of null") from error
+        values = {o: yaml.safe_load(o.partition("=")[2]) for o in overrides}
+        unnamed = " ".join(o for o, value in values.items() if not isinstance(value, str))
+        raise SettingsError(f"{unnamed}: give the name of a preset") from error
     except (AssertionError, AttributeError) as error:
         nested = " ".join(o for o in overrides if "." in o.partition("=")[0])
         raise SettingsError(

@@ -32,9 +32,9 @@ def main(cfg: ReportCommand, run: Run) -> None:
     runs, left_out = gather_runs(root, Path(cfg.saved), cfg.runs)
     for sentence in left_out:
         log.warning("%s", sentence)
-    selections = read_measurements(runs, root, SELECTION_KINDS)
+    selections = read_measurements(runs, SELECTION_KINDS)
     selections = deduplicate(distinguish_item_sets(selections))
-    retrievals = read_measurements(runs, root, RETRIEVAL_KINDS)
+    retrievals = read_measurements(runs, RETRIEVAL_KINDS)
     retrievals = deduplicate(distinguish_item_sets(retrievals))
     browser = browse_items(selections, Path(cfg.store), cfg.items, cfg.seed)
     sections = build_sections(selections, retrievals, runs, browser)

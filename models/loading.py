@@ -306,7 +306,11 @@ def explain_unloadable(group: str, model: str, key: str = "model") -> Iterator[N
     try:
         yield
     except UNREADABLE as error:
-        raise _unloadable_error(f"{group}.{key}", model, error) from error
+        where = "that folder" if Path(model).is_dir() else "the hub or its cache"
+        raise UserError(
+            f"{group}.{key}={model} cannot be loaded from {where}: {_first_line(error)}",
+            code="unloadable-model",
+        ) from error
 
 
 def check_available(group: str, model: str, key: str = "model") -> None:
@@ -317,24 +321,17 @@ def check_available(group: str, model: str, key: str = "model") -> None:
             find_commit(model)
     except Exception as error:
         # The hub's client raises the errors of whichever HTTP library is installed.
-        raise _unloadable_error(f"{group}.{key}", model, error) from error
-
-
-def _unloadable_error(key: str, model: str, error: Exception) -> UserError:
-    if Path(model).is_dir():
-        return UserError(
-            f"{key}={model} cannot be loaded from that folder: {_first_line(error)}",
-            code="unloadable-model",
-        )
-    if Path(model).is_absolute() or model.startswith("."):
-        return UserError(f"{key}={model}: this folder does not exist", code="missing-model")
-    return UserError(
-        f"{key}={model} is neither a local folder nor in the hub's cache, and cannot be downloaded "
-        f"({_first_line(error)}). Give a local copy with {key}=FOLDER (config.json, *.safetensors, "
-        "tokenizer and processor files), or download it on a machine with network access: hf "
-        f"download {model}",
-        code="missing-model",
-    )
+        name = f"{group}.{key}"
+        if Path(model).is_absolute() or model.startswith("."):
+            message = f"{name}={model}: this folder does not exist"
+        else:
+            message = (
+                f"{name}={model} is neither a local folder nor in the hub's cache, and cannot be "
+                f"downloaded ({_first_line(error)}). Give a local copy with {name}=FOLDER "
+                "(config.json, *.safetensors, tokenizer and processor files), or download it on a "
+                f"machine with network access: hf download {model}"
+            )
+        raise UserError(message, code="missing-model") from error
 
 
 @contextmanager

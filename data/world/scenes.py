@@ -124,17 +124,19 @@ def read_release(
             # Size and time of the file, so that a record that has changed is read again.
             inputs = [str(path), split, file.stat().st_size, file.stat().st_mtime_ns]
             part = part_path(folder, inputs)
+            if _problem_of(part):
+                # What was wrong may be mended, such as a missing video beside the record.
+                part.unlink()
             jobs[part] = partial(_read_one, cfg, path, split, folder, part)
             split_of[part] = split
     workers.write_files(jobs, f"reading {cfg.simulator}", "scene")
     scene_ids: dict[str, list[str]] = {split: [] for split in SPLITS}
     problems = []
     for part, split in split_of.items():
-        outcome = json.loads(part.read_bytes())
-        if "problem" in outcome:
-            problems.append(outcome["problem"])
+        if problem := _problem_of(part):
+            problems.append(problem)
         else:
-            scene_ids[split].append(outcome["scene_id"])
+            scene_ids[split].append(json.loads(part.read_bytes())["scene_id"])
     if problems and strict:
         raise UserError(
             f"{problems[0]} (strict=false leaves such records out)", code="invalid-record"
@@ -147,6 +149,11 @@ def read_release(
     return scene_ids, {"bad records left out": len(problems)}
 
 
+def _problem_of(part: Path) -> str | None:
+    """Return why a record was left out; None if it was read, or not yet."""
+    return json.loads(part.read_bytes()).get("problem") if part.exists() else None
+
+
 def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: Path) -> None:
     reader, source = READERS[cfg.simulator], Path(cfg.folder)
     rate = {"fps": cfg.fps} if cfg.simulator == "physion" else {}
@@ -154,6 +161,8 @@ def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: 
         scene = reader.read_scene(path, source, split, **rate)
     except RecordError as error:
         outcome = {"problem": str(error)}
+    except (OSError, UnicodeDecodeError) as error:
+        outcome = {"problem": f"{getattr(error, 'filename', None) or path}: {error}"}
     else:
         save_scene(scene, scene_path(folder, scene.scene_id))
         outcome = {"scene_id": scene.scene_id}

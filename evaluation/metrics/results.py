@@ -182,6 +182,51 @@ class RetrieverDifference:
 
 
 @dataclass(frozen=True)
+class MajorityVote(Accuracy):
+    """Accuracy of the majority vote over the items with votes. `undecided` items have no majority
+    and count as wrong."""
+
+    undecided: int
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """A coefficient of agreement over some items; its value is None where it is undefined."""
+
+    value: float | None
+    items: int
+
+
+@dataclass(frozen=True)
+class StudyReport:
+    """report.json of evaluation.study.export.
+
+    Attributes:
+        items: Number of items in the study, with or without votes.
+        judgments: Number of votes.
+        annotators: Annotators with votes.
+        depth: Number of items by number of votes.
+        accuracy: Accuracy by annotator.
+        fleiss_kappa: Over the items that all annotators with votes answered.
+        krippendorff_alpha: Over the items with two votes or more.
+        seconds: Median decision times by family: by the server's clock, by the client's clock, and
+            the number of votes that were timed.
+    """
+
+    benchmark: str
+    build: str
+    items: int
+    judgments: int
+    annotators: list[str]
+    depth: dict[str, int]
+    accuracy: dict[str, Accuracy]
+    majority: MajorityVote | None
+    fleiss_kappa: Agreement
+    krippendorff_alpha: Agreement
+    seconds: dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
 class RetrievalReport:
     """report.json of evaluation.retrieve and evaluation.two_stage."""
 

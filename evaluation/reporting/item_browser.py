@@ -75,8 +75,9 @@ class ItemBrowser:
         if standard:
             self.baselines[name] = baseline_results(standard, store, seed)
         shown = choose_items(answered, by_label, limit, seed)
-        self.entries += page_entries(shown, by_label, store, name)
+        entries = page_entries(shown, by_label, store, name)
         frames, errors = encode_frames(shown, store)
+        self.entries += entries
         self.frames |= frames
         self.notes.append(
             f"{name}: {len(shown):,} of {len(answered):,} answered items, spread over "
@@ -95,20 +96,17 @@ def browse_items(
     for group in dict.fromkeys(m.group for m in selections):
         of_group = [m for m in selections if m.group == group]
         name, build = of_group[0].benchmark, of_group[0].run.report.build
+        models = {", ".join([m.label, *m.variants]): m for m in of_group}
         try:
             store = open_store(stores / name)
+            if build == store.identity:
+                browser.add_group(group, store, models, limit, seed)
+                continue
+            # Items of two builds can differ although they have the same ids.
+            problem = f"{store.folder} has another build"
         except UserError as error:
             problem = str(error).replace("benchmark=NAME", f"benchmark={name}")
-            browser.notes.append(f"The items of {group} cannot be shown: {problem}.")
-            continue
-        if build != store.identity:
-            # Items of two builds can differ although they have the same ids.
-            browser.notes.append(
-                f"The items of {group} cannot be shown: {store.folder} has another build."
-            )
-            continue
-        models = {", ".join([m.label, *m.variants]): m for m in of_group}
-        browser.add_group(group, store, models, limit, seed)
+        browser.notes.append(f"The items of {group} cannot be shown: {problem}.")
     return browser
 
 

@@ -14,7 +14,7 @@ from data.records import SelectionItem
 from evaluation.metrics.results import UNTRAINED, RetrievalResult, SelectionResult
 from evaluation.metrics.significance import PairedComparison, compare_runs
 from evaluation.reporting.run_responses import Responses
-from evaluation.reporting.runs import FinishedRun, training_settings
+from evaluation.reporting.runs import FinishedRun
 
 TRANSFER_SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
 """Names of the paper's transfer suites, by the setting `benchmark.simulator`."""
@@ -115,17 +115,14 @@ class Measurement:
         return self.run.kind, self.item_set, result.name, variant
 
 
-def read_measurements(
-    runs: Iterable[FinishedRun], root: Path, kinds: Sequence[str]
-) -> list[Measurement]:
-    """Return the results of the runs of some kinds. The training runs are below `root`, too."""
+def read_measurements(runs: Iterable[FinishedRun], kinds: Sequence[str]) -> list[Measurement]:
+    """Return the results of the runs of some kinds."""
     measurements = []
     for run in runs:
         if run.kind in kinds:
-            training = training_settings(run, root)
             for row in run.report.rows:
                 # The report of a trained retriever also has rows for its untrained base.
-                trained = None if row.name.startswith(UNTRAINED) else training
+                trained = None if row.name.startswith(UNTRAINED) else run.training
                 measurements.append(Measurement(row, run, row.name, trained))
     return measurements
 

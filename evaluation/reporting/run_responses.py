@@ -98,7 +98,8 @@ def reading(folder: Path, file: str = "report.json") -> Iterator[None]:
         yield
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
-            f"{folder / file} is missing, damaged or of another version: delete {folder} and run "
-            "its command again, or leave the run out with runs=[...]",
+            f"{folder / file} is missing, damaged or of another version ({type(error).__name__}: "
+            f"{str(error).partition(chr(10))[0]}): delete {folder} and run its command again, or "
+            "leave the run out with runs=[...]",
             code="damaged-file",
         ) from error

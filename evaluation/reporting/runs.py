@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from conf.errors import UserError
-from evaluation.metrics.results import RetrievalReport, SelectionReport, from_json
+from evaluation.metrics.results import RetrievalReport, SelectionReport, StudyReport, from_json
 from evaluation.reporting.run_responses import Responses, read_responses, reading
 
 SELECTION_KINDS, RETRIEVAL_KINDS = ("select", "similarity"), ("retrieve", "two_stage")
@@ -21,7 +21,7 @@ STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "contrastive")
 REPORT_TYPES = {
     **dict.fromkeys(SELECTION_KINDS, SelectionReport),
     **dict.fromkeys(RETRIEVAL_KINDS, RetrievalReport),
-    **dict.fromkeys(STUDY_KINDS, dict[str, Any]),
+    **dict.fromkeys(STUDY_KINDS, StudyReport),
 }
 YamlLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """The loader in C, if PyYAML has it, is ten times as fast."""
@@ -36,6 +36,9 @@ class FinishedRun:
     Attributes:
         kind: Name of the command's folder, such as select.
         config: Settings of the run.
+        training: Settings of the run that trained the evaluated model, or for a two-stage run with
+            an untrained model, that trained its matcher (the retriever that ranks the frames); None
+            for a released model, and an empty dictionary if that run's folder does not exist.
         report: Content of report.json; None for a training run.
         started: Time of the first start, in ISO format.
     """
@@ -45,7 +48,8 @@ class FinishedRun:
     kind: str
     name: str
     config: dict[str, Any]
-    report: SelectionReport | RetrievalReport | dict[str, Any] | None
+    training: dict[str, Any] | None
+    report: SelectionReport | RetrievalReport | StudyReport | None
     started: str
     responses: Mapping[str, Responses] = field(default_factory=dict, repr=False)
 
@@ -77,7 +81,7 @@ def gather_runs(
     runs, left_out = [], []
     for title in dict.fromkeys(titles):
         try:
-            runs.append(_read_run(folders[title], title))
+            runs.append(_read_run(folders[title], title, root))
         except UserError as error:
             if patterns is not None:
                 raise
@@ -110,7 +114,7 @@ def _match(root: Path, pattern: str, finished: Sequence[str]) -> list[str]:
     raise UserError(f"runs: {pattern} matches no run below {root}{hint}", code="missing-run")
 
 
-def _read_run(folder: Path, title: str) -> FinishedRun:
+def _read_run(folder: Path, title: str, root: Path) -> FinishedRun:
     kind, _, name = title.partition("/")
     with reading(folder, "run.json"):
         record = json.loads((folder / "run.json").read_text())
@@ -124,7 +128,8 @@ def _read_run(folder: Path, title: str) -> FinishedRun:
     if kind in SELECTION_KINDS:
         responses = read_responses(folder, kind, report)
     settings = _read_settings(folder)
-    return FinishedRun(folder, title, kind, name, settings, report, started, responses)
+    training = _training_settings(settings, root)
+    return FinishedRun(folder, title, kind, name, settings, training, report, started, responses)
 
 
 def _read_settings(folder: Path) -> dict[str, Any]:
@@ -135,17 +140,9 @@ def _read_settings(folder: Path) -> dict[str, Any]:
             raise ValueError(str(error)) from error
 
 
-def training_settings(run: FinishedRun, root: Path) -> dict[str, Any] | None:
-    """Return the settings of the run that trained the model of an evaluation. For a two-stage run
-    with an untrained model, return those of its matcher (the retriever that ranks the frames).
-
-    Returns:
-        None for a released model, and an empty dictionary if the training folder does not exist.
-
-    Raises:
-        UserError: The settings cannot be read.
-    """
-    model = run.config.get("model") or (run.config.get("matcher") or {}).get("model")
+def _training_settings(settings: Mapping[str, Any], root: Path) -> dict[str, Any] | None:
+    """Return the settings of the run that trained the model of an evaluation; see `FinishedRun`."""
+    model = settings.get("model") or (settings.get("matcher") or {}).get("model")
     if model is None:
         return None
     path = Path(str(model))

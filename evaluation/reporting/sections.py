@@ -19,7 +19,6 @@ from evaluation.reporting.measurements import (
     transfer_benchmarks,
     widest_results,
 )
-from evaluation.reporting.run_responses import reading
 from evaluation.reporting.runs import SELECTION_KINDS, STUDY_KINDS, TRAINING_KINDS, FinishedRun
 from evaluation.reporting.table import Row, Table, file_stem
 from train.common.curves import plot_curves
@@ -107,12 +106,11 @@ def zero_shot(
 
 def _majority_rows(study: FinishedRun, m: Measurement) -> list[Row]:
     """Return the row of a study's majority vote, or no row if `m` measured another build."""
-    with reading(study.folder):
-        build = (study.report["benchmark"], study.report.get("build"))
-        votes = study.report["majority"]
-        if votes is None or build != (m.benchmark, m.run.report.build):
-            return []
-        return [tables.human_row(f"Majority vote, {study.name}", votes)]
+    report = study.report
+    build = (report.benchmark, report.build)
+    if report.majority is None or build != (m.benchmark, m.run.report.build):
+        return []
+    return [tables.human_row(f"Majority vote, {study.name}", report.majority)]
 
 
 def distillation(selections: Results, retrievals: Results, browser: ItemBrowser) -> Section:
@@ -190,9 +188,8 @@ def controls(selections: Results, runs: Sequence[FinishedRun]) -> Section:
 
 
 def _study_table(run: FinishedRun) -> Table:
-    with reading(run.folder):
-        title = f"study {run.name} on benchmark {run.report['benchmark']}"
-        return _name_table(tables.human_table(run.report), run.name, title)
+    title = f"study {run.name} on benchmark {run.report.benchmark}"
+    return _name_table(tables.human_table(run.report), run.name, title)
 
 
 def selection_details(selections: Results, transfers: Container[str]) -> Section:

@@ -17,7 +17,7 @@ from evaluation.metrics.results import (
     RetrieverDifference,
     SelectionReport,
     SelectionResult,
-    from_json,
+    StudyReport,
 )
 from evaluation.metrics.significance import PairedComparison, adjust_holm
 from evaluation.reporting.reference import SUITE, reference, table_with_paper
@@ -217,48 +217,39 @@ def rank_differences_table(differences: Iterable[RetrieverDifference]) -> Table:
     return Table("rank-differences", caption, columns, groups, (note,), signed=True)
 
 
-def human_table(summary: Mapping[str, Any]) -> Table:
-    """Return the table of a human study, above the paper's rows.
-
-    Args:
-        summary: As `evaluation.study.agreement.summarize_votes` returns it.
-    """
-    rows = [human_row(name, accuracy) for name, accuracy in summary["accuracy"].items()]
-    if summary["majority"]:
-        rows.append(human_row("Majority vote", summary["majority"]))
+def human_table(study: StudyReport) -> Table:
+    """Return the table of a human study, above the paper's rows."""
+    rows = [human_row(name, accuracy) for name, accuracy in study.accuracy.items()]
+    if study.majority:
+        rows.append(human_row("Majority vote", study.majority))
     for clock in ("server", "client"):
-        times = {f: summary["seconds"].get(f, {}).get(clock) for f in FAMILIES}
+        times = {f: study.seconds.get(f, {}).get(clock) for f in FAMILIES}
         cells = {f.capitalize(): time and f"{time:.1f}" for f, time in times.items()}
         rows.append({"name": f"Median seconds, {clock}", **cells})
     columns = [*FAMILY_COLUMNS, "Macro", "Micro", "Items"]
-    return table_with_paper("human", "human", columns, {"": rows}, _human_notes(summary))
+    return table_with_paper("human", "human", columns, {"": rows}, _human_notes(study))
 
 
-def human_row(name: str, accuracy: Mapping[str, Any]) -> Row:
-    """Return the row of an annotator or of the majority vote, which is never marked as the best.
-
-    Args:
-        accuracy: An `Accuracy` as JSON, from the summary of a study.
-    """
-    parsed = from_json(Accuracy, accuracy)
-    row = accuracy_row(name, parsed.families, parsed.macro, parsed.micro)
+def human_row(name: str, accuracy: Accuracy) -> Row:
+    """Return the row of an annotator or of the majority vote, which is never marked as the best."""
+    row = accuracy_row(name, accuracy.families, accuracy.macro, accuracy.micro)
     return {**row, "Parsed": None, "ranked": False}
 
 
-def _human_notes(summary: Mapping[str, Any]) -> tuple[str, ...]:
-    depth = [f"{items} with {votes}" for votes, items in summary["depth"].items()]
-    kappa, alpha = summary["fleiss_kappa"], summary["krippendorff_alpha"]
-    undecided = summary["majority"]["undecided"] if summary["majority"] else 0
+def _human_notes(study: StudyReport) -> tuple[str, ...]:
+    depth = [f"{items} with {votes}" for votes, items in study.depth.items()]
+    kappa, alpha = study.fleiss_kappa, study.krippendorff_alpha
+    undecided = study.majority.undecided if study.majority else 0
     return (
         INTERVAL_NOTE,
-        f"{summary['judgments']:,} judgments of {summary['items']:,} items; items by their number "
+        f"{study.judgments:,} judgments of {study.items:,} items; items by their number "
         f"of judgments: {', '.join(depth)}.",
         f"A majority is more than half of an item's votes; {undecided} items have no majority and "
         "count as wrong.",
-        f"Fleiss' kappa: {_agreement(kappa['value'])} on the {kappa['items']} items that all "
-        f"{len(summary['annotators'])} annotators answered (paper: {reference('human_kappa'):.2f} "
+        f"Fleiss' kappa: {_agreement(kappa.value)} on the {kappa.items} items that all "
+        f"{len(study.annotators)} annotators answered (paper: {reference('human_kappa'):.2f} "
         "on 19 items).",
-        f"Krippendorff's alpha: {_agreement(alpha['value'])} on the {alpha['items']} items with "
+        f"Krippendorff's alpha: {_agreement(alpha.value)} on the {alpha.items} items with "
         "two votes or more.",
         "Median seconds: over items whose page was loaded only once. The server's clock includes "
         "time in which the server was down.",

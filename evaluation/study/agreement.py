@@ -7,34 +7,38 @@ with one vote for each of two candidates, are undecided and count as wrong.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from data.records import LETTERS
 from evaluation.metrics.intervals import SceneBootstrap
-from evaluation.metrics.results import Accuracy, accuracy_by_family
+from evaluation.metrics.results import (
+    Accuracy,
+    Agreement,
+    MajorityVote,
+    StudyReport,
+    accuracy_by_family,
+)
 
 
 def summarize_votes(
-    votes: pd.DataFrame, items: int, annotators: Sequence[str], seed: int
-) -> dict[str, Any]:
-    """Return the report of a study, ready for JSON; undefined values are None.
+    votes: pd.DataFrame,
+    items: int,
+    annotators: Sequence[str],
+    benchmark: str,
+    build: str,
+    seed: int,
+) -> StudyReport:
+    """Return the accuracies, the agreement and the decision times of a study.
 
     Args:
         votes: As `storage.read_votes` returns them.
         items: Number of items in the study, with or without votes.
         annotators: All annotators, with or without votes.
+        benchmark: Name of the study's benchmark.
+        build: Identity of the benchmark's build.
         seed: Seed of the bootstrap over scenes.
-
-    Returns:
-        `items`; `judgments`, the number of votes; `annotators` with votes; `depth`, the number of
-        items by number of votes; `accuracy` by annotator, as `evaluation.metrics.results.Accuracy`;
-        `majority`, the accuracy of the majority vote over the items with votes, and the number of
-        `undecided` items; `fleiss_kappa` over the `items` that all annotators with votes answered;
-        `krippendorff_alpha` over the `items` with two votes or more; and median `seconds`.
     """
     # The number of votes for each candidate (items, 4).
     counts = pd.crosstab(votes.item_id, votes.choice)
@@ -44,21 +48,21 @@ def summarize_votes(
     complete = counts[(depth == len(active)) & (depth > 1)]
     several = counts[depth > 1]
     items_by_depth = {0: items - len(counts), **depth.value_counts()}
-    accuracy = {
-        name: asdict(_accuracy(own, list(own.right), seed))
-        for name, own in votes.groupby("annotator")
-    }
-    return {
-        "items": items,
-        "judgments": len(votes),
-        "annotators": active,
-        "depth": {str(d): int(n) for d, n in sorted(items_by_depth.items()) if n},
-        "accuracy": {name: accuracy[name] for name in active},
-        "majority": _majority_accuracy(votes, counts, seed) if len(votes) else None,
-        "fleiss_kappa": {"value": fleiss_kappa(complete), "items": len(complete)},
-        "krippendorff_alpha": {"value": krippendorff_alpha(several), "items": len(several)},
-        "seconds": median_seconds(votes),
-    }
+    votes_of = {name: votes[votes.annotator == name] for name in active}
+    accuracy = {name: _accuracy(own, list(own.right), seed) for name, own in votes_of.items()}
+    return StudyReport(
+        benchmark,
+        build,
+        items,
+        judgments=len(votes),
+        annotators=active,
+        depth={str(d): int(n) for d, n in sorted(items_by_depth.items()) if n},
+        accuracy=accuracy,
+        majority=_majority_vote(votes, counts, seed) if len(votes) else None,
+        fleiss_kappa=Agreement(fleiss_kappa(complete), len(complete)),
+        krippendorff_alpha=Agreement(krippendorff_alpha(several), len(several)),
+        seconds=median_seconds(votes),
+    )
 
 
 def majority(counts: pd.DataFrame) -> pd.Series:
@@ -102,11 +106,12 @@ def _accuracy(items: pd.DataFrame, credits: Sequence[float], seed: int) -> Accur
     return accuracy_by_family(list(items.family), credits, scenes)
 
 
-def _majority_accuracy(votes: pd.DataFrame, counts: pd.DataFrame, seed: int) -> dict[str, Any]:
+def _majority_vote(votes: pd.DataFrame, counts: pd.DataFrame, seed: int) -> MajorityVote:
     choices = majority(counts)
     items = votes.groupby("item_id").first().loc[counts.index]
     accuracy = _accuracy(items, list(choices == items.answer), seed)
-    return {**asdict(accuracy), "undecided": int(choices.isna().sum())}
+    parts = accuracy.families, accuracy.macro, accuracy.micro
+    return MajorityVote(*parts, undecided=int(choices.isna().sum()))
 
 
 def _is_undefined(counts: pd.DataFrame) -> bool:

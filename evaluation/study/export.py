@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import asdict
 from pathlib import Path
 
 from conf.entry import Run, command
@@ -37,17 +38,17 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
         annotators = [name for (name,) in db.execute("SELECT name FROM annotator ORDER BY rowid")]
     if votes.empty:
         raise UserError(f"{path} has no votes yet", code="no-votes")
-    benchmark = {"benchmark": about["benchmark"], "build": about["identity"]}
-    report = benchmark | summarize_votes(votes, items, annotators, cfg.seed)
+    benchmark = about["benchmark"], about["identity"]
+    report = summarize_votes(votes, items, annotators, *benchmark, cfg.seed)
     rows = votes.to_json(orient="records", lines=True, double_precision=15)
     write_text(run.folder / VOTES_FILE, rows)
-    write_text(run.folder / "report.json", json.dumps(report, indent=1))
+    write_text(run.folder / "report.json", json.dumps(asdict(report), indent=1))
     table = human_table(report)
     write_text(run.folder / "report.txt", f"{table}\n")
     log.info("%s\n\nvotes: %s", table, run.folder / VOTES_FILE)
-    majority = report["majority"]
-    families = {f"majority_{f}": share["value"] for f, share in majority["families"].items()}
-    return {**families, "majority_macro": majority["macro"]["value"]}
+    majority = report.majority
+    families = {f"majority_{f}": share.value for f, share in majority.families.items()}
+    return {**families, "majority_macro": majority.macro.value}
 
 
 if __name__ == "__main__":

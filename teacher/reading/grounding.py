@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
 
@@ -51,6 +52,8 @@ class IndexedPredicates:
 
     def __init__(self, predicates: Predicates) -> None:
         self.objects = {o.object: o for o in predicates.objects}
+        counts = Counter(o.object for o in predicates.objects)
+        self.look_alikes = {name for name, count in counts.items() if count > 1}
         self.courses = {frozenset(m.objects): m.when for m in predicates.courses}
         self.contacts = {frozenset(m.objects): m.when for m in predicates.contacts}
         self.close = {frozenset(c.objects): c.region for c in predicates.close}
@@ -66,8 +69,10 @@ class IndexedPredicates:
         }
 
     def verdict(self, claim: Claim) -> str:
-        """Return one of `VERDICTS`; "unknown" if the predicates do not tell, or if they contradict
-        a claim that is not certain."""
+        """Return one of `VERDICTS`; "unknown" if the predicates do not tell, if they contradict a
+        claim that is not certain, or if several objects have the name that the claim uses."""
+        if claim.kind != "mention" and self.look_alikes.intersection(claim.subjects):
+            return "unknown"
         truth = self.truth(claim)
         if truth is None:
             return "unknown"

@@ -59,6 +59,7 @@ def test_removed_key_names_its_replacement(monkeypatch):
         ("+benchmark.selection.event={new: {trian: 3}}", "unknown-key", "event.new.trian"),
         ("student=null", "invalid-setting", "student=null"),
         ("+exp=null", "invalid-setting", "+exp=null"),
+        ("student=3", "invalid-setting", "student=3"),
         ("+sweep=lr_rank", "needs-multirun", "+sweep=lr_rank"),
         ("workers=0", "invalid-setting", "workers=0"),
         ("benchmark.height=129", "invalid-setting", "benchmark.height=129"),

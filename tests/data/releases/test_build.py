@@ -13,6 +13,7 @@ from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionC
 from data.build import ensure_benchmark, ensure_items
 from data.parallel import Workers
 from data.render.frame_cache import FrameReader
+from data.world.scenes import read_release
 from tests.data.releases.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.releases.movi_a_files import movi_example, write_movi_folder
 from tests.data.releases.pictures import picture
@@ -68,6 +69,24 @@ def test_an_invalid_record_stops_a_strict_build(movi, tmp_path) -> None:
     with raises_user_error("invalid-record", contains=("00007", "strict=false")):
         ensure_items(config(movi), tmp_path, Workers(1), strict=True)
     assert not (tmp_path / "movi").exists()
+
+
+def test_a_mended_record_is_read_by_the_next_build(movi, tmp_path) -> None:
+    """Also if the file that was mended is not the one whose size and time identify the record."""
+    release = shutil.copytree(movi, tmp_path / "release" / "movi_a")
+    events = release / "00007" / "events.json"
+    for damage in ("not JSON", "not a file"):
+        if damage == "not a file":
+            events.unlink()
+            events.mkdir()
+        scenes, counts = read_release(config(release), tmp_path / "store", Workers(1), False)
+        assert counts == {"bad records left out": 1}, damage
+        assert len(scenes["test"]) == 11
+    events.rmdir()
+    shutil.copy(release / "00006" / "events.json", events)
+    scenes, counts = read_release(config(release), tmp_path / "store", Workers(1), False)
+    assert counts == {"bad records left out": 0}
+    assert len(scenes["test"]) == 12
 
 
 def test_a_release_without_a_valid_record_names_their_number(movi, tmp_path) -> None:

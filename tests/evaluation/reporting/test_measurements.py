@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -48,11 +49,8 @@ def test_an_untrained_base_that_two_runs_measured_has_one_row(runs, micro, micro
 
 def test_the_majority_vote_on_the_same_build_has_a_row_that_is_not_bold(runs, micro_store, report):
     votes = [vote(name, k, 0, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
-    found = {
-        "benchmark": "micro",
-        "build": micro_store.identity,
-        **summarize(votes, 6, ["A1", "A2"]),
-    }
+    report_of = summarize(votes, 6, ["A1", "A2"], micro_store.identity)
+    found = {**asdict(report_of), "benchmark": "micro"}
     finish(runs / "export_study" / "pilot", ExportStudyCommand(run="pilot"), found)
     folder = report(items=0)
     # Every vote is correct, and no cell is bold.

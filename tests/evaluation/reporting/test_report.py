@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from conf.schema import ReportCommand
+from conf.schema import ExportStudyCommand, ReportCommand
 from data.tracks.controls import MATCHED_ANCHOR
 from tests.evaluation.reporting.measured import (
+    finish,
     read_table,
     right,
     run_report,
@@ -339,6 +340,18 @@ def test_a_damaged_file_is_named(runs, file, content, report):
     page = (report(items=1) / "report.html").read_text()
     assert f"{run} is left out" in page
     assert name in page
+
+
+def test_a_damaged_study_or_training_does_not_end_a_report_on_all_runs(measured, runs, report):
+    finish(runs / "export_study" / "pilot", ExportStudyCommand(run="pilot"), {"benchmark": "micro"})
+    (runs / "sft" / "cot" / "config.yaml").write_text("a: [1")
+    settings = runs / "select" / "cot" / "config.yaml"
+    settings.write_text(settings.read_text().replace(str(measured), str(runs)))
+    page = (report(items=1) / "report.html").read_text()
+    assert "export_study/pilot is left out" in page
+    assert "select/cot is left out" in page
+    assert "sft/cot/config.yaml" in page
+    assert "select/base is left out" not in page
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections import Counter
+from dataclasses import asdict
 from typing import Any
 
 import krippendorff
@@ -16,6 +17,7 @@ from conf.entry import Run
 from conf.schema import ReportCommand
 from data.records import FAMILIES
 from evaluation import report
+from evaluation.metrics.results import Agreement, StudyReport, from_json
 from evaluation.reporting.tables import human_table
 from evaluation.study.agreement import fleiss_kappa, krippendorff_alpha, majority, summarize_votes
 from tests.user_errors import raises_user_error
@@ -33,8 +35,10 @@ def vote(
     }  # fmt: skip
 
 
-def summarize(votes: list[dict[str, Any]], items: int, annotators: list[str]) -> dict[str, Any]:
-    return summarize_votes(pd.DataFrame(votes), items, annotators, seed=0)
+def summarize(
+    votes: list[dict[str, Any]], items: int, annotators: list[str], build: str = "build"
+) -> StudyReport:
+    return summarize_votes(pd.DataFrame(votes), items, annotators, "tiny", build, seed=0)
 
 
 def sample_votes(rng, items: int, depths: list[int]) -> list[list[int]]:
@@ -108,21 +112,21 @@ def test_a_study_of_the_papers_size_is_summarized() -> None:
         for name in rng.permutation(["A1", "A2", "A3"])[:depth]
     ]
     found = summarize(votes, 60, ["A1", "A2", "A3"])
-    assert (found["items"], found["judgments"]) == (60, 127)
-    assert found["depth"] == {"0": 1, "1": 10, "2": 30, "3": 19}
-    assert found["fleiss_kappa"]["items"] == 19
-    assert found["krippendorff_alpha"]["items"] == 49
-    assert sum(accuracy["micro"]["n"] for accuracy in found["accuracy"].values()) == 127
-    assert found["majority"]["micro"]["n"] == 59
+    assert (found.items, found.judgments) == (60, 127)
+    assert found.depth == {"0": 1, "1": 10, "2": 30, "3": 19}
+    assert found.fleiss_kappa.items == 19
+    assert found.krippendorff_alpha.items == 49
+    assert sum(accuracy.micro.n for accuracy in found.accuracy.values()) == 127
+    assert found.majority.micro.n == 59
     by_item = {k: [v["choice"] for v in votes if v["item_id"] == f"i{k}"] for k in range(59)}
     ties = sum(len(c) == 2 and c[0] != c[1] for c in by_item.values())
-    assert found["majority"]["undecided"] == ties > 0
+    assert found.majority.undecided == ties > 0
     right = sum(c.count(0) * 2 > len(c) for c in by_item.values())
-    assert found["majority"]["micro"]["value"] == pytest.approx(right / 59)
-    for name, accuracy in found["accuracy"].items():
+    assert found.majority.micro.value == pytest.approx(right / 59)
+    for name, accuracy in found.accuracy.items():
         own = [v["right"] for v in votes if v["annotator"] == name]
-        assert accuracy["micro"]["value"] == pytest.approx(sum(own) / len(own))
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
+        assert accuracy.micro.value == pytest.approx(sum(own) / len(own))
+    assert from_json(StudyReport, json.loads(json.dumps(asdict(found), allow_nan=False))) == found
     table = str(human_table(found))
     assert "10 with 1, 30 with 2, 19 with 3" in " ".join(table.split())
     assert max(map(len, table.splitlines())) <= 100
@@ -132,21 +136,21 @@ def test_annotators_without_votes_are_left_out() -> None:
     votes = [vote(name, k, (k + (name == "A3")) % 2) for k in range(4) for name in ("A1", "A3")]
     found = summarize(votes, 4, ["A1", "A2", "A3"])
     assert found == summarize(votes, 4, ["A1", "A3"])
-    assert list(found["accuracy"]) == found["annotators"] == ["A1", "A3"]
-    assert found["fleiss_kappa"] == {"value": pytest.approx(-1.0), "items": 4}
+    assert list(found.accuracy) == found.annotators == ["A1", "A3"]
+    assert found.fleiss_kappa == Agreement(pytest.approx(-1.0), 4)
 
 
 def test_the_agreement_of_a_single_annotator_is_undefined() -> None:
     found = summarize([vote("A1", k, 0) for k in range(3)], 3, ["A1", "A2"])
-    assert found["fleiss_kappa"] == {"value": None, "items": 0}
-    assert found["krippendorff_alpha"] == {"value": None, "items": 0}
+    assert found.fleiss_kappa == Agreement(None, 0)
+    assert found.krippendorff_alpha == Agreement(None, 0)
     assert "undefined" in str(human_table(found))
 
 
 def test_times_are_medians_over_pages_that_were_loaded_once() -> None:
     votes = [vote("A1", k, 0, seconds=s, client_seconds=s / 2) for k, s in enumerate([4, 9, 5])]
     votes.append(vote("A1", 3, 0, seconds=1e5, loads=2))
-    found = summarize(votes, 4, ["A1"])["seconds"]
+    found = summarize(votes, 4, ["A1"]).seconds
     assert found == {"event": {"server": 5.0, "client": 2.5, "votes": 3}}
 
 
@@ -157,8 +161,8 @@ def test_the_report_covers_an_exported_study_without_models(tmp_path) -> None:
     (exported / "run.json").write_text('{"started": "2026-01-01", "earlier_starts": []}')
     (exported / "config.yaml").write_text("run: pilot\n")
     votes = [vote(name, k, k % 3, FAMILIES[k % 3]) for k in range(6) for name in ("A1", "A2")]
-    found = {"benchmark": "tiny", **summarize(votes, 6, ["A1", "A2"])}
-    (exported / "report.json").write_text(json.dumps(found))
+    found = summarize(votes, 6, ["A1", "A2"])
+    (exported / "report.json").write_text(json.dumps(asdict(found)))
     run = Run("x", tmp_path / "report")
     run.folder.mkdir()
     report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), run)
@@ -168,5 +172,5 @@ def test_the_report_covers_an_exported_study_without_models(tmp_path) -> None:
     assert (run.folder / "tables" / "human-pilot.tex").exists()
 
     (exported / "report.json").write_text('{"benchmark": "tiny"}')
-    with raises_user_error("damaged-file", contains="report.json"):
+    with raises_user_error("missing-run", contains="report.json is missing, damaged"):
         report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path)), run)
