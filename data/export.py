@@ -14,10 +14,15 @@ log = logging.getLogger(__name__)
 
 @command("data.export", ExportCommand)
 def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
-    from data.build import ensure_benchmark
+    from data.build import ensure_benchmark, ensure_items
+    from data.parallel import Workers
     from data.publish.huggingface import ensure_export, summarize
 
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    root = Path(cfg.store)
+    if cfg.images:
+        store = ensure_benchmark(cfg.benchmark, root, cfg.workers)
+    else:
+        store = ensure_items(cfg.benchmark, root, Workers(cfg.workers))
     shards = ensure_export(store, Path(cfg.folder), cfg.images)
     summary = summarize(shards)
     text = f"{cfg.folder}\n{summary.to_string(float_format='{:,.1f}'.format)}"

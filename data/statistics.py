@@ -16,10 +16,12 @@ log = logging.getLogger(__name__)
 
 @command("data.statistics", StatisticsCommand)
 def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
-    from data.build import ensure_benchmark
+    from data.build import ensure_items
+    from data.parallel import Workers
     from data.publish.statistics import compute_statistics, format_statistics
 
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    # Statistics need no frames, and rendering those of a large benchmark takes hours.
+    store = ensure_items(cfg.benchmark, Path(cfg.store), Workers(cfg.workers))
     if not store.selection():
         raise UserError(
             f"{store.folder} has no selection items, so there are no statistics to report",

@@ -12,9 +12,6 @@ from data.store import Store
 from data.world.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
 from data.world.standins import standin_view
 
-Cost = Callable[[SelectionItem, Candidate, Store], float]
-"""Cost of choosing a candidate of an item."""
-
 
 def displacement_from_prefix(item: SelectionItem, candidate: Candidate, store: Store) -> float:
     """Displacement between the last frame of the prefix and the candidate."""
@@ -55,24 +52,34 @@ def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: St
     return float(np.minimum(distances, DIAGONAL).mean())
 
 
-BASELINES: dict[str, Cost] = {
-    "nearest": displacement_from_prefix,
-    "farthest": lambda *arguments: -displacement_from_prefix(*arguments),
-    "first": lambda item, candidate, store: item.candidates.index(candidate),
-    "latest": lambda item, candidate, store: -candidate.frame,
-    "odd": lambda *arguments: -displacement_from_others(*arguments),
-    "typical": displacement_from_others,
-    "velocity": constant_velocity_error,
-}
-"""Cost function of each baseline; a baseline chooses the candidate with the lowest cost."""
+def baseline_costs(item: SelectionItem, store: Store) -> dict[str, np.ndarray]:
+    """Return each baseline's costs of the candidates, (4,), by the names in `BASELINES`."""
+
+    def costs(function: Callable[[SelectionItem, Candidate, Store], float]) -> np.ndarray:
+        return np.array([function(item, candidate, store) for candidate in item.candidates])
+
+    from_prefix, from_others = costs(displacement_from_prefix), costs(displacement_from_others)
+    frames = np.array([candidate.frame for candidate in item.candidates])
+    return {
+        "nearest": from_prefix,
+        "farthest": -from_prefix,
+        "first": np.arange(len(frames)),
+        "latest": -frames,
+        "odd": -from_others,
+        "typical": from_others,
+        "velocity": costs(constant_velocity_error),
+    }
+
+
+BASELINES = ("nearest", "farthest", "first", "latest", "odd", "typical", "velocity")
+"""Names of the baselines. A baseline chooses the candidate with the lowest cost."""
 
 
 def score_baselines(item: SelectionItem, store: Store) -> dict[str, float]:
     """Return each baseline's score on an item: 1/m if the target is among the m candidates with the
     lowest cost, otherwise 0; NaN if the baseline cannot be computed for the simulator."""
     scores = {}
-    for name, cost in BASELINES.items():
-        costs = np.array([cost(item, candidate, store) for candidate in item.candidates])
+    for name, costs in baseline_costs(item, store).items():
         best = np.flatnonzero(costs == costs.min())
         scores[name] = float(item.answer in best) / len(best) if len(best) else np.nan
     return scores

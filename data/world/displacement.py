@@ -14,12 +14,16 @@ MODEL_SIZE = 336
 DIAGONAL = MODEL_SIZE * 2**0.5
 
 
+@lru_cache(maxsize=64)
 def visible_positions(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return positions (F, N, 2), px at 336 x 336, and whether each object is visible (F, N): its
     centre is on screen, and no other objects hide it."""
     positions = scene.image_positions * (MODEL_SIZE / np.array(scene.image_size))
     inside = (positions >= 0).all(-1) & (positions <= MODEL_SIZE).all(-1)
-    return positions, scene.in_view & inside & ~is_hidden(scene)
+    visible = scene.in_view & inside & ~is_hidden(scene)
+    for shared in (positions, visible):
+        shared.setflags(write=False)
+    return positions, visible
 
 
 @lru_cache(maxsize=64)
@@ -60,6 +64,7 @@ def cross_scene_displacement(scene: Scene, frame: int, other: Scene, other_frame
     return min(displacement, DIAGONAL)
 
 
+@lru_cache(maxsize=256)
 def _positions_by_appearance(
     scene: Scene, frame: int
 ) -> dict[tuple[SceneObject, int], tuple[np.ndarray, bool]]:

@@ -105,7 +105,8 @@ def test_a_killed_export_resumes_and_gives_the_same_bytes(
     broken = folder / "scenes" / f"{damaged.scene_ids('test')[0]}.npz"
     whole = broken.read_bytes()
     broken.write_bytes(whole[: len(whole) // 2])
-    shutil.rmtree(folder / "frames")
+    for frames in (folder / "frames").glob(f"{broken.stem}*"):
+        frames.unlink()
     out = tmp_path / "out" / "micro"
     with pytest.raises(Exception, match="not a zip"):
         ensure_export(damaged, out, images=True)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from conf.entry import Run
+from conf.schema import ExportCommand, StatisticsCommand
+from data import export, statistics
 from data.publish.statistics import (
     BASELINES,
     compute_statistics,
@@ -98,19 +102,32 @@ def test_cells_are_counted_beside_their_quotas() -> None:
 
 
 @pytest.mark.slow
+def test_commands_that_need_no_frames_render_none(micro, micro_store, tmp_path) -> None:
+    folder = tmp_path / "store" / "micro"
+    shutil.copytree(micro_store.folder, folder, ignore=shutil.ignore_patterns("frames"))
+    settings = {"benchmark": micro, "store": str(folder.parent), "workers": 1}
+    (tmp_path / "run").mkdir()
+    run = Run("run", tmp_path / "run")
+    assert statistics.main.__wrapped__(StatisticsCommand(**settings), run)["latest_time"] <= 1
+    command = ExportCommand(**settings, folder=str(tmp_path / "export"), images=False)
+    assert export.main.__wrapped__(command, run)["bytes"] > 0
+    assert not (folder / "frames").exists()
+
+
+@pytest.mark.slow
 def test_statistics_of_a_benchmark_are_consistent(micro_store) -> None:
     items = micro_store.selection()
-    statistics = compute_statistics(micro_store)
-    baselines, cells = statistics["baselines"], statistics["cells"]
-    assert sum(statistics["scenes"]["collisions"].values()) == 10
-    assert sum(statistics["answers"].values()) == len(items)
+    found = compute_statistics(micro_store)
+    baselines, cells = found["baselines"], found["cells"]
+    assert sum(found["scenes"]["collisions"].values()) == 10
+    assert sum(found["answers"].values()) == len(items)
     assert sum(baselines[family]["items"] for family in ("event", "time", "window")) == len(items)
     assert baselines["event, cross_scene"]["nearest"] == 1
     groups = [cells[f"window/{group}"]["test"] for group in ("G1", "G2", "G3", "G4")]
     assert cells["window"]["test"] == sum(groups)
-    for row in statistics["candidates"].values():
+    for row in found["candidates"].values():
         assert row["nearest distractor"] >= row["least"] - 1e-3
     assert baselines["window, easy"]["nearest"] > baselines["window, hard"]["nearest"] + 0.3
-    text = format_statistics(statistics)
+    text = format_statistics(found)
     assert max(map(len, text.splitlines())) <= 100
     assert all(category in text for category in baselines)
