@@ -8,6 +8,7 @@ prose.jsonl: rationales written by a language model, with the predicates that it
 """
 
 import json
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from random import Random
@@ -52,6 +53,17 @@ def verdicts(section, sentence):
 def test_only_false_sentences_are_contradicted(truth, section, sentence):
     detected = contradicted(f"{SECTION[section]}: {sentence}", FACTS)
     assert bool(detected) == (truth == "false"), detected
+
+
+def test_claims_about_a_name_that_two_objects_share_are_unknown():
+    """The text does not tell which of them it means."""
+    [red] = [o for o in FACTS.objects if o.object == RED]
+    elsewhere = next(o.region for o in FACTS.objects if o.region != red.region)
+    text = f"{SECTION['S']}: The {RED} is {elsewhere}."
+    twins = replace(FACTS, objects=(*FACTS.objects, replace(red, region=elsewhere)))
+    for predicates, verdict in ((FACTS, "contradicted"), (twins, "unknown")):
+        [region] = [c for c in extract_claims(text, predicates) if c.kind == "region"]
+        assert region.verdict == verdict
 
 
 @pytest.mark.parametrize("case", VERDICTS, ids=lambda case: case["sentence"])

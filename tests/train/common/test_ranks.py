@@ -43,7 +43,7 @@ SHARDED = ("--use_fsdp", "--fsdp_version=2", "--fsdp_auto_wrap_policy=TRANSFORME
 
 @pytest.fixture
 def settings(few_steps) -> SftCommand:
-    return few_steps(batch=4, validation_items=3, generated_items=8, permute_candidates=True)
+    return few_steps(batch=4, validation_items=3, generated_items=4, permute_candidates=True)
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ DROPOUT = LoraConfig(rank=4, dropout=0.1)
 
 @pytest.fixture
 def sft_settings(few_steps) -> SftCommand:
-    settings = few_steps(batch=4, validation_items=4, generated_items=8, permute_candidates=True)
+    settings = few_steps(batch=4, validation_items=4, generated_items=2, permute_candidates=True)
     return replace(settings, student=replace(settings.student, lora=DROPOUT))
 
 
