@@ -139,8 +139,13 @@ def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.R
     try:
         return hydra.compose_config(config_name(command), overrides, mode, from_shell=False)
     except ValueError as error:
-        values = {o: yaml.safe_load(o.partition("=")[2]) for o in overrides}
-        unnamed = " ".join(o for o, value in values.items() if not isinstance(value, str))
+        parts = {o: o.lstrip("+").partition("=") for o in overrides}
+        unnamed = " ".join(
+            override
+            for override, (key, _, value) in parts.items()
+            if hydra.config_loader.get_group_options(key)
+            and not isinstance(yaml.safe_load(value), str)
+        )
         raise SettingsError(f"{unnamed}: give the name of a preset") from error
     except (AssertionError, AttributeError) as error:
         nested = " ".join(o for o in overrides if "." in o.partition("=")[0])

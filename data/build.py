@@ -111,11 +111,10 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(partial, name)))
         queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
         if not items and not queries:
-            left_out = "".join(f" ({count} {what})" for what, count in invalid.items() if count)
+            reasons = "".join(f" ({count} {what})" for what, count in invalid.items() if count)
             raise UserError(
-                f"benchmark {cfg.name} would contain no item and no query{left_out}: raise "
-                "benchmark.scenes "
-                "or the quotas, or lower benchmark.selection.min_displacement="
+                f"benchmark {cfg.name} would contain no item and no query{reasons}: raise "
+                "benchmark.scenes or the quotas, or lower benchmark.selection.min_displacement="
                 f"{cfg.selection.min_displacement}",
                 code="empty-benchmark",
             )
