@@ -35,6 +35,10 @@ OVERLAYS = ("exp", "sweep")
 """Groups of overlays: files that change a few settings on top of a command's presets. An overlay is
 added with `+`, as in `+exp=cot`, whereas a preset replaces another one, as in `student=tiny`."""
 REMOVED_KEYS: dict[str, str] = {
+    "benchmark.standin": "use benchmark=standin_movi_a or benchmark=standin_physion",
+    "benchmark.min_objects": "use benchmark.world.objects.min_count instead",
+    "benchmark.max_objects": "use benchmark.world.objects.max_count instead",
+    "benchmark.max_collisions": "use benchmark.world.start.max_collisions instead",
     "format": "leave it out: data.export writes a Hugging Face dataset",
     "shown": "use examples instead",
     "cards": "use gpus instead",
@@ -96,6 +100,9 @@ def list_presets(command: str, schema: type) -> dict[str, list[str]]:
         paths = {name: files("conf") / group / f"{name}.yaml" for name in groups[group]}
         groups[group] = [name for name, p in paths.items() if f"{command} " in p.read_text()]
     used = {*OVERLAYS, *(field.name for field in fields(schema))}
+    if "benchmark" in used:
+        # A world is a group of settings inside the benchmark.
+        used.add("world")
     return {group: names for group, names in groups.items() if names and group in used}
 
 

@@ -15,10 +15,11 @@ from typing import Any
 
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
-from conf.runs import compare_settings, wait_for_lock
-from conf.schema import BenchmarkConfig, BuildCommand
+from conf.runs import compare_settings, flatten, wait_for_lock
+from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.parallel import Workers
 from data.records import SPLITS
+from data.releases.transfer_suites import suite_name
 from data.render.prerender import RECORD, prerender_frames
 from data.store import (
     FRAMES_FOLDER,
@@ -36,19 +37,16 @@ from data.store import (
     with_checksum,
     write_atomically,
 )
-from data.tracks.build_items import family_quotas, item_families, make_items_and_queries, suite_name
+from data.tracks.build_items import family_quotas, item_families, make_items_and_queries
 from data.tracks.retrieval import future
 from data.tracks.retrieval.database import make_databases
 from data.tracks.shortfalls import count_records, summarize_store
+from data.world.physics import GENERATOR_VERSION
 from data.world.scenes import make_scenes
-from data.world.standins import generator_version
 
 log = logging.getLogger(__name__)
 
-SCENE_SETTINGS = (
-    "simulator", "standin", "seed", "test_share", "min_objects", "max_objects", "max_collisions",
-    "fps",
-)  # fmt: skip
+SCENE_SETTINGS = ("simulator", "world", "seed", "test_share", "fps")
 """Settings that determine the scenes. A killed build resumes only with the same values of these.
 Other settings may change, because the name of a file in `PARTS` is a hash of its job's inputs."""
 
@@ -73,14 +71,14 @@ def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
 def ensure_items(
     cfg: BenchmarkConfig, root: Path, workers: Workers, strict: bool = False, verify: bool = False
 ) -> Store:
-    """Open the benchmark `root / cfg.name`; build it first, without frames, if it is missing.
+    """Open the benchmark `root / cfg.store_name`; build it first, without frames, if it is missing.
 
     Raises:
         UserError: the existing store is damaged, or was built by another version of the code or
             with other settings.
     """
     check_quota_names(cfg)
-    folder = root / cfg.name
+    folder = root / cfg.store_name
     if not folder.exists():
         build(cfg, folder, workers, strict)
     store = open_store(folder, verify)
@@ -102,7 +100,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         UserError: the benchmark would contain no item and no query.
     """
     check_quota_names(cfg)
-    log.info("building benchmark %s in %s", cfg.name, folder)
+    log.info("building benchmark %s in %s", cfg.store_name, folder)
     with lock_partial_build(cfg, folder) as partial:
         if partial is None:
             return
@@ -124,11 +122,12 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         save_rows(rows, partial / "database.parquet")
         counts, shortfalls = count_records(cfg, scene_ids, items, queries, databases)
         manifest = {
-            "name": cfg.name,
+            "name": cfg.store_name,
             "suite": suite_name(cfg),
             "seed": cfg.seed,
             **component_versions(asdict(cfg)),
             "config": asdict(cfg),
+            "world_changes": world_changes(cfg.world),
             "counts": counts | invalid | dropped | left_out,
             "shortfalls": shortfalls,
             "scenes": scene_ids,
@@ -138,6 +137,17 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         partial.rename(folder)
         shutil.rmtree(folder / PARTS)
         (folder / PLAN).unlink()
+
+
+def world_changes(world: WorldConfig) -> dict[str, Any]:
+    """Return the settings of a world that differ from those of CLEVRER's world, by dotted key."""
+    usual = flatten(asdict(WorldConfig()))
+    settings = flatten(asdict(world))
+    return {
+        key: settings.get(key)
+        for key in sorted(settings.keys() | usual.keys())
+        if settings.get(key) != usual.get(key)
+    }
 
 
 def check_quota_names(cfg: BenchmarkConfig) -> None:
@@ -178,8 +188,8 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(parents=True, exist_ok=True)
     plan = {
-        "generator": generator_version(cfg.standin),
-        "benchmark": {key: getattr(cfg, key) for key in SCENE_SETTINGS},
+        "generator": GENERATOR_VERSION,
+        "benchmark": {key: asdict(cfg)[key] for key in SCENE_SETTINGS},
         "counterfactual scenes": {
             split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS
         },

@@ -92,6 +92,8 @@ class Scene:
         scenario: the kind of scene, for a simulator with several kinds.
         footage: path of the recorded frames of another simulator's scene, relative to the folder
             of its release; None for a scene that is rendered from its oracle.
+        scales: sizes of the objects as multiples of their shapes' standard size; empty if all are
+            1, or if they are not known.
     """
 
     scene_id: str
@@ -110,6 +112,7 @@ class Scene:
     landings: tuple[Landing, ...] = ()
     scenario: str = ""
     footage: str | None = None
+    scales: tuple[float, ...] = ()
 
     ARRAYS = (
         "positions", "quaternions", "velocities", "angular_velocities", "image_positions",
@@ -119,6 +122,11 @@ class Scene:
     @property
     def frames(self) -> int:
         return self.positions.shape[0]
+
+    @property
+    def object_scales(self) -> tuple[float, ...]:
+        """The size of each object, as a multiple of the standard size of its shape."""
+        return self.scales or (1.0,) * len(self.objects)
 
     @property
     def object_keys(self) -> list[tuple[SceneObject, int]]:

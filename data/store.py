@@ -46,7 +46,7 @@ from data.records import (
 )
 from data.render import RENDERERS
 from data.tracks.selection.distractors import BUILDERS_VERSION
-from data.world.standins import generator_version
+from data.world.physics import GENERATOR_VERSION
 
 MANIFEST = "manifest.json"
 CHECKED = "checked.json"
@@ -66,7 +66,7 @@ def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
     """Return the versions of the code that determines scenes, pixels, items and queries."""
     is_rendered, renderer = config["simulator"] == "bullet", RENDERERS[config["renderer"]]
     return {
-        "generator": generator_version(config["standin"]),
+        "generator": GENERATOR_VERSION,
         "renderer": renderer.version if is_rendered else f"{config['simulator']}'s own frames",
         "builders": BUILDERS_VERSION,
     }
@@ -102,6 +102,9 @@ def part_path(folder: Path, inputs: Any) -> Path:
 def save_scene(scene: Scene, path: Path) -> None:
     """Write a scene's oracle as arrays and a JSON header."""
     header = {f.name: getattr(scene, f.name) for f in fields(scene) if f.name not in Scene.ARRAYS}
+    if not scene.scales:
+        # Scenes of the standard world then have the same bytes as before worlds had sizes.
+        del header["scales"]
     arrays = {name: getattr(scene, name) for name in Scene.ARRAYS}
     buffer = io.BytesIO()
     np.savez(buffer, header=np.array(json.dumps(header, default=vars)), **arrays)
@@ -118,6 +121,7 @@ def load_scene(path: Path) -> Scene:
             "collisions": tuple(Collision(*c) for c in collisions),
             "image_size": tuple(header["image_size"]),
             "landings": tuple(Landing(**landing) for landing in header["landings"]),
+            "scales": tuple(header.get("scales", ())),
         }
         return Scene(**header, **{name: file[name] for name in Scene.ARRAYS})
 
@@ -179,9 +183,11 @@ class Store:
 
     @property
     def identity(self) -> str:
-        """A short hash of the benchmark's scenes, tables, renderer and frame size."""
+        """A short hash of the benchmark's scenes, tables, renderer, frame size and world."""
         config = self.manifest["config"]
         frames = [self.manifest["renderer"], config["width"], config["height"]]
+        if changes := self.manifest["world_changes"]:
+            frames.append(changes)
         content = json.dumps([self.manifest["files"], *frames])
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 

@@ -164,7 +164,8 @@ def _apply_overrides(
 def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) -> None:
     """Check that no scene on which a model was trained is in the test split of a benchmark.
 
-    Two benchmarks have the same scenes if they simulate with one seed or read one release. If their
+    Two benchmarks have the same scenes if they simulate one world with one seed, or read one
+    release. If their
     splits have one seed, a greater test share adds test scenes and removes none.
 
     Args:
@@ -173,7 +174,7 @@ def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) 
     Raises:
         UserError: Training scenes may be among the test scenes.
     """
-    scenes = ["simulator", "standin", "folder"] + ["seed"] * (trained.simulator == "bullet")
+    scenes = ["simulator", "world", "folder"] + ["seed"] * (trained.simulator == "bullet")
     if any(getattr(trained, key) != getattr(tested, key) for key in scenes):
         return
     if trained.seed != tested.seed or tested.test_share > trained.test_share:

@@ -30,13 +30,15 @@ IMMINENT, SOON = 15, 40
 """Maximum numbers of frames from the cut to a collision that is "imminent", and to a collision that
 comes "soon" (paper, Rationale construction)."""
 CONTACT = 0.4
-"""Ground-plane distance (simulator units) at which two objects of radius 0.2 touch."""
+"""Ground-plane distance (simulator units) at which two objects of scale 1 touch; it grows with the
+mean scale of the objects."""
 COURSE_MARGIN = 0.1
 """Maximum gap (simulator units) between two objects on a collision course when they would pass."""
 COURSE_HORIZON = 60
 """Number of frames over which straight paths are extrapolated."""
 VERY_CLOSE = 0.6
-"""Ground-plane distance (simulator units) below which two objects are very close."""
+"""Ground-plane distance (simulator units) below which two objects of scale 1 are very close; it
+grows with their mean scale."""
 IMAGE_SIZE = 336
 """Side (px) of the square image in which displacements are measured: the models' input size."""
 STAYS, SHIFTS = 8.0, 60.0
@@ -247,9 +249,14 @@ def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
         if speed * scene.fps < STATIONARY or np.dot(gap, closing) >= 0:
             continue
         time = min(-float(np.dot(gap, closing)) / speed**2, COURSE_HORIZON)
-        if np.linalg.norm(gap + time * closing) < CONTACT + COURSE_MARGIN:
+        contact = CONTACT * _mean_scale(scene, i, j)
+        if np.linalg.norm(gap + time * closing) < contact + COURSE_MARGIN:
             pairs.append((i, j))
     return pairs
+
+
+def _mean_scale(scene: Scene, i: int, j: int) -> float:
+    return (scene.object_scales[i] + scene.object_scales[j]) / 2
 
 
 def motion_start(scene: Scene, index: int, cut: int) -> int:
@@ -360,7 +367,7 @@ def _close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
             _cell(scene, (places[i] + places[j]) / 2),
         )
         for i, j in combinations(seen, 2)
-        if np.linalg.norm(ground[i] - ground[j]) < VERY_CLOSE
+        if np.linalg.norm(ground[i] - ground[j]) < VERY_CLOSE * _mean_scale(scene, i, j)
     )
 
 

@@ -38,3 +38,4 @@ from conf.schema.models import (
 )
 from conf.schema.servers import ServerConfig, ServersConfig, TeacherConfig
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
+from conf.schema.world import CameraConfig, PartConfig, PhysicsConfig, WorldConfig

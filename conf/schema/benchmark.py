@@ -13,18 +13,18 @@ from itertools import product
 from omegaconf import MISSING
 
 from conf.schema.settings import Settings, setting
+from conf.schema.world import WorldConfig
 
 RENDERERS = ("bullet", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
-STANDINS = ("movi_a", "physion")
+RECIPES = ("dynapix", "movi_a", "physion")
 WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
 """Window families of each group (see `data.tracks.selection.window`). B needs a later collision."""
 WINDOW_HORIZONS = (8, 16, 24)
 """Number of frames from the last frame of a window item's prefix to its target."""
 WINDOW_DIFFICULTIES = ("easy", "hard")
-STANDIN_OBJECTS = 6
-DISTINCT_APPEARANCES = 48
-"""Number of distinct object names: 3 shapes x 8 colours x 2 materials."""
+SCENE_FRAMES, SCENE_FPS = 128, 25
+"""Frames and frame rate of the scenes to which the recipe dynapix applies."""
 
 
 @dataclass
@@ -85,10 +85,11 @@ class BenchmarkConfig(Settings):
     """Folder of the benchmark below `store`."""
     simulator: str = setting("bullet", SIMULATORS)
     """Source of the scenes: bullet simulates them; the others read a release from `folder`."""
-    standin: str | None = setting(None, (*STANDINS, None))
-    """Dataset to imitate without its release: movi_a or physion. Bullet simulates scenes with
-    another camera, floor, light and physics, and items are built as for that dataset. null
-    simulates standard scenes."""
+    world: WorldConfig = field(default_factory=WorldConfig)
+    """World of simulated scenes."""
+    recipe: str | None = setting(None, (*RECIPES, None))
+    """How items are made: as the paper does it for CLEVRER (dynapix), for MoVi-A (movi_a) or for
+    Physion (physion). null takes the recipe of `simulator`; that of bullet is dynapix."""
     folder: str | None = None
     """Folder of the release, if `simulator` reads one."""
     fps: float = setting(30.0, above=0)
@@ -99,12 +100,6 @@ class BenchmarkConfig(Settings):
     """Number of scenes to simulate, or maximum number of scenes to read from a release."""
     test_share: float = setting(0.2, above=0, most=1)
     """Share of the scenes in the test split."""
-    min_objects: int = 4
-    """Minimum number of objects in a scene."""
-    max_objects: int = 6
-    """Maximum number of objects in a scene."""
-    max_collisions: int = setting(3, least=1)
-    """Maximum number of collisions in a scene."""
     renderer: str = setting("bullet", RENDERERS)
     """bullet renders on the CPU of any machine; blender renders scenes that look like CLEVRER's and
     needs the extra `blender`."""
@@ -117,50 +112,74 @@ class BenchmarkConfig(Settings):
     selection: SelectionConfig = field(default_factory=SelectionConfig)
     retrieval: RetrievalTrackConfig = field(default_factory=RetrievalTrackConfig)
 
+    @property
+    def store_name(self) -> str:
+        """Name of the benchmark's folder: `name`, followed by the world's name unless the world is
+        clevrer or `name` ends with it."""
+        world = self.world.name
+        if world == "clevrer" or self.name.endswith(world):
+            return self.name
+        return f"{self.name}-{world}"
+
+    @property
+    def item_recipe(self) -> str:
+        """The recipe of the items, `recipe` or the simulator's own."""
+        own = self.simulator if self.simulator in RECIPES else "dynapix"
+        return self.recipe or own
+
     def find_problems(self, group: str) -> Iterator[str]:
-        simulator = f"{group}simulator={self.simulator}"
+        simulator, recipe = f"{group}simulator={self.simulator}", self.item_recipe
         counterfactual = self.retrieval.counterfactual
         has_counterfactuals = counterfactual.train + counterfactual.test > 0
         remedy = f"set both quotas of {group}retrieval.counterfactual to 0"
-        if self.simulator in SIMULATORS[1:] and has_counterfactuals:
-            yield f"{simulator}: scenes of a release cannot be simulated again; {remedy}"
-        if (self.simulator in ("movi_a", "physion") or self.standin) and any(
-            quota.train + quota.test for quota in self.retrieval.builders.values()
-        ):
+        if self.simulator in SIMULATORS[1:]:
+            if has_counterfactuals:
+                yield f"{simulator}: scenes of a release cannot be simulated again; {remedy}"
+            if self.simulator in RECIPES and recipe != self.simulator:
+                yield f"{simulator} with {group}recipe={recipe}: set {group}recipe={self.simulator}"
+            if self.world != WorldConfig():
+                yield (
+                    f"{simulator} with world={self.world.name}: a world is simulated, but the "
+                    f"scenes of a release are read; set world=clevrer or {group}simulator=bullet"
+                )
+        physics = self.world.physics
+        if recipe == "dynapix" and (physics.frames, physics.fps) != (SCENE_FRAMES, SCENE_FPS):
             yield (
-                f"{group}retrieval.builders: queries need scenes of 128 frames at 25 fps, unlike "
-                f"those of {self.standin or self.simulator}; set the quotas of all builders to 0"
+                f"{group}world.physics.frames={physics.frames} and {group}world.physics.fps="
+                f"{physics.fps}: the recipe dynapix needs {SCENE_FRAMES} frames at {SCENE_FPS} per "
+                f"second; set them, or set {group}recipe=movi_a or physion"
             )
-        if self.standin in STANDINS:
-            standin = f"{group}standin={self.standin}"
-            if self.simulator != "bullet":
+        if recipe != "dynapix":
+            if any(quota.train + quota.test for quota in self.retrieval.builders.values()):
                 yield (
-                    f"{standin} with {simulator}: a stand-in consists of simulated scenes; set "
-                    f"{group}simulator=bullet"
-                )
-            if self.renderer == "blender":
-                yield (
-                    f"{standin} with {group}renderer=blender: Blender renders standard scenes "
-                    f"only; set {group}renderer=bullet"
-                )
-            if self.max_objects > STANDIN_OBJECTS:
-                yield (
-                    f"{standin} with {group}max_objects={self.max_objects}: a stand-in's view has "
-                    f"room for at most {STANDIN_OBJECTS} objects"
+                    f"{group}retrieval.builders with {group}recipe={recipe}: this recipe has no "
+                    "queries; set the quotas of all builders to 0"
                 )
             if has_counterfactuals:
-                yield f"{standin}: a stand-in has no counterfactual queries; {remedy}"
-        if not 2 <= self.min_objects <= self.max_objects <= DISTINCT_APPEARANCES:
+                yield f"{group}retrieval.counterfactual with {group}recipe={recipe}: {remedy}"
+        if self.renderer == "blender" and (look := _unusual_look(self.world)):
             yield (
-                f"{group}min_objects={self.min_objects} and {group}max_objects={self.max_objects}: "
-                f"need 2 <= min <= max <= {DISTINCT_APPEARANCES}, because all objects of a scene "
-                "look different"
+                f"{group}renderer=blender: Blender has no {look} of world={self.world.name}; set "
+                f"{group}renderer=bullet"
             )
         if self.width < 48 or self.width * 2 != self.height * 3:
             yield (
                 f"{group}width={self.width} and {group}height={self.height}: the aspect ratio "
                 "must be 3:2 and the size at least 48 x 32 px, such as 480 x 320"
             )
+
+
+def _unusual_look(world: WorldConfig) -> str | None:
+    """Name a setting of a world's look that differs from CLEVRER's and that Blender lacks."""
+    usual = WorldConfig()
+    looks = {
+        "light": world.light != usual.light,
+        "floor colour": world.floor != usual.floor,
+        "background": world.background != usual.background,
+        "parts": bool(world.parts),
+        "scale of objects": world.objects.scale != usual.objects.scale,
+    }
+    return next((name for name, differs in looks.items() if differs), None)
 
 
 def divide_window_quotas(quotas: dict[str, Quota]) -> dict[str, Quota]:

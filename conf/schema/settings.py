@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field, fields
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 from urllib.parse import urlsplit
 
 from conf.runs import is_run_name, resolve_run_name
@@ -55,6 +55,22 @@ class Settings:
         """One message per further problem, such as settings that exclude each other. Subclasses
         override this method."""
         return ()
+
+
+def from_dict(schema: type, values: Mapping[str, Any]) -> Any:
+    """Return an instance of a settings class from nested dicts, the inverse of `asdict`."""
+    hints = get_type_hints(schema)
+    arguments = {}
+    for name, value in values.items():
+        kind = hints[name]
+        if get_origin(kind) is dict:
+            nested = get_args(kind)[1]
+            arguments[name] = {key: from_dict(nested, inner) for key, inner in value.items()}
+        elif isinstance(value, Mapping):
+            arguments[name] = from_dict(kind, value)
+        else:
+            arguments[name] = value
+    return schema(**arguments)
 
 
 def _check_value(

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,11 @@ from data.tracks.selection import event, time
 from data.tracks.selection.distractors import DistractorPicker, Family, Timing, scene_candidates
 from data.world.events import find_motion_onsets
 
+if TYPE_CHECKING:
+    from conf.schema import BenchmarkConfig
+
+STANDIN = "standin_"
+"""Start of the names of the suites whose scenes are simulated instead of read from a release."""
 MIN_PREFIX_FRAMES = 5
 """Minimum number of frames in a prefix, for prefixes that are cut at the start of the scene."""
 CROSS_SCENES = 8
@@ -124,6 +130,14 @@ def cross_scene_candidates(
         yield Candidate(other.scene_id, target, "cross_scene")
 
 
+def suite_name(cfg: BenchmarkConfig) -> str:
+    """Return the name of the set of items: `dynapix`, a transfer suite, or a stand-in for one,
+    whose scenes are simulated."""
+    recipe = cfg.item_recipe
+    is_standin = recipe in CELLS and cfg.simulator not in CELLS
+    return f"{STANDIN}{recipe}" if is_standin else recipe
+
+
 EVENTS: dict[str, Callable[[Scene], list[int]]] = {
     "contact": lambda scene: [collision.frame for collision in scene.collisions],
     "motion": lambda scene: [frame for frame, _ in find_motion_onsets(scene)],
@@ -161,6 +175,6 @@ TRANSFER_SUITES = {
         )
         for family, cells in families.items()
     }
-    for prefix in ("", "standin_")
+    for prefix in ("", STANDIN)
     for suite, families in CELLS.items()
 }

@@ -8,21 +8,33 @@ image.
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from functools import cache
+from typing import Any
 
 from data.render.blender import BlenderRenderer
 from data.render.bullet import BulletRenderer
-from data.world.camera import STANDARD_VIEW, View
 
 Renderer = BulletRenderer | BlenderRenderer
 RENDERERS: dict[str, type[Renderer]] = {"bullet": BulletRenderer, "blender": BlenderRenderer}
 
 
-@cache
-def get_renderer(name: str, width: int, height: int, view: View = STANDARD_VIEW) -> Renderer:
-    """Return this process's renderer for a frame size (px) and a view.
+def get_renderer(config: Mapping[str, Any]) -> Renderer:
+    """Return this process's renderer for the settings of a benchmark: the renderer's name, the
+    frame size and the world.
 
     Raises:
         UserError: the renderer cannot run on this machine.
     """
-    return RENDERERS[name](width, height, view)
+    return _make_renderer(
+        config["renderer"], config["width"], config["height"], json.dumps(config["world"])
+    )
+
+
+@cache
+def _make_renderer(name: str, width: int, height: int, world: str) -> Renderer:
+    from conf.schema.settings import from_dict
+    from conf.schema.world import WorldConfig
+
+    return RENDERERS[name](width, height, from_dict(WorldConfig, json.loads(world)))

@@ -20,14 +20,16 @@ RGB = {
 }
 """CLEVRER's colours; green and brown are darker so that small objects differ more."""
 
+Mesh = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Vertices (V, 3), normals (V, 3), texture coordinates (V, 2) and triangles (T, 3)."""
 SEGMENTS = 48
 """Number of segments around the z axis."""
 
 
-def mesh(shape: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices (V, 3), normals (V, 3), texture coordinates (V, 2) and triangles (T, 3)."""
+def mesh(shape: str) -> Mesh:
+    """Return the surface of an object of scale 1."""
     if shape == "cube":
-        return _cube()
+        return box_mesh(np.full(3, CUBE_HALF))
     if shape == "sphere":
         angle = np.linspace(0, np.pi, SEGMENTS // 2 + 1)
         normals = np.stack([np.sin(angle), np.cos(angle)], axis=1)
@@ -38,9 +40,7 @@ def mesh(shape: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return _revolve(points, normals, np.array([0.05, 0.2, 0.25, 0.75, 0.8, 0.95]))
 
 
-def _revolve(
-    points: np.ndarray, normals: np.ndarray, down: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _revolve(points: np.ndarray, normals: np.ndarray, down: np.ndarray) -> Mesh:
     """Rotate a profile of (radius, height) points about the z axis; `down` is their texture v."""
     turns = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
 
@@ -57,7 +57,8 @@ def _revolve(
     return spin(points), spin(normals), uvs.reshape(-1, 2), triangles
 
 
-def _cube() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def box_mesh(half: np.ndarray) -> Mesh:
+    """Return the surface of a box, whose edges have the halves (3,)."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
     vertices, normals = [], []
     for axis, side in product(range(3), (-1.0, 1.0)):
@@ -68,7 +69,7 @@ def _cube() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     triangles = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]
     uvs = np.tile((corners + 1) / 2, (6, 1))
     return (
-        CUBE_HALF * np.concatenate(vertices),
+        half * np.concatenate(vertices),
         np.concatenate(normals),
         uvs,
         triangles.reshape(-1, 3),

@@ -13,15 +13,18 @@ import sys
 import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from PIL import Image
 
 from conf.errors import UserError
 from data.records import Scene
 from data.render.appearance import RGB
-from data.world.camera import STANDARD_VIEW, View
+from data.world.camera import Camera
 from data.world.shapes import CUBE_HALF, RADIUS
+
+if TYPE_CHECKING:
+    from conf.schema import WorldConfig
 
 BPY = "4.2.23"
 """Release of Blender's Python module; other releases give other pixels."""
@@ -35,12 +38,12 @@ WORKER = Path(__file__).with_name("blender_worker.py")
 class BlenderRenderer:
     """Renders frames of any scene at one size, in one Blender process.
 
-    Only the camera of the view is used. `blender_worker.py` defines the lamps and the ground.
+    Only the camera of the world is used. `blender_worker.py` defines the lamps and the ground.
     """
 
     version = VERSION
 
-    def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
+    def __init__(self, width: int, height: int, world: WorldConfig) -> None:
         """Start Blender. Raises UserError if the module `bpy` is missing or of another release."""
         try:
             installed = version("bpy")
@@ -62,7 +65,7 @@ class BlenderRenderer:
             stderr=self._errors,
             text=True,
         )
-        camera = view.camera.sized(width, height)
+        camera = Camera.from_settings(world.camera).sized(width, height)
         settings = {
             "width": width,
             "height": height,

@@ -9,16 +9,22 @@ Objects are rendered at twice the size and averaged, for anti-aliasing.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 
 from data.records import MATERIALS, Scene, SceneObject
-from data.render.appearance import RGB, mesh, texture
+from data.render.appearance import RGB, Mesh, box_mesh, mesh, texture
 from data.render.floor import Floor
-from data.world.camera import STANDARD_VIEW, Camera, View
+from data.world.camera import Camera
+from data.world.parts import Box, world_boxes
 from data.world.physics import connect
+
+if TYPE_CHECKING:
+    from conf.schema import WorldConfig
 
 VERSION = "bullet-1"
 
@@ -32,15 +38,20 @@ class BulletRenderer:
 
     version = VERSION
 
-    def __init__(self, width: int, height: int, view: View = STANDARD_VIEW) -> None:
-        self._scene_view = view
+    def __init__(self, width: int, height: int, world: WorldConfig) -> None:
+        self._world = world
         self._bullet = connect()
-        self._fine = view.camera.sized(width * OVERSAMPLING, height * OVERSAMPLING)
-        self._view_matrix = self._bullet.computeViewMatrix(self._fine.eye, [0, 0, 0], [0, 0, 1])
+        camera = Camera.from_settings(world.camera)
+        self._fine = camera.sized(width * OVERSAMPLING, height * OVERSAMPLING)
+        self._view_matrix = self._bullet.computeViewMatrix(camera.eye, camera.aim, [0, 0, 1])
         self._projection = _projection(self._fine)
-        self._floor = Floor(view.camera.sized(width, height), view.light)
+        self._floor = Floor(camera.sized(width, height), world)
         self._textures = self._load_textures()
-        self._visuals: dict[SceneObject, int] = {}
+        self._visuals: dict[tuple[SceneObject, float], int] = {}
+        self.part_handles = [
+            self._add_part(box, part.color)
+            for box, part in zip(world_boxes(world), world.parts.values(), strict=True)
+        ]
         self._scene_id: str | None = None
         self._handles: list[int] = []
 
@@ -53,11 +64,14 @@ class BulletRenderer:
         # RGBX, because Pillow would premultiply the colours of an RGBA image by alpha.
         fine = Image.frombuffer("RGBX", mask.shape[::-1], layers, "raw", "RGBX", 0, 1)
         *colors, cover = fine.reduce(OVERSAMPLING).split()
-        shade = self._floor.shade(scene.positions[frame], self._shadow_boxes[frame])
+        shade = self._floor.shade(
+            scene.positions[frame], scene.object_scales, self._shadow_boxes[frame]
+        )
         bands = []
         uncovered = 1 - np.asarray(cover, np.float32) / 255
-        for color, tint in zip(colors, self._scene_view.floor, strict=True):
-            band = shade * tint
+        world = self._world
+        for color, tint, sky in zip(colors, world.floor, world.background, strict=True):
+            band = self._floor.paint(shade, tint, sky)
             band *= uncovered
             band += color
             bands.append(Image.fromarray(np.rint(band, out=band).astype(np.uint8)))
@@ -80,21 +94,22 @@ class BulletRenderer:
         return list(self._handles)
 
     def capture(self) -> tuple[np.ndarray, np.ndarray]:
-        """Render the objects without a floor at OVERSAMPLING times the size.
+        """Render the objects and parts without a floor at OVERSAMPLING times the size.
 
         Returns:
-            Pixels (H, W, 4) uint8, and the mask (H, W) int32: an object's handle or -1.
+            Pixels (H, W, 4) uint8, and the mask (H, W) int32: the handle of an object or a part,
+            or -1.
         """
         _, _, pixels, _, mask = self._bullet.getCameraImage(
             self._fine.width,
             self._fine.height,
             self._view_matrix,
             self._projection,
-            lightDirection=self._scene_view.light,
+            lightDirection=self._world.light.direction,
             lightColor=[1, 1, 1],
             shadow=0,
-            lightAmbientCoeff=0.45,
-            lightDiffuseCoeff=0.6,
+            lightAmbientCoeff=self._world.light.ambient,
+            lightDiffuseCoeff=self._world.light.diffuse,
             lightSpecularCoeff=0.6,
             renderer=self._bullet.ER_TINY_RENDERER,
         )
@@ -112,27 +127,45 @@ class BulletRenderer:
         # resetSimulation would leak megabytes each time.
         for handle in self._handles:
             self._bullet.removeBody(handle)
-        self._handles = [self._add(scene_object) for scene_object in scene.objects]
-        self._shadow_boxes = self._floor.shadow_boxes(scene.positions)
+        self._handles = [
+            self._add(*each) for each in zip(scene.objects, scene.object_scales, strict=True)
+        ]
+        self._shadow_boxes = self._floor.shadow_boxes(scene.positions, scene.object_scales)
         self._scene_id = scene.scene_id
 
-    def _add(self, scene_object: SceneObject) -> int:
-        bullet = self._bullet
-        if scene_object not in self._visuals:
-            vertices, normals, uvs, triangles = mesh(scene_object.shape)
+    def _add(self, scene_object: SceneObject, scale: float) -> int:
+        look = scene_object, scale
+        if look not in self._visuals:
+            vertices, *rest = mesh(scene_object.shape)
             shine = 1.0 if scene_object.material == "metal" else 0.05
-            self._visuals[scene_object] = bullet.createVisualShape(
-                bullet.GEOM_MESH,
-                vertices=vertices.tolist(),
-                normals=normals.tolist(),
-                uvs=uvs.tolist(),
-                indices=triangles.ravel().tolist(),
-                rgbaColor=[*(np.array(RGB[scene_object.color]) / 255), 1],
-                specularColor=[shine] * 3,
-            )
-        handle = bullet.createMultiBody(0, -1, self._visuals[scene_object])
-        bullet.changeVisualShape(handle, -1, textureUniqueId=self._textures[scene_object.material])
+            color = RGB[scene_object.color]
+            self._visuals[look] = self._add_visual((vertices * scale, *rest), color, shine)
+        handle = self._bullet.createMultiBody(0, -1, self._visuals[look])
+        self._set_texture(handle, scene_object.material)
         return handle
+
+    def _add_part(self, box: Box, color: Sequence[float]) -> int:
+        visual = self._add_visual(box_mesh(box.half), color, shine=0.05)
+        handle = self._bullet.createMultiBody(
+            0, -1, visual, box.position.tolist(), box.quaternion.tolist()
+        )
+        self._set_texture(handle, "rubber")
+        return handle
+
+    def _add_visual(self, surface: Mesh, color: Sequence[float], shine: float) -> int:
+        vertices, normals, uvs, triangles = surface
+        return self._bullet.createVisualShape(
+            self._bullet.GEOM_MESH,
+            vertices=vertices.tolist(),
+            normals=normals.tolist(),
+            uvs=uvs.tolist(),
+            indices=triangles.ravel().tolist(),
+            rgbaColor=[*(np.array(color) / 255), 1],
+            specularColor=[shine] * 3,
+        )
+
+    def _set_texture(self, handle: int, material: str) -> None:
+        self._bullet.changeVisualShape(handle, -1, textureUniqueId=self._textures[material])
 
 
 def _projection(camera: Camera) -> list[float]:

@@ -25,7 +25,6 @@ from conf.errors import UserError
 from data.records import Scene
 from data.render import get_renderer
 from data.store import FRAMES_FOLDER, Store, write_atomically
-from data.world.standins import standin_view
 
 log = logging.getLogger(__name__)
 
@@ -109,9 +108,8 @@ def render_frames(
         reader = READERS[config["simulator"]]
         images = reader.load_images(scene, Path(config["folder"]), frames)
     else:
-        view = standin_view(config["standin"])
         try:
-            renderer = get_renderer(config["renderer"], config["width"], config["height"], view)
+            renderer = get_renderer(config)
         except ModuleNotFoundError as error:
             raise UserError(
                 f"frames of scene {scene.scene_id} are not in the cache, and rendering them needs "

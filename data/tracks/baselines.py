@@ -9,8 +9,8 @@ import numpy as np
 
 from data.records import Candidate, SelectionItem
 from data.store import Store
+from data.world.camera import Camera
 from data.world.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
-from data.world.standins import standin_view
 
 
 def displacement_from_prefix(item: SelectionItem, candidate: Candidate, store: Store) -> float:
@@ -42,7 +42,7 @@ def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: St
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
     seconds = (item.target_frame - item.prefix_stop) / scene.fps
     positions = scene.positions[item.prefix_stop] + seconds * scene.velocities[item.prefix_stop]
-    expected, _ = standin_view(config.get("standin")).camera.project(positions)
+    expected, _ = Camera.from_settings(config["world"]["camera"]).project(positions)
     actual = dict(zip(other.object_keys, other.image_positions[candidate.frame], strict=True))
     scale = MODEL_SIZE / np.array(scene.image_size)
     distances = [

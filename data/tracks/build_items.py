@@ -20,7 +20,7 @@ from typing import Any
 from conf.schema import BenchmarkConfig, Quota
 from data.parallel import Workers
 from data.records import FAMILIES, RetrievalQuery, Scene, SelectionItem
-from data.releases.transfer_suites import TRANSFER_SUITES
+from data.releases.transfer_suites import TRANSFER_SUITES, suite_name
 from data.store import load_scene, part_path, scene_path, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota
@@ -80,13 +80,6 @@ def make_items_and_queries(
 def item_families(cfg: BenchmarkConfig) -> Mapping[str, Family]:
     """Return the families of a benchmark's suite by name."""
     return TRANSFER_SUITES.get(suite_name(cfg), DYNAPIX_FAMILIES)
-
-
-def suite_name(cfg: BenchmarkConfig) -> str:
-    """Return the name of the set of items: `dynapix`, a transfer suite or a stand-in."""
-    if cfg.standin is not None:
-        return f"standin_{cfg.standin}"
-    return cfg.simulator if cfg.simulator in TRANSFER_SUITES else "dynapix"
 
 
 def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:

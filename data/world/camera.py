@@ -1,32 +1,56 @@
-"""A pinhole camera, and the view of a scene: its camera, floor colour and light."""
+"""A pinhole camera."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import radians, tan
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from conf.schema import CameraConfig
+
+WIDTH, HEIGHT = 480, 320
+"""Size in px of the image plane to which the image positions of a simulated scene refer."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera that looks at the origin of the world, whose z axis points up. The defaults
-    approximate the camera of the CLEVRER dataset."""
+    """A pinhole camera in a world whose z axis points up. The defaults approximate the camera of
+    the CLEVRER dataset."""
 
-    width: int = 480
-    height: int = 320
+    width: int = WIDTH
+    height: int = HEIGHT
     focal: float = 525.0
     """Focal length, px."""
     eye: tuple[float, float, float] = (4.3301, 0.0, 2.5)
     """Position of the camera in the world."""
+    aim: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Point in the middle of the image."""
+
+    @classmethod
+    def from_settings(cls, settings: CameraConfig | Mapping[str, Any]) -> Camera:
+        """Return the camera of a world's settings; the focal length is rounded to 0.01 px."""
+        values = settings if isinstance(settings, Mapping) else vars(settings)
+        focal = round(WIDTH / 2 / tan(radians(values["field_of_view"]) / 2), 2)
+        return cls(WIDTH, HEIGHT, focal, tuple(values["position"]), tuple(values["aim"]))
 
     @cached_property
     def axes(self) -> np.ndarray:
         """(3, 3) rows: right, down and forward in world coordinates."""
-        forward = -np.asarray(self.eye) / np.linalg.norm(self.eye)
+        sight = np.subtract(self.aim, self.eye)
+        forward = sight / np.linalg.norm(sight)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(forward, right), forward])
+
+    @property
+    def magnification(self) -> float:
+        """Length in px of a simulator unit in the middle of the image."""
+        return self.focal / float(np.linalg.norm(np.subtract(self.aim, self.eye)))
 
     def sized(self, width: int, height: int) -> Camera:
         """Return this camera at another resolution, with the same horizontal field of view."""
@@ -47,18 +71,3 @@ class Camera:
         x = (columns + 0.5 - self.width / 2) / self.focal
         y = (rows + 0.5 - self.height / 2) / self.focal
         return np.stack([x, y, np.ones_like(x)], axis=-1) @ self.axes
-
-
-@dataclass(frozen=True)
-class View:
-    """The camera, floor colour and light of scenes."""
-
-    camera: Camera = Camera()
-    """`eye` must lie in the x-z plane, as `data.render.floor` assumes."""
-    floor: tuple[float, float, float] = (158.0, 156.0, 152.0)
-    """RGB colour of the floor at brightness 1, 0 to 255."""
-    light: tuple[float, float, float] = (3.0, 3.0, 6.0)
-    """Direction towards the light; the Blender renderer has lamps of its own."""
-
-
-STANDARD_VIEW = View()

@@ -13,17 +13,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain, combinations, pairwise
+from itertools import chain, combinations, pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data.records import FPS, FRAMES, Collision, Landing, SceneObject
+from data.records import Collision, Landing, SceneObject
 from data.world.events import first_contacts
-from data.world.shapes import CUBE_HALF, RADIUS
+from data.world.parts import part_box
+from data.world.shapes import CUBE_HALF, RADIUS, half_height
 
 if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient
+
+    from conf.schema import PartConfig, WorldConfig
 
 GENERATOR_VERSION = "2"
 """Changes whenever the same seed and index give a different scene."""
@@ -31,30 +34,8 @@ GENERATOR_VERSION = "2"
 SOLVER_ITERATIONS = 20
 CONTACT_FREE_FRAMES = 5
 """A pair collides again only if more frames than this without contact precede."""
-
-
-@dataclass(frozen=True)
-class Physics:
-    """Constants of a simulation, and its frame rate."""
-
-    fps: int = FPS
-    substeps: int = 7
-    """Simulation steps per frame; 7 x 25 fps = 175 Hz, as in CLEVRER's raw records."""
-    gravity: float = 9.81
-    ground_friction: float = 0.1
-    object_friction: float = 0.3
-    ground_restitution: float = 0.0
-    """Bullet multiplies it by the object's restitution, so with 0 nothing bounces on the ground."""
-    rubber_restitution: float = 0.5
-    metal_restitution: float = 0.7
-
-    @property
-    def friction_deceleration(self) -> float:
-        """Deceleration of a sliding object; Bullet multiplies the two friction coefficients."""
-        return self.ground_friction * self.object_friction * self.gravity
-
-
-STANDARD_PHYSICS = Physics()
+TOUCHING = 0.02
+"""Distance (simulator units) below which bodies touch at the start."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +47,9 @@ class Body:
     yaw: float
     velocity: Sequence[float] | np.ndarray = (0.0, 0.0)
     height: float | None = None
-    """Initial height of the centre of a body in the air; None for a body on the ground."""
+    """Initial height of the centre of a body in the air; None for a body on the floor."""
+    scale: float = 1.0
+    """Size, as a multiple of the standard size of the shape."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +60,9 @@ class Motion:
         states: (F, N, 13) positions, quaternions, linear and angular velocities as in `Scene`.
         collisions: First contacts of pairs.
         repeated_pair: Whether any pair collides more than once.
-        touching_at_start: Whether any two bodies touch at the first frame.
-        landings: Landings of bodies that start in the air.
+        touching_at_start: Whether any two bodies, or a body and a part, touch at the first frame.
+            Such a motion is not simulated: it has the first frame only.
+        landings: Landings, on the floor or on a part, of bodies that start in the air.
     """
 
     states: np.ndarray
@@ -129,28 +113,38 @@ class Simulator:
         self._bullet = connect()
 
     def simulate(
-        self, bodies: list[Body], frames: int = FRAMES, physics: Physics = STANDARD_PHYSICS
+        self, bodies: Sequence[Body], world: WorldConfig, frames: int | None = None
     ) -> Motion:
-        """Simulate bodies for `frames` frames. Equal arguments give bit-identical results."""
-        ground, handles = self._place(bodies, physics)
+        """Simulate bodies in a world. Equal arguments give bit-identical results.
+
+        Args:
+            frames: Number of frames; that of the world by default.
+        """
+        frames = world.physics.frames if frames is None else frames
+        fixed, handles = self._place(bodies, world)
         recorded = np.zeros((frames, len(bodies), 13))
         recorded[0] = self._state(handles)
-        touching_at_start = any(
-            self._bullet.getClosestPoints(a, b, 0.02) for a, b in combinations(handles, 2)
-        )
+        parts = fixed[1:]
+        if any(
+            self._bullet.getClosestPoints(a, b, TOUCHING)
+            for a, b in chain(combinations(handles, 2), product(handles, parts))
+        ):
+            return Motion(recorded[:1], (), repeated_pair=False, touching_at_start=True)
         contacts: dict[tuple[int, int], list[int]] = defaultdict(list)
         in_air = {k for k, body in enumerate(bodies) if body.height is not None}
         landings = []
         for frame in range(1, frames):
             # Bullet also lists points of pairs that have separated; contacts have a normal force.
-            for _ in range(physics.substeps):
+            for _ in range(world.physics.substeps):
                 self._bullet.stepSimulation()
                 for point in self._bullet.getContactPoints():
-                    if point[1] != ground and point[2] != ground and point[9] > 0:
+                    if point[1] not in fixed and point[2] not in fixed and point[9] > 0:
                         pair = sorted(map(handles.index, point[1:3]))
                         contacts[tuple(pair)].append(frame)
                 for k in list(in_air):
-                    points = self._bullet.getContactPoints(ground, handles[k])
+                    points = chain.from_iterable(
+                        self._bullet.getContactPoints(surface, handles[k]) for surface in fixed
+                    )
                     if any(point[9] > 0 for point in points):
                         in_air.remove(k)
                         landings.append(Landing(frame, k))
@@ -159,13 +153,17 @@ class Simulator:
             recorded,
             first_contacts((at, pair) for pair, times in contacts.items() for at in times),
             _has_repeated(contacts),
-            touching_at_start,
-            tuple(landings),
+            touching_at_start=False,
+            landings=tuple(landings),
         )
 
-    def _place(self, bodies: list[Body], physics: Physics) -> tuple[int, list[int]]:
-        """Reset the world, add the ground and the bodies, and return their handles."""
-        bullet = self._bullet
+    def _place(self, bodies: Sequence[Body], world: WorldConfig) -> tuple[list[int], list[int]]:
+        """Empty Bullet's world, and add the floor, the parts and the bodies.
+
+        Returns:
+            Handles of the floor and the parts, and handles of the bodies.
+        """
+        bullet, physics = self._bullet, world.physics
         bullet.resetSimulation()
         bullet.setGravity(0, 0, -physics.gravity)
         # With a residual threshold above 0, the number of iterations depends on all objects, so
@@ -176,35 +174,47 @@ class Simulator:
             solverResidualThreshold=0,
             deterministicOverlappingPairs=1,
         )
-        ground = bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))
+        floor = bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))
         bullet.changeDynamics(
-            ground,
+            floor,
             -1,
-            lateralFriction=physics.ground_friction,
-            restitution=physics.ground_restitution,
+            lateralFriction=physics.floor_friction,
+            restitution=physics.floor_restitution,
         )
-        return ground, [self._add(body, physics) for body in bodies]
+        fixed = [floor, *(self._add_part(part) for part in world.parts.values())]
+        return fixed, [self._add(body, world) for body in bodies]
 
-    def _add(self, body: Body, physics: Physics) -> int:
-        bullet, shape, height = self._bullet, body.object.shape, body.height
-        if height is None:
-            height = CUBE_HALF if shape == "cube" else RADIUS
+    def _add_part(self, part: PartConfig) -> int:
+        bullet, box = self._bullet, part_box(part)
+        form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=box.half.tolist())
+        handle = bullet.createMultiBody(0, form, -1, box.position.tolist(), box.quaternion.tolist())
+        bullet.changeDynamics(
+            handle, -1, lateralFriction=part.friction, restitution=part.restitution
+        )
+        return handle
+
+    def _add(self, body: Body, world: WorldConfig) -> int:
+        bullet, scale, physics = self._bullet, body.scale, world.physics
+        shape, material = body.object.shape, body.object.material
+        height = half_height(shape, scale) if body.height is None else body.height
+        radius = RADIUS * scale
         sizes = {
-            "sphere": (bullet.GEOM_SPHERE, {"radius": RADIUS}),
-            "cube": (bullet.GEOM_BOX, {"halfExtents": [CUBE_HALF] * 3}),
-            "cylinder": (bullet.GEOM_CYLINDER, {"radius": RADIUS, "height": 2 * RADIUS}),
+            "sphere": (bullet.GEOM_SPHERE, {"radius": radius}),
+            "cube": (bullet.GEOM_BOX, {"halfExtents": [CUBE_HALF * scale] * 3}),
+            "cylinder": (bullet.GEOM_CYLINDER, {"radius": radius, "height": 2 * radius}),
         }
         kind, size = sizes[shape]
         form = bullet.createCollisionShape(kind, **size)
         turn = bullet.getQuaternionFromEuler([0, 0, body.yaw])
-        handle = bullet.createMultiBody(1.0, form, -1, [*body.position, height], turn)
+        mass = getattr(world.objects.mass, material) * scale**3
+        handle = bullet.createMultiBody(mass, form, -1, [*body.position, height], turn)
         bullet.changeDynamics(
             handle,
             -1,
             lateralFriction=physics.object_friction,
-            rollingFriction=0,
-            spinningFriction=0,
-            restitution=getattr(physics, f"{body.object.material}_restitution"),
+            rollingFriction=physics.rolling_friction,
+            spinningFriction=physics.rolling_friction,
+            restitution=getattr(physics.restitution, material),
             linearDamping=0,
             angularDamping=0,
         )

@@ -1,200 +1,165 @@
-"""Samples collision scenes in the manner of CLEVRER, and records their oracle.
+"""Samples the scenes of a world, and records their oracle.
 
-A scene depends only on the seed, its index, GENERATOR_VERSION, and the benchmark's limits on the
-numbers of objects and collisions.
+A scene depends only on the seed, its index, the world and GENERATOR_VERSION.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Mapping
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data.records import COLORS, FPS, MATERIALS, SHAPES, Scene, SceneObject
-from data.world.camera import STANDARD_VIEW, Camera
-from data.world.physics import STANDARD_PHYSICS, Body, Motion, Physics, shared_simulator
-from data.world.shapes import BOUNDING_RADIUS, RADIUS
+from conf.errors import UserError
+from data.records import COLORS, MATERIALS, Scene, SceneObject
+from data.world.camera import Camera
+from data.world.parts import world_boxes
+from data.world.physics import Body, shared_simulator
+from data.world.sliding import NO_PLACE, slide
+from data.world.starts import (
+    NO_COLLISION,
+    OFF_SCREEN,
+    OVERLAP,
+    RejectedError,
+    Sample,
+    Sized,
+    is_on_screen,
+    strike,
+    throw,
+)
 from data.world.visibility import compute_visibility
 
 if TYPE_CHECKING:
-    from conf.schema import BenchmarkConfig
+    from conf.schema import WorldConfig
 
-AT_REST = 0.35
-"""Probability that an object added for a collision starts at rest."""
-SPEED = (1.0, 3.0)
-"""Range of initial speeds, simulator units per second."""
-COLLISIONS = {2: 0.63, 3: 0.33, 4: 0.04}
-"""Probabilities of the intended number of collisions, from a sample of CLEVRER's release."""
-CLEAR = 2 * max(BOUNDING_RADIUS.values()) + 0.2
-"""Objects that have this distance at every frame never touch, because between two frames their
-distance falls by less than 0.1."""
-PLACEMENTS = 40
-"""Number of attempts to place an object before the scene is sampled again."""
+STARTS = {"slide": slide, "throw": throw, "strike": strike}
+"""Functions that sample the initial states of objects, by `start.kind` of the world."""
+ATTEMPTS = 300
+"""Number of samples after which a world is refused because none was suitable."""
+NEAREST = 0.3
+"""Minimum depth (simulator units) of a part, which the renderer cannot clip."""
+LOWEST = -0.1
+"""Height (simulator units) below which a centre has fallen through the floor."""
+
+TOO_MANY = "objects collide too often"
+FALLEN = "an object falls through the floor"
+UNSEEN = "no object comes into view"
+REMEDIES: Mapping[str, str] = {
+    OFF_SCREEN: "change start.area, or camera.position, camera.aim or camera.field_of_view",
+    OVERLAP: "lower objects.scale or objects.max_count, enlarge start.area or start.height, or "
+    "move the parts",
+    NO_COLLISION: "raise start.speed, lower start.spread, or lower the friction in physics",
+    NO_PLACE: "lower objects.scale or objects.max_count, change start.area, or move the camera or "
+    "the parts",
+    TOO_MANY: "raise start.max_collisions or set it to null",
+    FALLEN: "raise physics.substeps, or lower start.speed or start.height",
+    UNSEEN: "change camera.aim or start.middle, so that the camera sees the middle",
+}
+"""What to change in the world, by the reason for which most samples were rejected."""
 
 
-def sample_bodies(seed: int, index: int, limits: BenchmarkConfig) -> tuple[list[Body], Motion]:
-    """Sample the bodies of scene `index` and simulate their motion.
+def sample_scene(world: WorldConfig, seed: int, index: int) -> Sample:
+    """Sample scene `index` of a world: its bodies and their motion.
 
-    The first body moves. Each further body is placed so that it collides with an earlier body,
-    until the scene has its intended number of collisions; the others rest and touch no other body.
-    A placement by which a pair touches at the start or collides twice is rejected.
+    Raises:
+        UserError: the camera does not see the middle, or is inside or in front of a part; or no
+            suitable scene was found, and the message names the most frequent reason.
     """
+    camera = Camera.from_settings(world.camera)
+    check_view(world, camera)
     rng = np.random.default_rng([seed, index])
-    while True:
-        objects = sample_objects(rng, limits)
-        goal = int(rng.choice(list(COLLISIONS), p=list(COLLISIONS.values())))
-        bodies = [_entering(objects[0], rng)]
-        motion = shared_simulator().simulate(bodies)
-        for added in objects[1:]:
-            attempts = (
-                _try_body(bodies, motion, added, rng, goal, limits.max_collisions)
-                for _ in range(PLACEMENTS)
+    rejections: Counter[str] = Counter()
+    for _ in range(ATTEMPTS):
+        try:
+            sample = STARTS[world.start.kind](sample_objects(rng, world), world, camera, rng)
+            check_sample(sample, world, camera)
+        except RejectedError as rejection:
+            rejections[str(rejection)] += 1
+        else:
+            return sample
+    ((reason, count),) = rejections.most_common(1)
+    raise UserError(
+        f"world {world.name}: scene {index} was sampled {ATTEMPTS} times without success; in "
+        f"{count} samples, {reason}: {REMEDIES[reason]} (settings of benchmark.world)",
+        code="impossible-world",
+    )
+
+
+def check_view(world: WorldConfig, camera: Camera) -> None:
+    """Raises UserError if the camera does not see the middle, or if a part is not in front of the
+    camera."""
+    if not is_on_screen(np.array(world.start.middle), 0.0, camera):
+        raise UserError(
+            f"world {world.name}: the camera does not see benchmark.world.start.middle="
+            f"{world.start.middle}: change benchmark.world.camera.aim={world.camera.aim} or "
+            "benchmark.world.camera.position",
+            code="impossible-world",
+        )
+    for name, box in zip(world.parts, world_boxes(world), strict=True):
+        if camera.project(box.corners)[1].min() < NEAREST:
+            raise UserError(
+                f"world {world.name}: benchmark.world.parts.{name} is not entirely in front of the "
+                "camera: move it or the camera",
+                code="impossible-world",
             )
-            extended = next(filter(None, attempts), None)
-            if extended is None:
-                break
-            bodies, motion = extended
-        if len(bodies) == len(objects) and motion.collisions:
-            return bodies, motion
 
 
-def sample_objects(rng: np.random.Generator, limits: BenchmarkConfig) -> list[SceneObject]:
-    """Sample the number of objects in a scene and their distinct appearances."""
-    every = [SceneObject(*attributes) for attributes in product(SHAPES, MATERIALS, COLORS)]
-    count = int(rng.integers(limits.min_objects, limits.max_objects + 1))
-    return [every[k] for k in rng.choice(len(every), count, replace=False)]
+def sample_objects(rng: np.random.Generator, world: WorldConfig) -> list[Sized]:
+    """Sample the number of objects in a scene, their distinct appearances and their sizes."""
+    settings = world.objects
+    every = [SceneObject(*each) for each in product(settings.shapes, MATERIALS, COLORS)]
+    count = int(rng.integers(settings.min_count, settings.max_count + 1))
+    chosen = [every[k] for k in rng.choice(len(every), count, replace=False)]
+    low, high = settings.scale
+    scales = rng.uniform(low, high, count).tolist() if low < high else [low] * count
+    return [Sized(*each) for each in zip(chosen, scales, strict=True)]
 
 
-def _entering(added: SceneObject, rng: np.random.Generator) -> Body:
-    """Sample a body that moves from far away towards the middle of the view."""
-    bearing = rng.uniform(0, 2 * np.pi)
-    start = np.array([-0.7, 0.0]) + rng.uniform(2.6, 4.0) * unit_vector(bearing)
-    goal = np.array([-0.7, 0.0]) + rng.uniform(-1, 1, 2)
-    direction = (goal - start) / np.linalg.norm(goal - start)
-    speed = rng.uniform(*SPEED)
-    return Body(added, start, rng.uniform(0, 2 * np.pi), speed * direction)
-
-
-def _try_body(
-    bodies: list[Body],
-    motion: Motion,
-    added: SceneObject,
-    rng: np.random.Generator,
-    goal: int,
-    max_collisions: int,
-) -> tuple[list[Body], Motion] | None:
-    """Add a body that collides with another body or, once there are `goal` collisions, with none.
-
-    Returns:
-        All bodies and their motion, or None if the sampled body does not fit.
-    """
-    is_colliding = len(motion.collisions) < min(goal, max_collisions)
-    body = (_colliding if is_colliding else _resting)(added, motion, rng)
-    if body is None:
-        return None
-    extended = [*bodies, body]
-    # A body at rest usually stays clear of the others, and then need not be simulated with them.
-    combined = None if is_colliding else _combine(motion, body)
-    result = combined or shared_simulator().simulate(extended)
-    fits = (
-        not result.touching_at_start
-        and not result.repeated_pair
-        and len(result.collisions) <= max_collisions
-        and any(len(bodies) in c.objects for c in result.collisions) == is_colliding
-    )
-    return (extended, result) if fits else None
-
-
-def _combine(motion: Motion, body: Body) -> Motion | None:
-    """Add the motion of a body that touches no other body; return None if it may touch one.
-
-    Bullet solves groups of bodies that do not touch separately, so the result is bit-identical to a
-    simulation of all bodies.
-    """
-    alone = shared_simulator().simulate([body]).states
-    distance = np.linalg.norm(motion.positions - alone[..., :3], axis=-1)
-    if distance.min() < CLEAR:
-        return None
-    return replace(motion, states=np.concatenate([motion.states, alone], axis=1))
-
-
-def _colliding(added: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
-    """Sample a body that should collide with another body on screen: at rest in its path, or moving
-    towards its future position. Returns None if the sample is unsuitable."""
-    other = int(rng.integers(motion.positions.shape[1]))
-    frame = int(rng.integers(15, 111))
-    place = motion.positions[frame, other, :2] + rng.normal(0, 0.1, 2)
-    if not is_on_screen(place):
-        return None
-    if rng.random() < AT_REST:
-        if np.linalg.norm(motion.velocities[frame, other]) < 0.3:
-            return None
-        return Body(added, place, rng.uniform(0, 2 * np.pi))
-    seconds, deceleration = frame / FPS, STANDARD_PHYSICS.friction_deceleration
-    speed = rng.uniform(*SPEED)
-    if speed - deceleration * seconds < 0.3:
-        return None
-    travel = speed * seconds - deceleration * seconds**2 / 2
-    direction = unit_vector(rng.uniform(0, 2 * np.pi))
-    start = place - travel * direction
-    return Body(added, start, rng.uniform(0, 2 * np.pi), speed * direction)
-
-
-def _resting(added: SceneObject, motion: Motion, rng: np.random.Generator) -> Body | None:
-    """Sample a body at rest on screen; return None if it is off screen or near another's path."""
-    place = np.array([rng.uniform(-3.5, 1.2), rng.uniform(-2.2, 2.2)])
-    is_clear = np.linalg.norm(motion.positions[..., :2] - place, axis=-1).min() > 0.7
-    if not (is_clear and is_on_screen(place)):
-        return None
-    return Body(added, place, rng.uniform(0, 2 * np.pi))
-
-
-def is_on_screen(
-    place: np.ndarray, height: float = RADIUS, camera: Camera = STANDARD_VIEW.camera
-) -> bool:
-    """Return whether a point above a ground position is on screen, with a margin of 20 px."""
-    pixel, depth = camera.project(np.array([*place, height]))
-    margin = 20
-    return bool(
-        depth > 1
-        and margin < pixel[0] < camera.width - margin
-        and margin < pixel[1] < camera.height - margin
-    )
-
-
-def unit_vector(angle: float) -> np.ndarray:
-    return np.array([np.cos(angle), np.sin(angle)])
+def check_sample(sample: Sample, world: WorldConfig, camera: Camera) -> None:
+    """Raises RejectedError if a scene is unsuitable, whatever its start."""
+    motion, most = sample.motion, world.start.max_collisions
+    if motion.touching_at_start:
+        raise RejectedError(OVERLAP)
+    if not motion.collisions:
+        raise RejectedError(NO_COLLISION)
+    if most is not None and len(motion.collisions) > most:
+        raise RejectedError(TOO_MANY)
+    # NaN counts as fallen.
+    if not (motion.positions[..., 2] > LOWEST).all():
+        raise RejectedError(FALLEN)
+    pixels, depth = camera.project(motion.positions)
+    on_screen = (depth > 0) & ((pixels > 0) & (pixels < (camera.width, camera.height))).all(-1)
+    if not on_screen.any():
+        raise RejectedError(UNSEEN)
 
 
 def format_scene_id(seed: int, index: int) -> str:
     return f"s{seed}-{index:06d}"
 
 
-def simulate_without(name: str, split: str, bodies: list[Body], removed: int) -> Scene:
+def simulate_without(
+    name: str, split: str, bodies: list[Body], removed: int, world: WorldConfig
+) -> Scene:
     """Simulate a scene again without object `removed`.
 
     Objects that the removed object never affects, directly or through others, move bit-identically.
     """
     rest = bodies[:removed] + bodies[removed + 1 :]
-    return record_scene(name, split, rest, shared_simulator().simulate(rest))
+    return record_scene(name, split, Sample(rest, shared_simulator().simulate(rest, world)), world)
 
 
-def record_scene(
-    name: str,
-    split: str,
-    bodies: list[Body],
-    motion: Motion,
-    physics: Physics = STANDARD_PHYSICS,
-    camera: Camera = STANDARD_VIEW.camera,
-    scenario: str = "",
-) -> Scene:
-    """Return the scene of a motion, with image positions and visibility for a camera."""
-    objects = tuple(body.object for body in bodies)
+def record_scene(name: str, split: str, sample: Sample, world: WorldConfig) -> Scene:
+    """Return the oracle of a sampled scene, with image positions and visibility."""
+    camera, motion, physics = Camera.from_settings(world.camera), sample.motion, world.physics
+    objects = tuple(body.object for body in sample.bodies)
+    scales = tuple(body.scale for body in sample.bodies)
     states = np.split(motion.states, [3, 7, 10], axis=-1)
     positions, quaternions, velocities, angular_velocities = states
-    in_view, fraction = compute_visibility(objects, positions, quaternions, camera)
+    in_view, fraction = compute_visibility(
+        objects, positions, quaternions, camera, scales, world_boxes(world)
+    )
     floats = {
         "positions": positions,
         "quaternions": quaternions,
@@ -212,6 +177,7 @@ def record_scene(
         image_size=(camera.width, camera.height),
         fps=physics.fps,
         landings=motion.landings,
-        scenario=scenario,
+        scenario=sample.scenario,
+        scales=() if set(scales) == {1.0} else scales,
         **{key: array.astype(np.float32) for key, array in floats.items()},
     )

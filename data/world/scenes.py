@@ -16,11 +16,11 @@ from conf.schema import BenchmarkConfig
 from data.parallel import Workers
 from data.records import SPLITS
 from data.releases.readers import READERS
+from data.releases.transfer_suites import suite_name
 from data.releases.validation import RecordError
 from data.store import part_path, save_scene, scene_path, write_atomically
 from data.tracks.retrieval import counterfactual
-from data.world.sampling import format_scene_id, record_scene, sample_bodies, simulate_without
-from data.world.standins import simulate_standin
+from data.world.sampling import format_scene_id, record_scene, sample_scene, simulate_without
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +46,7 @@ def make_scenes(
     """
     if cfg.simulator != "bullet":
         return read_release(cfg, folder, workers, strict)
-    prefix = f"standin_{cfg.standin}-" if cfg.standin else ""
-    names = [prefix + format_scene_id(cfg.seed, index) for index in range(cfg.scenes)]
+    names = [scene_prefix(cfg) + format_scene_id(cfg.seed, k) for k in range(cfg.scenes)]
     scene_ids = split_scenes(cfg, names)
     split_of = {name: split for split, ids in scene_ids.items() for name in ids}
     paths = {name: scene_path(folder, name) for name in names}
@@ -57,6 +56,13 @@ def make_scenes(
     }
     workers.write_files(jobs, "simulating scenes", "scene")
     return scene_ids, {}
+
+
+def scene_prefix(cfg: BenchmarkConfig) -> str:
+    """Return the start of the ids of a benchmark's scenes, so that ids differ between worlds."""
+    if cfg.item_recipe != "dynapix":
+        return f"{suite_name(cfg)}-"
+    return "" if cfg.world.name == "clevrer" else f"{cfg.world.name}-"
 
 
 def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, list[Element]]:
@@ -87,17 +93,14 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
 
 def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> None:
     """Simulate a scene and, for counterfactual queries, the scene without one of its objects."""
-    if cfg.standin is not None:
-        save_scene(simulate_standin(path.stem, index, split, cfg), path)
-        return
-    bodies, motion = sample_bodies(cfg.seed, index, cfg)
-    scene = record_scene(path.stem, split, bodies, motion)
+    sample = sample_scene(cfg.world, cfg.seed, index)
+    scene = record_scene(path.stem, split, sample, cfg.world)
     if getattr(cfg.retrieval.counterfactual, split):
         removed = counterfactual.removed_object(scene, cfg.seed)
         if removed is not None:
             name = counterfactual.counterfactual_id(scene.scene_id, removed)
-            counterfactual_scene = simulate_without(name, split, bodies, removed)
-            save_scene(counterfactual_scene, path.with_name(f"{name}.npz"))
+            other = simulate_without(name, split, sample.bodies, removed, cfg.world)
+            save_scene(other, path.with_name(f"{name}.npz"))
     # This file is saved last, because it marks the job as done.
     save_scene(scene, path)
 

@@ -1,4 +1,4 @@
-"""Sizes of the objects, and intersections of rays with them."""
+"""Sizes of objects of scale 1, and intersections of rays with objects and boxes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from functools import reduce
 import numpy as np
 
 RADIUS = 0.2
-"""Radius of spheres and cylinders, and half the height of cylinders, simulator units. All objects
-of one shape have the same size, as in CLEVRER."""
+"""Radius of spheres and cylinders, and half the height of cylinders, simulator units. In the world
+of CLEVRER, all objects have scale 1."""
 CUBE_HALF = 0.18
 """Half of a cube's edge, simulator units."""
 BOUNDING_RADIUS = {"sphere": RADIUS, "cylinder": RADIUS * 2**0.5, "cube": CUBE_HALF * 3**0.5}
@@ -27,35 +27,72 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     )
 
 
-def intersect_rays(
-    shape: str, position: np.ndarray, quaternion: np.ndarray, eye: np.ndarray, rays: np.ndarray
+def half_height(shape: str, scale: float) -> float:
+    """Return half the height of an upright object, simulator units."""
+    return (CUBE_HALF if shape == "cube" else RADIUS) * scale
+
+
+def intersect_object(
+    shape: str,
+    scale: float,
+    position: np.ndarray,
+    quaternion: np.ndarray,
+    eye: np.ndarray,
+    rays: np.ndarray,
 ) -> np.ndarray:
     """Return each ray's parameter at its first intersection with an object, (P,); inf for none."""
-    to_local = rotation_matrix(quaternion)
-    origin = (eye - position) @ to_local
-    direction = rays @ to_local
+    if shape == "cube":
+        return intersect_box(np.full(3, CUBE_HALF * scale), position, quaternion, eye, rays)
+    radius = RADIUS * scale
+    origin, direction = _to_local(position, quaternion, eye, rays)
     with np.errstate(divide="ignore", invalid="ignore"):
         if shape == "sphere":
-            return _solve_quadric(origin, direction, 3)
-        if shape == "cube":
-            low, high = _slab(origin, direction, CUBE_HALF)
-            low, high = reduce(np.maximum, low.T), reduce(np.minimum, high.T)
-            return np.where((low <= high) & (low > 0), low, np.inf)
-        side = _solve_quadric(origin, direction, 2)
-        on_side = np.abs(origin[2] + side * direction[:, 2]) <= RADIUS
+            return _solve_quadric(origin, direction, 3, radius)
+        side = _solve_quadric(origin, direction, 2, radius)
+        on_side = np.abs(origin[2] + side * direction[:, 2]) <= radius
         side = np.where(on_side, side, np.inf)
-        cap = _slab(origin[2:], direction[:, 2:], RADIUS)[0][:, 0]
+        cap = _slab(origin[2:], direction[:, 2:], radius)[0][:, 0]
         across = origin[:2] + cap[:, None] * direction[:, :2]
-        on_cap = _squares(across) <= RADIUS**2
+        on_cap = _squares(across) <= radius**2
         return np.minimum(side, np.where(on_cap & (cap > 0), cap, np.inf))
 
 
-def _solve_quadric(origin: np.ndarray, direction: np.ndarray, axes: int) -> np.ndarray:
+def intersect_box(
+    half: np.ndarray,
+    position: np.ndarray,
+    quaternion: np.ndarray,
+    eye: np.ndarray,
+    rays: np.ndarray,
+) -> np.ndarray:
+    """Return each ray's parameter at its first intersection with a box, (P,); inf for none.
+
+    Args:
+        half: (3,) halves of the edges.
+        eye: (3,) origin of all rays, or (P, 3) origins.
+    """
+    origin, direction = _to_local(position, quaternion, eye, rays)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high = _slab(origin, direction, half)
+        low, high = reduce(np.maximum, low.T), reduce(np.minimum, high.T)
+        return np.where((low <= high) & (low > 0), low, np.inf)
+
+
+def _to_local(
+    position: np.ndarray, quaternion: np.ndarray, eye: np.ndarray, rays: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return origins and directions of rays in a body's own coordinates."""
+    to_local = rotation_matrix(quaternion)
+    return (eye - position) @ to_local, rays @ to_local
+
+
+def _solve_quadric(
+    origin: np.ndarray, direction: np.ndarray, axes: int, radius: float
+) -> np.ndarray:
     """Return the first intersection with a sphere (3 axes) or an infinite z cylinder (2 axes)."""
     o, d = origin[:axes], direction[:, :axes]
     a = _squares(d)
     b = d @ o
-    c = o @ o - RADIUS**2
+    c = o @ o - radius**2
     discriminant = b * b - a * c
     t = (-b - np.sqrt(np.maximum(discriminant, 0))) / a
     return np.where((discriminant > 0) & (t > 0), t, np.inf)
@@ -66,7 +103,9 @@ def _squares(vectors: np.ndarray) -> np.ndarray:
     return reduce(np.add, (vectors**2).T)
 
 
-def _slab(origin: np.ndarray, direction: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
+def _slab(
+    origin: np.ndarray, direction: np.ndarray, half: float | np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the ray parameters where rays enter and leave the region |x| <= half of each axis."""
     first, second = (-half - origin) / direction, (half - origin) / direction
     return np.minimum(first, second), np.maximum(first, second)

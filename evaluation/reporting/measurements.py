@@ -104,7 +104,7 @@ class Measurement:
     def is_transfer_suite(self) -> bool:
         """Whether the benchmark is a transfer suite, or a simulated stand-in for one."""
         benchmark = self.run.config.get("benchmark", {})
-        return bool({benchmark.get("simulator"), benchmark.get("standin")} & {*TRANSFER_SUITES})
+        return bool({benchmark.get("simulator"), benchmark.get("recipe")} & {*TRANSFER_SUITES})
 
     @property
     def row_key(self) -> tuple:

@@ -1,15 +1,24 @@
-"""Scenes that tests simulate, within the default limits on objects and collisions."""
+"""Scenes that tests simulate, by default in the world of CLEVRER."""
 
 from __future__ import annotations
 
-from conf.schema import BenchmarkConfig
+from conf.compose import compose
+from conf.schema import BuildCommand, WorldConfig
 from data.records import Scene
-from data.world.sampling import format_scene_id, record_scene, sample_bodies
+from data.world.sampling import format_scene_id, record_scene, sample_scene
 
-LIMITS = BenchmarkConfig(name="limits")
+CLEVRER = WorldConfig()
 
 
-def simulate_scene(seed: int, index: int) -> Scene:
+def preset_world(name: str) -> WorldConfig:
+    """The world of a preset in conf/world."""
+    recipe = f"standin_{name}" if name in ("movi_a", "physion") else "tiny"
+    return compose(
+        "data.build", BuildCommand, [f"benchmark={recipe}", f"world={name}"]
+    ).benchmark.world
+
+
+def simulate_scene(seed: int, index: int, world: WorldConfig = CLEVRER) -> Scene:
     """Simulate scene `index` of a seed; it is a training scene."""
-    bodies, motion = sample_bodies(seed, index, LIMITS)
-    return record_scene(format_scene_id(seed, index), "train", bodies, motion)
+    sample = sample_scene(world, seed, index)
+    return record_scene(format_scene_id(seed, index), "train", sample, world)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from conf.entry import Run
-from conf.schema import ExportCommand, StatisticsCommand
+from conf.schema import ExportCommand, StatisticsCommand, WorldConfig
 from data import export, statistics
 from data.publish.statistics import (
     BASELINES,
@@ -21,8 +21,8 @@ from data.publish.statistics import (
 )
 from tests.teacher import synthetic
 
-STANDARD = {"config": {"simulator": "bullet"}}
-"""A manifest of standard scenes."""
+STANDARD = {"config": {"simulator": "bullet", "world": asdict(WorldConfig())}}
+"""A manifest of scenes of the world of CLEVRER."""
 
 
 def synthetic_store(count: int = 24) -> tuple[list, SimpleNamespace]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from data.render import get_renderer
 from data.render.bullet import BulletRenderer
 from data.world.camera import Camera
 from data.world.displacement import frame_displacements, object_match_scores
-from tests.data.simulated import simulate_scene
+from tests.data.simulated import CLEVRER, simulate_scene
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ FRAMES = [0, 10, 15, 20, 60, 100]
 
 
 def test_visibility_agrees_with_bullets_mask(scene: Scene) -> None:
-    renderer = BulletRenderer(240, 160)  # renders at 480 x 320, the oracle's image size
+    renderer = BulletRenderer(240, 160, CLEVRER)  # renders at 480 x 320, the oracle's image size
     # These frames have objects out of view, fully visible and partly hidden.
     fractions = scene.visible_fraction[FRAMES]
     assert not scene.in_view[FRAMES].all()
@@ -69,8 +69,10 @@ def test_displacement_is_a_symmetric_distance(scene: Scene) -> None:
 
 
 def test_rendering_is_independent_of_the_previous_scene(scene: Scene) -> None:
-    first = BulletRenderer(192, 128).render(scene, 50).tobytes()
-    other = get_renderer("bullet", 192, 128)
+    first = BulletRenderer(192, 128, CLEVRER).render(scene, 50).tobytes()
+    other = get_renderer(
+        {"renderer": "bullet", "width": 192, "height": 128, "world": asdict(CLEVRER)}
+    )
     other.render(simulate_scene(0, 1), 3)
     assert other.render(scene, 50).tobytes() == first
 
@@ -91,7 +93,9 @@ def crop(appearance: SceneObject, place: tuple[float, float], yaw: float) -> np.
         f"{appearance}{place}{yaw}", "train", (appearance,), (), position, turn, none, none,
         none[..., :2], in_view, in_view.astype(np.float32),
     )  # fmt: skip
-    renderer = get_renderer("bullet", 192, 128)
+    renderer = get_renderer(
+        {"renderer": "bullet", "width": 192, "height": 128, "world": asdict(CLEVRER)}
+    )
     renderer.pose(scene, 0)
     pixels, mask = renderer.capture()
     is_object = (mask >= 0)[..., None]

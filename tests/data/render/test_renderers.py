@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,9 @@ from data.records import Scene
 from data.render import blender, get_renderer
 from data.render.bullet import BulletRenderer
 from data.render.floor import Floor
-from data.world.camera import STANDARD_VIEW
+from data.world.camera import Camera
 from tests.children import run_child
-from tests.data.simulated import simulate_scene
+from tests.data.simulated import CLEVRER, simulate_scene
 from tests.user_errors import raises_user_error
 
 
@@ -37,23 +38,25 @@ def test_versions_need_no_renderer_package() -> None:
 
 def test_shadow_is_confined_to_its_box() -> None:
     """Tested for objects on screen, at its edges, far away and behind the camera."""
-    floor = Floor(STANDARD_VIEW.camera.sized(192, 128), STANDARD_VIEW.light)
+    floor = Floor(Camera().sized(192, 128), CLEVRER)
     width, height = 192, 128
     rng = np.random.default_rng(0)
     for spread in (1.0, 3.0, 8.0):
         positions = rng.uniform(-spread, spread, (6, 3)).astype(np.float32)
         everywhere = np.tile([0, 0, width, height], (6, 1))
-        boxes = floor.shadow_boxes(positions)
-        shade = floor.shade(positions, boxes)
-        np.testing.assert_array_equal(shade, floor.shade(positions, everywhere))
+        scales = rng.uniform(0.5, 2.0, 6)
+        boxes = floor.shadow_boxes(positions, scales)
+        shade = floor.shade(positions, scales, boxes)
+        np.testing.assert_array_equal(shade, floor.shade(positions, scales, everywhere))
     middle = np.zeros((1, 3), np.float32)
-    darker = floor.shade(middle, floor.shadow_boxes(middle)) < floor.shade(middle[:0], boxes[:0])
+    lit = floor.shade(middle[:0], [], boxes[:0])
+    darker = floor.shade(middle, [1.0], floor.shadow_boxes(middle, [1.0])) < lit
     assert 0 < darker.mean() < 0.5
 
 
 def test_rendering_many_scenes_does_not_leak_memory(scene: Scene) -> None:
     others = [scene, *(simulate_scene(7, k) for k in (2, 3))]
-    renderer = BulletRenderer(48, 32)
+    renderer = BulletRenderer(48, 32, CLEVRER)
     used = []
     for _ in range(2):
         for k in range(30):
@@ -65,7 +68,7 @@ def test_rendering_many_scenes_does_not_leak_memory(scene: Scene) -> None:
 def test_blender_without_its_module_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(blender, "BPY", "0.0.0")
     with raises_user_error("missing-package", contains=("0.0.0", ".[blender]")):
-        get_renderer("blender", 48, 32)
+        get_renderer({"renderer": "blender", "width": 48, "height": 32, "world": asdict(CLEVRER)})
 
 
 def test_crash_of_blender_names_the_frame(
@@ -86,7 +89,7 @@ def test_crash_of_blender_names_the_frame(
     )
     monkeypatch.setattr(blender, "WORKER", dying)
     monkeypatch.setattr(blender, "version", lambda package: blender.BPY)
-    renderer = blender.BlenderRenderer(48, 32)
+    renderer = blender.BlenderRenderer(48, 32, CLEVRER)
     assert renderer.render(scene, 4).getpixel((0, 0)) == (255, 0, 0)
     with raises_user_error("renderer-failed", contains=(f"frame 5 of {scene.scene_id}", "memory")):
         renderer.render(scene, 5)

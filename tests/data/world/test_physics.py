@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from data.records import FPS, Scene, SceneObject
-from data.world.physics import STANDARD_PHYSICS, Body, _has_repeated, shared_simulator
-from data.world.sampling import record_scene, sample_bodies, simulate_without
+from data.world.physics import Body, _has_repeated, shared_simulator
+from data.world.sampling import record_scene, sample_scene, simulate_without
 from tests.children import run_child
-from tests.data.simulated import LIMITS, simulate_scene
+from tests.data.simulated import CLEVRER, simulate_scene
 
 CUBE = SceneObject("cube", "rubber", "red")
 
@@ -34,8 +34,10 @@ def test_scenes_are_bit_identical_in_another_process_and_order() -> None:
 
 
 def test_friction_decelerates_a_sliding_cube() -> None:
-    motion = shared_simulator().simulate([Body(CUBE, (0.0, 0.0), 0.0, (-2.0, 0.0))], frames=26)
-    seconds, deceleration = 25 / FPS, STANDARD_PHYSICS.friction_deceleration
+    motion = shared_simulator().simulate(
+        [Body(CUBE, (0.0, 0.0), 0.0, (-2.0, 0.0))], CLEVRER, frames=26
+    )
+    seconds, deceleration = 25 / FPS, CLEVRER.physics.friction_deceleration
     lost = 2.0 - np.linalg.norm(motion.velocities[25, 0])
     travelled = np.linalg.norm(motion.positions[25, 0] - motion.positions[0, 0])
     assert lost == pytest.approx(deceleration * seconds, rel=0.05)
@@ -48,7 +50,7 @@ def test_collision_of_two_spheres_conserves_momentum() -> None:
         Body(spheres[0], (0.0, -1.0), 0, (0.0, 2.0)),
         Body(spheres[1], (0.0, 0.0), 0, (0.0, 0.0)),
     ]
-    motion = shared_simulator().simulate(bodies, frames=40)
+    motion = shared_simulator().simulate(bodies, CLEVRER, frames=40)
     (hit,) = motion.collisions
     # The gap is 1 unit minus two radii of 0.2, and the speed is about 2 units per second.
     assert hit.frame / FPS == pytest.approx(0.6 / 2, abs=0.06)
@@ -65,8 +67,8 @@ def test_contacts_within_the_gap_are_one_collision() -> None:
 @pytest.mark.parametrize("index", range(4))
 def test_scenes_respect_the_limits(index: int) -> None:
     scene = simulate_scene(1, index)
-    assert LIMITS.min_objects <= len(scene.objects) <= LIMITS.max_objects
-    assert 1 <= len(scene.collisions) <= LIMITS.max_collisions
+    assert CLEVRER.objects.min_count <= len(scene.objects) <= CLEVRER.objects.max_count
+    assert 1 <= len(scene.collisions) <= CLEVRER.start.max_collisions
     pairs = [c.objects for c in scene.collisions]
     assert len(set(pairs)) == len(pairs)
     assert all(c.frame > 0 for c in scene.collisions)
@@ -74,10 +76,10 @@ def test_scenes_respect_the_limits(index: int) -> None:
 
 @pytest.mark.parametrize("index", range(4))
 def test_removing_an_object_does_not_affect_untouched_objects(index: int) -> None:
-    bodies, motion = sample_bodies(1, index, LIMITS)
-    factual = record_scene("factual", "train", bodies, motion)
+    sample = sample_scene(CLEVRER, 1, index)
+    factual = record_scene("factual", "train", sample, CLEVRER)
     for removed in range(len(factual.objects)):
-        other = simulate_without("other", "train", bodies, removed)
+        other = simulate_without("other", "train", sample.bodies, removed, CLEVRER)
         kept = [k for k in range(len(factual.objects)) if k != removed]
         reached = touched_by(factual, removed)
         for k, original in enumerate(kept):
@@ -111,7 +113,7 @@ def reached_in(scene: Scene, index: int, reached: dict[int, int], kept: list[int
 
 @pytest.mark.parametrize("index", range(6))
 def test_motion_of_objects_added_one_by_one_equals_a_joint_simulation(index: int) -> None:
-    bodies, motion = sample_bodies(11, index, LIMITS)
-    together = shared_simulator().simulate(bodies)
-    assert np.array_equal(together.states, motion.states)
-    assert together.collisions == motion.collisions
+    sample = sample_scene(CLEVRER, 11, index)
+    together = shared_simulator().simulate(sample.bodies, CLEVRER)
+    assert np.array_equal(together.states, sample.motion.states)
+    assert together.collisions == sample.motion.collisions

@@ -211,7 +211,7 @@ def test_results_on_a_benchmark_without_trained_models_are_transfer(runs, report
     assert "python -m data.build benchmark=elsewhere" in page
 
 
-@pytest.mark.parametrize("key", ["simulator", "standin"])
+@pytest.mark.parametrize("key", ["simulator", "recipe"])
 def test_a_base_on_a_transfer_suite_is_not_in_the_zero_shot_table(runs, key):
     config = runs / "select" / "base" / "config.yaml"
     settings = OmegaConf.load(config)
