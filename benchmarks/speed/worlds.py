@@ -1,0 +1,104 @@
+"""Measures how long scenes and frames of each world take, beside those of CLEVRER's world.
+
+    python -m benchmarks.speed.worlds --repeats 3 --sheet docs/worlds.webp
+
+Each repeat simulates the same numbers of scenes in every world and renders frames of them, in turn,
+in one process. The table has the medians of the CPU time: scenes per second, frames per second, and
+their ratios to the world `clevrer` of the same repeat. `--sheet` also draws the first scene of each
+world, at six moments.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from PIL import Image
+
+from conf.compose import compose, list_presets
+from conf.schema import BuildCommand, WorldConfig
+from data.records import Scene
+from data.render.bullet import BulletRenderer
+from data.world.sampling import record_scene, sample_scene
+
+SIZE = 240, 160
+"""Width and height of the rendered frames, px."""
+MOMENTS = 6
+"""Frames of a scene on the sheet."""
+RENDERED = 25
+"""Frames of a scene that are rendered for the measurement."""
+WORLDS = list_presets("data.build", BuildCommand)["world"]
+
+
+def preset_world(name: str) -> WorldConfig:
+    """Return the world of a preset. Its benchmark's recipe plays no part in the scenes."""
+    overrides = [f"world={name}", "benchmark=standin_movi_a"]
+    return compose("data.build", BuildCommand, overrides).benchmark.world
+
+
+def simulate(world: WorldConfig, scenes: int, seed: int) -> tuple[list[Scene], float]:
+    """Simulate scenes, and return them with the CPU seconds per scene."""
+    start = time.process_time()
+    simulated = [
+        record_scene(f"{world.name}-{k}", "train", sample_scene(world, seed, k), world)
+        for k in range(scenes)
+    ]
+    return simulated, (time.process_time() - start) / scenes
+
+
+def render(world: WorldConfig, scenes: list[Scene]) -> float:
+    """Render frames of scenes, and return the CPU seconds per frame."""
+    renderer = BulletRenderer(*SIZE, world)
+    start = time.process_time()
+    for scene in scenes:
+        for frame in moments(scene, RENDERED):
+            renderer.render(scene, frame)
+    return (time.process_time() - start) / (len(scenes) * RENDERED)
+
+
+def moments(scene: Scene, count: int) -> list[int]:
+    """Return the indices of evenly spaced frames."""
+    return np.linspace(0, scene.frames - 1, count).astype(int).tolist()
+
+
+def draw_sheet(path: Path, seed: int) -> None:
+    """Draw the first scene of each world, a row for each."""
+    rows = []
+    for name in WORLDS:
+        world = preset_world(name)
+        (scene,), _ = simulate(world, 1, seed)
+        renderer = BulletRenderer(*SIZE, world)
+        images = [renderer.render(scene, frame) for frame in moments(scene, MOMENTS)]
+        rows.append(np.concatenate([np.asarray(image) for image in images], axis=1))
+    Image.fromarray(np.concatenate(rows)).save(path, quality=80)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--sheet", type=Path)
+    args = parser.parse_args()
+    if args.sheet:
+        draw_sheet(args.sheet, args.seed)
+    measured = defaultdict(list)
+    for repeat in range(args.repeats):
+        seconds = {}
+        for name in WORLDS:
+            world = preset_world(name)
+            scenes, per_scene = simulate(world, args.scenes, args.seed + repeat)
+            seconds[name] = np.array([per_scene, render(world, scenes[:4])])
+        for name, pair in seconds.items():
+            measured[name].append([*1 / pair, *seconds["clevrer"] / pair])
+    columns = ["scenes/s", "frames/s", "scenes, ratio", "frames, ratio"]
+    medians = {name: np.median(values, axis=0) for name, values in measured.items()}
+    print(pd.DataFrame.from_dict(medians, "index", columns=columns).round(2).to_string())
+
+
+if __name__ == "__main__":
+    main()
