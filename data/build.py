@@ -37,7 +37,12 @@ from data.store import (
     with_checksum,
     write_atomically,
 )
-from data.tracks.build_items import family_quotas, item_families, make_items_and_queries
+from data.tracks.build_items import (
+    family_quotas,
+    item_families,
+    make_items_and_queries,
+    remove_unused_futures,
+)
 from data.tracks.retrieval import future
 from data.tracks.retrieval.database import make_databases
 from data.tracks.shortfalls import count_records, summarize_store
@@ -106,6 +111,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
             return
         scene_ids, invalid = make_scenes(cfg, partial, workers, strict)
         items, queries, dropped = make_items_and_queries(cfg, partial, scene_ids, workers)
+        remove_unused_futures(partial, items)
         scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(partial, name)))
         queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
         if not items and not queries:

@@ -29,6 +29,8 @@ COLORS = ("gray", "red", "blue", "green", "brown", "cyan", "purple", "yellow")
 POOLS = ("future", "counterfactual")
 SPLITS = ("train", "test")
 FAMILIES = ("event", "time", "window")
+COUNTERFACTUAL, ALTERNATIVE = "-without-", "-alt-"
+"""What follows the id of a scene in the ids of its counterfactuals and alternative futures."""
 
 
 @dataclass(frozen=True)
@@ -150,9 +152,15 @@ class FrameRef:
 @dataclass(frozen=True)
 class Candidate(FrameRef):
     """One of an item's four frames. `source` is `target` or the kind of distractor: same_offset,
-    same_obj_match, same_time, same_near, same_far or cross_scene."""
+    same_obj_match, same_time, same_near, same_far, cross_scene or alternative."""
 
     source: str = "target"
+
+
+def original_scene_id(scene_id: str) -> str:
+    """Return the id of the scene of which a scene is a counterfactual or an alternative future, or
+    of the scene itself."""
+    return scene_id.partition(COUNTERFACTUAL)[0].partition(ALTERNATIVE)[0]
 
 
 class Record:

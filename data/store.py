@@ -2,7 +2,8 @@
 
     store/<name>/
         manifest.json        settings, versions, counts, and the SHA-256 of scenes and tables
-        scenes/<id>.npz      the oracle of a scene; <id>-without-<k> is simulated without object k
+        scenes/<id>.npz      the oracle of a scene; <id>-without-<k> is simulated without object k,
+                             and <id>-alt-<...> is an alternative future
         selection.parquet retrieval.parquet database.parquet    tables of items, queries, frames
         frames/<id>.zip      cache of a scene's frames
         embeddings/          cache of embeddings of frames and queries

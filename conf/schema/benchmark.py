@@ -17,6 +17,7 @@ from conf.schema.world import WorldConfig
 
 RENDERERS = ("bullet", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
+DISTRACTORS = ("paper", "balanced")
 RECIPES = ("dynapix", "movi_a", "physion")
 WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
 """Window families of each group (see `data.tracks.selection.window`). B needs a later collision."""
@@ -90,6 +91,9 @@ class BenchmarkConfig(Settings):
     recipe: str | None = setting(None, (*RECIPES, None))
     """How items are made: as the paper does it for CLEVRER (dynapix), for MoVi-A (movi_a) or for
     Physion (physion). null takes the recipe of `simulator`; that of bullet is dynapix."""
+    distractors: str = setting("paper", DISTRACTORS)
+    """Distractors of selection items: as in the paper (paper), or frames of other futures of the
+    scene, chosen so that only a prediction of its motion reveals the target (balanced)."""
     folder: str | None = None
     """Folder of the release, if `simulator` reads one."""
     fps: float = setting(30.0, above=0)
@@ -148,6 +152,11 @@ class BenchmarkConfig(Settings):
                 f"{group}world.physics.frames={physics.frames} and {group}world.physics.fps="
                 f"{physics.fps}: the recipe dynapix needs {SCENE_FRAMES} frames at {SCENE_FPS} per "
                 f"second; set them, or set {group}recipe=movi_a or physion"
+            )
+        if self.distractors == "balanced" and (recipe != "dynapix" or self.simulator != "bullet"):
+            yield (
+                f"{group}distractors=balanced with {simulator} and {group}recipe={recipe}: other "
+                f"futures are simulated; set {group}simulator=bullet and {group}recipe=dynapix"
             )
         if recipe != "dynapix":
             if any(quota.train + quota.test for quota in self.retrieval.builders.values()):

@@ -8,7 +8,14 @@ from dataclasses import dataclass
 
 from PIL import Image
 
-from data.records import LETTERS, FrameRef, RetrievalQuery, SelectionItem, sample_prefix_frames
+from data.records import (
+    LETTERS,
+    FrameRef,
+    RetrievalQuery,
+    SelectionItem,
+    original_scene_id,
+    sample_prefix_frames,
+)
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from data.tracks.retrieval.counterfactual import removal_displacement
@@ -153,6 +160,6 @@ def _describe_frame(record: SelectionItem | RetrievalQuery, frame: FrameRef) -> 
     The offset is omitted if the frame belongs to another scene; the scene's counterfactual counts
     as the same scene.
     """
-    is_same_scene = frame.scene_id.partition("-without-")[0] == record.scene_id
+    is_same_scene = original_scene_id(frame.scene_id) == record.scene_id
     offset = frame.frame - record.prefix_stop
     return f"frame {frame.frame}" + (f" ({offset:+d})" if is_same_scene else "")

@@ -7,11 +7,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from tqdm import tqdm
 
 from data.records import FAMILIES, LETTERS, SPLITS, SelectionItem
 from data.store import Store
+from data.tracks import shortcuts
 from data.tracks.baselines import BASELINES, score_baselines
 from data.world.displacement import cross_scene_displacement
+
+LOGISTIC = "logistic model of all scores"
 
 
 def compute_statistics(store: Store) -> dict[str, Any]:
@@ -21,7 +25,8 @@ def compute_statistics(store: Store) -> dict[str, Any]:
         ``scenes``: distributions of objects, collisions and event frames. ``answers``: items by
         letter. ``cells``: items and quotas by family, window group and subtype. ``candidates``:
         median displacements, and items by number of distractors earlier than the target, by
-        category. ``baselines``: accuracies by category. A category is a family, a kind of
+        category. ``baselines``: accuracies by category. ``shortcuts``: accuracies of the strategies
+        of `data.tracks.shortcuts` on the test split, by category. A category is a family, a kind of
         distractors in the event family, or a difficulty in the window family.
     """
     items = store.selection()
@@ -38,8 +43,28 @@ def compute_statistics(store: Store) -> dict[str, Any]:
         "answers": rows["letter"].value_counts().reindex(list(LETTERS), fill_value=0).to_dict(),
         "cells": count_cells(items, store.manifest["config"]["selection"]),
         "candidates": candidates.fillna(0).to_dict("index"),
-        "baselines": baselines.astype(object).where(baselines.notna(), None).to_dict("index"),
+        "baselines": _without_nan(baselines),
+        "shortcuts": _without_nan(measure_shortcuts(items, store)),
     }
+
+
+def measure_shortcuts(items: list[SelectionItem], store: Store) -> pd.DataFrame:
+    """Return the accuracy of each shortcut on the items of the test split, by category."""
+    progress = tqdm(items, desc="scoring shortcuts", unit="item", disable=None)
+    scores = np.stack([shortcuts.item_scores(item, store) for item in progress])
+    answers = np.array([item.answer for item in items])
+    right = pd.DataFrame(
+        shortcuts.simple_accuracies(scores, answers), columns=list(shortcuts.SIMPLE)
+    )
+    right[LOGISTIC] = shortcuts.logistic_accuracies(items, scores, answers)
+    right["category"] = [list(_categories(item)) for item in items]
+    test = right[[item.split == "test" for item in items]]
+    categories = test.explode("category").groupby("category")
+    return categories[[*shortcuts.SIMPLE, LOGISTIC]].mean().assign(items=categories.size())
+
+
+def _without_nan(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    return table.astype(object).where(table.notna(), None).to_dict("index")
 
 
 def describe_scenes(store: Store) -> dict[str, Any]:
@@ -114,12 +139,22 @@ def format_statistics(statistics: dict[str, Any]) -> str:
         f"Answers:              {_join(statistics['answers'])}",
         "Accuracy of baselines without prediction, %\n"
         + baselines.astype({"items": int}).to_string(float_format="{:.1f}".format, na_rep="-"),
+        "Accuracy of shortcuts on the test split, %\n" + format_shortcuts(statistics["shortcuts"]),
         "Candidates: median displacement in px from the target to the nearest distractor and\n"
         "between any two candidates; items by number of distractors earlier than the target\n"
         + candidates.to_string(),
         "Items and quotas\n" + cells.to_string(),
     ]
     return "\n\n".join(sections)
+
+
+def format_shortcuts(shortcuts: dict[str, dict[str, Any]]) -> str:
+    """Format accuracies as a table with a row for each strategy, and a column for each family and
+    each difficulty."""
+    columns = [name for name in shortcuts if not name.startswith("event, ")]
+    table = pd.DataFrame(shortcuts)[columns].astype(float)
+    table.loc[table.index != "items"] *= 100
+    return table.to_string(float_format="{:.1f}".format, na_rep="-")
 
 
 def _join(counts: dict[str, int]) -> str:

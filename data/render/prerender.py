@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from data.parallel import Workers
-from data.records import POOLS, sample_prefix_frames
+from data.records import POOLS, original_scene_id, sample_prefix_frames
 from data.render.frame_cache import frames_path, load_frames, render_frames, save_frames
 from data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path, write_atomically
 from data.tracks.controls import MATCHED_ANCHOR
@@ -74,7 +74,7 @@ def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:
         for scene in (*store.scene_ids("test"), *store.scene_ids("train")):
             frames[scene].update(range(store.scene(scene).frames))
     test = set(store.scene_ids("test"))
-    order = sorted(frames, key=lambda scene: (scene.split("-without-")[0] not in test, scene))
+    order = sorted(frames, key=lambda scene: (original_scene_id(scene) not in test, scene))
     return {scene: sorted(frames[scene]) for scene in order}
 
 

@@ -11,17 +11,24 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import asdict, astuple
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, astuple, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 from conf.schema import BenchmarkConfig, Quota
 from data.parallel import Workers
-from data.records import FAMILIES, RetrievalQuery, Scene, SelectionItem
+from data.records import ALTERNATIVE, FAMILIES, RetrievalQuery, Scene, SelectionItem
 from data.releases.transfer_suites import TRANSFER_SUITES, suite_name
-from data.store import load_scene, part_path, scene_path, write_atomically
+from data.store import (
+    SCENES_FOLDER,
+    load_scene,
+    part_path,
+    save_scene,
+    scene_path,
+    write_atomically,
+)
 from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.retrieval import counterfactual, future
@@ -53,7 +60,7 @@ def make_items_and_queries(
         train, test = (math.ceil(QUERY_RESERVE * n) for n in astuple(quotas[name]))
         quotas[name] = Quota(train, test)
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
-    inputs = [GENERATOR_VERSION, BUILDERS_VERSION, scene_ids, *settings]
+    inputs = [GENERATOR_VERSION, BUILDERS_VERSION, scene_ids, cfg.distractors, *settings]
     paths = {
         name: part_path(folder, [*inputs, name, asdict(quota)]) for name, quota in quotas.items()
     }
@@ -115,6 +122,19 @@ def _load(folder: Path, scene_id: str) -> Scene:
     return load_scene(scene_path(folder, scene_id))
 
 
+def _save(folder: Path, scene: Scene) -> None:
+    save_scene(scene, scene_path(folder, scene.scene_id))
+
+
+def remove_unused_futures(folder: Path, items: Iterable[SelectionItem]) -> None:
+    """Delete the alternative futures below `folder` to which no item refers, such as those of a
+    killed build with other quotas."""
+    used = {candidate.scene_id for item in items for candidate in item.candidates}
+    for path in (folder / SCENES_FOLDER).glob(f"*{ALTERNATIVE}*.npz"):
+        if path.stem not in used:
+            path.unlink()
+
+
 def _run_job(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> None:
     group, _, subtype = name.partition("/")
     if group == MATCHED_ANCHOR:
@@ -124,6 +144,8 @@ def _run_job(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> N
     elif _is_query_cell(group):
         made, dropped = future.make_queries(int(group.split()[1]), cell)
     else:
+        if cfg.distractors == "balanced":
+            cell = replace(cell, world=cfg.world, save=partial(_save, path.parents[1]))
         made, dropped = fill_quota(subtype, item_families(cfg)[group], cell)
     part: dict[str, Any] = {"rows": [row.to_row() for row in made], "dropped": dropped}
     write_atomically(path, json.dumps(part).encode())

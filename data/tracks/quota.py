@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from data.records import SPLITS, Scene, SelectionItem
+from data.tracks.selection.balanced import BalancedPicker, Picker
 from data.tracks.selection.distractors import DistractorPicker, Family
 
 if TYPE_CHECKING:
-    from conf.schema import Quota
+    from conf.schema import Quota, WorldConfig
 
 Element = TypeVar("Element")
 
@@ -29,6 +30,8 @@ class CellInputs:
         scene_of: Function that loads a scene by its id.
         min_displacement: Minimum displacement between two candidates, px at 336 x 336.
         hard_negatives: Number of hard negatives of a query.
+        world: The world of the scenes, if the items are balanced.
+        save: Function that stores an alternative future of a balanced item.
     """
 
     scene_ids: dict[str, list[str]]
@@ -37,6 +40,14 @@ class CellInputs:
     seed: int
     min_displacement: float
     hard_negatives: int = 0
+    world: WorldConfig | None = None
+    save: Callable[[Scene], None] | None = None
+
+    def make_picker(self, split: str, rng: np.random.Generator) -> Picker:
+        """Return the picker of distractors for the items of a split."""
+        if self.world is not None:
+            return BalancedPicker(self.min_displacement, self.world, rng, self.save)
+        return DistractorPicker(self.min_displacement, self.scene_ids[split], self.scene_of)
 
 
 def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[SelectionItem], int]:
@@ -46,13 +57,13 @@ def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[Sel
 
     Returns:
         The items of each split up to its quota, and the number of timings that were dropped because
-        fewer than three distractors differ enough.
+        no three distractors are suitable.
     """
     items, dropped = [], 0
     for split in SPLITS:
         scene_ids = cell.scene_ids[split]
-        picker = DistractorPicker(cell.min_displacement, scene_ids, cell.scene_of)
         rng = named_rng(cell.seed, subtype, split)
+        picker = cell.make_picker(split, rng)
         made: list[SelectionItem] = []
         for index in rng.permutation(len(scene_ids)):
             if len(made) == getattr(cell.quota, split):

@@ -120,18 +120,19 @@ class Simulator:
         Args:
             frames: Number of frames; that of the world by default.
         """
-        frames = world.physics.frames if frames is None else frames
-        fixed, handles = self._place(bodies, world)
-        recorded = np.zeros((frames, len(bodies), 13))
-        recorded[0] = self._state(handles)
-        parts = fixed[1:]
+        fixed = self._reset(world)
+        handles = [self._add_body(body, world) for body in bodies]
         if any(
             self._bullet.getClosestPoints(a, b, TOUCHING)
-            for a, b in chain(combinations(handles, 2), product(handles, parts))
+            for a, b in chain(combinations(handles, 2), product(handles, fixed[1:]))
         ):
-            return Motion(recorded[:1], (), repeated_pair=False, touching_at_start=True)
-        contacts: dict[tuple[int, int], list[int]] = defaultdict(list)
+            states = self._state(handles)[None]
+            return Motion(states, (), repeated_pair=False, touching_at_start=True)
+        frames = frames or world.physics.frames
+        recorded = np.zeros((frames, len(bodies), 13))
+        recorded[0] = self._state(handles)
         in_air = {k for k, body in enumerate(bodies) if body.height is not None}
+        contacts: dict[tuple[int, int], list[int]] = defaultdict(list)
         landings = []
         for frame in range(1, frames):
             # Bullet also lists points of pairs that have separated; contacts have a normal force.
@@ -157,12 +158,48 @@ class Simulator:
             landings=tuple(landings),
         )
 
-    def _place(self, bodies: Sequence[Body], world: WorldConfig) -> tuple[list[int], list[int]]:
-        """Empty Bullet's world, and add the floor, the parts and the bodies.
+    def branch(
+        self,
+        objects: Sequence[SceneObject],
+        scales: Sequence[float],
+        states: np.ndarray,
+        velocities: np.ndarray,
+        world: WorldConfig,
+        frames: int,
+    ) -> np.ndarray:
+        """Simulate objects from one state with several choices of their velocities.
+
+        Args:
+            states: (N, 13) states of the objects, such as those at a frame of a scene.
+            velocities: (K, N, 6) linear and angular velocities of each branch, instead of those in
+                `states`.
+            frames: Number of frames, of which the first has the given state.
 
         Returns:
-            Handles of the floor and the parts, and handles of the bodies.
+            (K, frames, N, 13) states, bit-identical for equal arguments. A branch with the
+            velocities of `states` is close to an uninterrupted simulation, but not equal, because
+            Bullet keeps contacts from step to step.
         """
+        self._reset(world)
+        handles = [
+            self._add(*each, world) for each in zip(objects, scales, states.tolist(), strict=True)
+        ]
+        start = self._bullet.saveState()
+        recorded = np.zeros((len(velocities), frames, len(handles), 13))
+        for branch, own in zip(recorded, velocities.tolist(), strict=True):
+            self._bullet.restoreState(start)
+            for handle, velocity in zip(handles, own, strict=True):
+                self._bullet.resetBaseVelocity(handle, velocity[:3], velocity[3:])
+            branch[0] = self._state(handles)
+            for frame in range(1, frames):
+                for _ in range(world.physics.substeps):
+                    self._bullet.stepSimulation()
+                branch[frame] = self._state(handles)
+        self._bullet.removeState(start)
+        return recorded
+
+    def _reset(self, world: WorldConfig) -> list[int]:
+        """Empty Bullet's world, add the floor and the parts, and return their handles."""
         bullet, physics = self._bullet, world.physics
         bullet.resetSimulation()
         bullet.setGravity(0, 0, -physics.gravity)
@@ -181,8 +218,7 @@ class Simulator:
             lateralFriction=physics.floor_friction,
             restitution=physics.floor_restitution,
         )
-        fixed = [floor, *(self._add_part(part) for part in world.parts.values())]
-        return fixed, [self._add(body, world) for body in bodies]
+        return [floor, *(self._add_part(part) for part in world.parts.values())]
 
     def _add_part(self, part: PartConfig) -> int:
         bullet, box = self._bullet, part_box(part)
@@ -193,10 +229,20 @@ class Simulator:
         )
         return handle
 
-    def _add(self, body: Body, world: WorldConfig) -> int:
-        bullet, scale, physics = self._bullet, body.scale, world.physics
-        shape, material = body.object.shape, body.object.material
-        height = half_height(shape, scale) if body.height is None else body.height
+    def _add_body(self, body: Body, world: WorldConfig) -> int:
+        height = body.height
+        if height is None:
+            height = half_height(body.object.shape, body.scale)
+        turn = self._bullet.getQuaternionFromEuler([0, 0, body.yaw])
+        state = [*body.position, height, *turn, *body.velocity, 0.0, 0.0, 0.0, 0.0]
+        return self._add(body.object, body.scale, state, world)
+
+    def _add(
+        self, scene_object: SceneObject, scale: float, state: Sequence[float], world: WorldConfig
+    ) -> int:
+        """Add an object with a state (13,), and return its handle."""
+        bullet, physics = self._bullet, world.physics
+        shape, material = scene_object.shape, scene_object.material
         radius = RADIUS * scale
         sizes = {
             "sphere": (bullet.GEOM_SPHERE, {"radius": radius}),
@@ -205,9 +251,8 @@ class Simulator:
         }
         kind, size = sizes[shape]
         form = bullet.createCollisionShape(kind, **size)
-        turn = bullet.getQuaternionFromEuler([0, 0, body.yaw])
         mass = getattr(world.objects.mass, material) * scale**3
-        handle = bullet.createMultiBody(mass, form, -1, [*body.position, height], turn)
+        handle = bullet.createMultiBody(mass, form, -1, state[:3], state[3:7])
         bullet.changeDynamics(
             handle,
             -1,
@@ -218,10 +263,10 @@ class Simulator:
             linearDamping=0,
             angularDamping=0,
         )
-        bullet.resetBaseVelocity(handle, [*body.velocity, 0.0], [0, 0, 0])
+        bullet.resetBaseVelocity(handle, state[7:10], state[10:13])
         return handle
 
-    def _state(self, handles: list[int]) -> np.ndarray:
+    def _state(self, handles: Sequence[int]) -> np.ndarray:
         pose, velocity = self._bullet.getBasePositionAndOrientation, self._bullet.getBaseVelocity
         return np.array([list(chain(*pose(k), *velocity(k))) for k in handles])
 

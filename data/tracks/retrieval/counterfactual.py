@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from data.records import FPS, FrameRef, RetrievalQuery, Scene
+from data.records import COUNTERFACTUAL, FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.quota import CellInputs, named_rng
 from data.tracks.retrieval.queries import fill_query_quota
 from data.tracks.selection.time import spell_seconds
@@ -35,7 +35,7 @@ def removed_object(scene: Scene, seed: int) -> int | None:
 
 def counterfactual_id(scene_id: str, removed: int) -> str:
     """Return the id of the counterfactual scene without object `removed`."""
-    return f"{scene_id}-without-{removed}"
+    return f"{scene_id}{COUNTERFACTUAL}{removed}"
 
 
 def _prefix_stop(scene: Scene, removed: int) -> int | None:

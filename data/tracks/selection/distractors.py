@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, islice
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -69,6 +69,8 @@ class DistractorPicker:
     scene_ids: list[str]
     scene_of: Callable[[str], Scene]
     dropped: int = 0
+    uses_pools: ClassVar[bool] = True
+    """Whether `make_item` chooses distractors from the pools that families prepare."""
 
     def make_item(
         self,

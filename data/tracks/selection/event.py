@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from data.records import Candidate, Scene, SelectionItem
+from data.tracks.selection.balanced import Picker
 from data.tracks.selection.distractors import (
-    DistractorPicker,
     Family,
     Timing,
     balance_in_time,
@@ -67,11 +67,13 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 
 
 def make_item(
-    subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: DistractorPicker
+    subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: Picker
 ) -> SelectionItem | None:
     """Make an item of a cell around a collision."""
     cell = CELLS[subtype]
-    if cell.distractors == "cross_scene":
+    if not picker.uses_pools:
+        pools = []
+    elif cell.distractors == "cross_scene":
         scenes = picker.sample_scenes(scene, rng, CROSS_SCENES)
         targets = ((other, [t.target for t in timings(subtype, other)]) for other in scenes)
         pools = [((Candidate(o.scene_id, t[0], "cross_scene") for o, t in targets if t), 3)]

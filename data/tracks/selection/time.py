@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from data.records import SELECTION_SECOND, Scene, SelectionItem
+from data.tracks.selection.balanced import Picker
 from data.tracks.selection.distractors import (
-    DistractorPicker,
     Family,
     Timing,
     balance_in_time,
@@ -35,7 +35,7 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 
 
 def make_item(
-    subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: DistractorPicker
+    subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: Picker
 ) -> SelectionItem | None:
     """Make an item whose distractors are other frames after the prefix.
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from conf.schema.benchmark import WINDOW_DIFFICULTIES, WINDOW_FAMILIES, WINDOW_HORIZONS
 from data.records import Scene, SelectionItem
+from data.tracks.selection.balanced import Picker
 from data.tracks.selection.distractors import (
-    DistractorPicker,
     Family,
     Timing,
     balance_in_time,
@@ -54,7 +54,7 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 
 
 def make_item(
-    subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: DistractorPicker
+    subtype: str, scene: Scene, timing: Timing, rng: np.random.Generator, picker: Picker
 ) -> SelectionItem | None:
     """Make an item at a timing. Returns None also if the timing belongs to another group, or if no
     object of `subject_objects` is on screen in the prefix."""

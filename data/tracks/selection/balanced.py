@@ -1,0 +1,227 @@
+"""Makes selection items that only a prediction solves: distractors are alternative futures.
+
+The candidates are the target and frames of other futures of the scene (`data.tracks.selection.
+futures`), chosen so that no score without prediction reveals the target (`data.tracks.selection.
+balance`). In the time family, two candidates show the right moment and two a wrong one, and two
+show the scene's own future and two another one.
+
+A subtype keeps the question, prefix and target of its cell. The distractors of the cells named
+`match` and of hard items are those nearest to the target; those of the cells named `cross` and of
+easy items are the farthest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
+from data.render import get_renderer
+from data.tracks.selection.balance import SCORES, Balance, Pool
+from data.tracks.selection.distractors import DistractorPicker, Timing
+from data.tracks.selection.futures import (
+    alternative_scene,
+    moving_objects,
+    sample_velocities,
+    scene_states,
+    scene_with_states,
+    simulate_futures,
+)
+from data.world.displacement import frame_displacements
+
+if TYPE_CHECKING:
+    from conf.schema import WorldConfig
+
+FUTURES = {"event": 10, "time": 8, "window": 12}
+"""Number of alternative futures from which the distractors of an item are chosen, by family."""
+NEAREST = {"same_obj_match": True, "same_near": True, "cross_scene": False, "same_far": False}
+"""Whether the distractors of a balanced item are the nearest to the target or the farthest, by the
+distractors that the cell has in the paper's recipe."""
+TRIES = 3
+"""Number of timings of a scene for which futures are simulated in one cell."""
+IMAGE_SIZE = 72, 48
+"""Width and height in px of the images that are compared by pixels."""
+EARLIEST = 5
+"""Minimum number of frames between the prefix and a wrong moment."""
+
+
+@dataclass
+class BalancedPicker:
+    """Makes the balanced items of one cell and one split.
+
+    Attributes:
+        min_displacement: Between any two candidates, the position of at least one object must
+            differ by this many px at 336 x 336.
+        save: Function that stores an alternative future.
+        dropped: Number of timings for which no choice of distractors was suitable.
+    """
+
+    min_displacement: float
+    world: WorldConfig
+    rng: np.random.Generator
+    save: Callable[[Scene], None]
+    dropped: int = 0
+    balance: Balance = field(init=False)
+    uses_pools: ClassVar[bool] = False
+    _tries: tuple[str, int] = ("", 0)
+
+    def __post_init__(self) -> None:
+        self.balance = Balance(self.rng)
+
+    def make_item(
+        self,
+        scene: Scene,
+        timing: Timing,
+        _pools: object,
+        about: tuple[int, ...] | None = None,
+        *,
+        family: str,
+        subtype: str,
+        suite: str = "dynapix",
+        distractors: str,
+        **fields: Any,
+    ) -> SelectionItem | None:
+        """Make an item whose first candidate is the target, or None if no choice is suitable.
+
+        Args:
+            about: Indices of the objects that may move differently and whose positions count.
+            distractors: The distractors of the paper's recipe, a key of `NEAREST` or another.
+            fields: The question, and the other fields of the item that apply to its family.
+        """
+        moving = self._moving(scene, timing, about or ())
+        if not moving:
+            return None
+        moments = [timing.target]
+        if family == "time":
+            moments += self._wrong_moment(scene, timing, about)
+            if len(moments) == 1:
+                return self._drop()
+        velocities = sample_velocities(
+            scene,
+            timing.stop,
+            moving,
+            FUTURES[family],
+            self.balance.rarest_rank("nearness"),
+            self.rng,
+        )
+        futures = simulate_futures(scene, timing.stop, max(moments), velocities, self.world)
+        # Frames of the pool: the last observed one, the target, the scene's own future at the wrong
+        # moment, and the alternative futures at each moment.
+        own = scene_states(scene)[[timing.stop, *moments]]
+        others = [futures[:, moment - timing.stop] for moment in moments]
+        name = f"{scene.scene_id}{ALTERNATIVE}{subtype}-{timing.stop}"
+        frames = scene_with_states(scene, name, np.concatenate([own, *others]), self.world)
+        moment_of = [timing.stop, *moments, *np.repeat(moments, len(futures))]
+        choices = _choices(len(moments), len(futures))
+        displacement = frame_displacements(frames, about)
+        choices = _distinct(choices, displacement, self.min_displacement)
+        choices = _of_difficulty(choices, displacement, NEAREST.get(distractors))
+        if not len(choices):
+            return self._drop()
+        pool = Pool.of(frames, self._render(frames), np.array(moment_of))
+        best = self.balance.choose(pool.scores(choices))
+        if best is None:
+            return self._drop()
+        chosen = choices[best]
+        candidates = []
+        for frame in chosen.tolist():
+            moment = int(moment_of[frame])
+            if frame <= len(moments):
+                source = "target" if frame == 1 else "same_time"
+                candidates.append(Candidate(scene.scene_id, moment, source))
+                continue
+            index = (frame - 1 - len(moments)) % len(futures)
+            other = f"{name}-{index}"
+            self.save(alternative_scene(scene, other, timing.stop, futures[index], self.world))
+            candidates.append(Candidate(other, moment, "alternative"))
+        pairs = frame_displacements(frames)[np.ix_(chosen, chosen)]
+        return SelectionItem(
+            item_id=f"{family}-{subtype}-{scene.scene_id}-{timing.target}",
+            split=scene.split,
+            suite=suite,
+            family=family,
+            subtype=subtype,
+            scene_id=scene.scene_id,
+            prefix_start=timing.start,
+            prefix_stop=timing.stop,
+            target_frame=timing.target,
+            event_frame=timing.event,
+            distractors="alternative",
+            candidates=tuple(candidates),
+            answer=0,
+            min_displacement=float(pairs[np.triu_indices(4, 1)].min()),
+            **fields,
+        )
+
+    def _moving(self, scene: Scene, timing: Timing, about: tuple[int, ...]) -> list[int]:
+        """Return the objects of `about` whose other velocities may give an item: they move at the
+        end of the prefix, and visibly until the target. Return none after `TRIES` timings."""
+        shift = frame_displacements(scene, about)[timing.stop, timing.target]
+        moving = moving_objects(scene, timing.stop, about)
+        if not moving or shift < self.min_displacement:
+            return []
+        tried, tries = self._tries
+        self._tries = scene.scene_id, tries + 1 if tried == scene.scene_id else 1
+        return moving if self._tries[1] <= TRIES else []
+
+    def _drop(self) -> None:
+        self.dropped += 1
+
+    def _wrong_moment(self, scene: Scene, timing: Timing, about: tuple[int, ...]) -> list[int]:
+        """Sample a moment after the prefix that differs visibly from the target, on the side of the
+        target that balances its rank in time; return an empty list if there is none."""
+        moments = np.arange(timing.stop + EARLIEST, scene.frames)
+        differs = frame_displacements(scene, about)[timing.target, moments]
+        moments = moments[differs >= self.min_displacement]
+        counts = self.balance.counts[SCORES.index("moment")]
+        is_earlier = moments < timing.target
+        side = moments[is_earlier if counts[0] >= counts[3] else ~is_earlier]
+        return [int(self.rng.choice(side))] if len(side) else []
+
+    def _render(self, frames: Scene) -> np.ndarray:
+        """Render all frames of a scene as small images, (M, H, W, 3) uint8."""
+        width, height = IMAGE_SIZE
+        size = {"renderer": "bullet", "width": width, "height": height}
+        renderer = get_renderer({**size, "world": asdict(self.world)})
+        return np.stack([np.asarray(renderer.render(frames, k)) for k in range(frames.frames)])
+
+
+Picker = DistractorPicker | BalancedPicker
+
+
+def _choices(moments: int, futures: int) -> np.ndarray:
+    """Return all choices of candidates (T, 4) as indices of frames of the pool; the first is the
+    target.
+
+    With two moments, a choice contains each of the scene's own and of another future at each of the
+    moments.
+    """
+    first = 1 + moments
+    if moments == 1:
+        triples = list(combinations(range(first, first + futures), 3))
+        return np.array([[1, *triple] for triple in triples])
+    pairs = product(range(futures), repeat=2)
+    return np.array([[1, 2, first + i, first + futures + j] for i, j in pairs])
+
+
+def _distinct(choices: np.ndarray, displacement: np.ndarray, least: float) -> np.ndarray:
+    """Return the choices whose candidates all differ by at least `least` px."""
+    pairs = displacement[choices[:, :, None], choices[:, None, :]]
+    pairs[:, np.arange(4), np.arange(4)] = np.inf
+    return choices[pairs.min(axis=(1, 2)) >= least]
+
+
+def _of_difficulty(
+    choices: np.ndarray, displacement: np.ndarray, nearest: bool | None
+) -> np.ndarray:
+    """Return the half of the choices whose distractors are nearer to the target, or the other half;
+    all choices if `nearest` is None."""
+    if nearest is None or len(choices) < 2:
+        return choices
+    order = np.argsort(displacement[1, choices[:, 1:]].max(axis=-1), kind="stable")
+    half = (len(choices) + 1) // 2
+    return choices[np.sort(order[:half] if nearest else order[-half:])]

@@ -1,0 +1,147 @@
+"""Shortcuts: strategies that answer selection items without predicting the motion.
+
+A simple strategy chooses the candidate with the lowest or the highest value of one score (see
+`data.tracks.selection.balance.SCORES`). A logistic model combines all scores; it is trained on the
+items of the training split, for each family.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image
+
+from data.records import FrameRef, Scene, SelectionItem
+from data.render.frame_cache import render_frames
+from data.store import Store
+from data.tracks.selection.balance import SCORES, rank_shares
+from data.tracks.selection.balanced import IMAGE_SIZE
+from data.world.displacement import DIAGONAL, cross_scene_displacement, visible_positions
+
+SIMPLE = tuple(f"{score}, {end}" for score in SCORES for end in ("lowest", "highest"))
+"""Names of the simple strategies."""
+PENALTY = 1e-2
+"""Weight of the squared coefficients in the loss of the logistic model."""
+
+
+def item_scores(item: SelectionItem, store: Store) -> np.ndarray:
+    """Return the scores (S, 4) of an item's candidates, in the order of `SCORES`."""
+    last = FrameRef(item.scene_id, item.prefix_stop)
+    frames = [last, *item.candidates]
+    states = [(store.scene(f.scene_id), f.frame) for f in frames]
+    displacement = np.array([[cross_scene_displacement(*a, *b) for b in states] for a in states])
+    images = np.stack([_small_image(frame, store) for frame in frames]).astype(np.float32)
+    flat = images.reshape(len(images), -1)
+    pixels = np.abs(flat[:, None] - flat[None]).mean(axis=-1)
+    visible = [visible_positions(scene)[1][frame].sum() for scene, frame in states[1:]]
+    return np.array(
+        [
+            displacement[0, 1:],
+            pixels[0, 1:],
+            displacement[1:, 1:].sum(axis=-1),
+            pixels[1:, 1:].sum(axis=-1),
+            [candidate.frame for candidate in item.candidates],
+            [_travel(*states[0], *state) for state in states[1:]],
+            visible,
+        ],
+        dtype=float,
+    )
+
+
+def _small_image(frame: FrameRef, store: Store) -> np.ndarray:
+    """Return a frame as a small (H, W, 3) image, rendered by Bullet if its scene was simulated."""
+    width, height = IMAGE_SIZE
+    small = {"renderer": "bullet", "width": width, "height": height}
+    scene = store.scene(frame.scene_id)
+    pixels = render_frames(scene, [frame.frame], store.manifest["config"] | small)[frame.frame]
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    return np.asarray(Image.fromarray(pixels).resize(IMAGE_SIZE))
+
+
+def _travel(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:
+    """Return the sum of the displacements of all objects between frames of two scenes, px at
+    336 x 336. An object that one scene lacks counts with the image's diagonal."""
+    positions, visible = (array[frame] for array in visible_positions(scene))
+    other_positions, other_visible = (array[other_frame] for array in visible_positions(other))
+    index = {key: k for k, key in enumerate(other.object_keys)}
+    total = 0.0
+    for k, key in enumerate(scene.object_keys):
+        match = index.pop(key, None)
+        if match is None:
+            total += DIAGONAL * visible[k]
+        elif visible[k] or other_visible[match]:
+            total += float(np.linalg.norm(positions[k] - other_positions[match]))
+    return total + DIAGONAL * float(other_visible[list(index.values())].sum())
+
+
+def simple_accuracies(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Return for each item how right each simple strategy is, (N, 2 S).
+
+    If the target is among m candidates with the best score, the strategy scores 1 / m.
+
+    Args:
+        scores: (N, S, 4) scores of the candidates.
+        answers: (N,) indices of the targets.
+    """
+    shares = rank_shares(_target_first(scores, answers))
+    return np.stack([shares[..., 0], shares[..., 3]], axis=-1).reshape(len(scores), -1)
+
+
+def _target_first(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    order = np.array([[a, *(k for k in range(4) if k != a)] for a in answers.tolist()])
+    return np.take_along_axis(scores, order[:, None, :], axis=-1)
+
+
+def logistic_features(scores: np.ndarray) -> np.ndarray:
+    """Return features (N, 4, F) of the candidates: the scores relative to those of the other
+    candidates, and whether each is the lowest or the highest."""
+    spread = scores.std(axis=-1, keepdims=True)
+    relative = (scores - scores.mean(axis=-1, keepdims=True)) / np.maximum(spread, 1e-6)
+    is_lowest = scores <= scores.min(axis=-1, keepdims=True)
+    is_highest = scores >= scores.max(axis=-1, keepdims=True)
+    return np.concatenate([relative, is_lowest, is_highest], axis=1).swapaxes(1, 2)
+
+
+def fit_logistic(features: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Return the coefficients (F,) of a conditional logistic model, by maximum likelihood with a
+    small penalty.
+
+    The probability of a candidate is the softmax of its linear score over the four candidates.
+    """
+    from scipy.optimize import minimize
+
+    rows = np.arange(len(answers))
+
+    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
+        linear = features @ weights
+        linear -= linear.max(axis=-1, keepdims=True)
+        odds = np.exp(linear)
+        probabilities = odds / odds.sum(axis=-1, keepdims=True)
+        likelihood = np.log(probabilities[rows, answers]).mean()
+        residual = probabilities.copy()
+        residual[rows, answers] -= 1
+        gradient = np.einsum("nc,ncf->f", residual, features) / len(rows)
+        penalty = PENALTY * (weights**2).sum() / 2
+        return penalty - likelihood, gradient + PENALTY * weights
+
+    return minimize(loss, np.zeros(features.shape[-1]), jac=True, method="L-BFGS-B").x
+
+
+def logistic_accuracies(
+    items: Sequence[SelectionItem], scores: np.ndarray, answers: np.ndarray
+) -> np.ndarray:
+    """Return for each item whether the logistic model of its family is right, (N,): NaN for items
+    of the training split, on which the models are trained, and of families without such items."""
+    right = np.full(len(items), np.nan)
+    features = logistic_features(scores)
+    families = np.array([item.family for item in items])
+    splits = np.array([item.split for item in items])
+    for family in np.unique(families):
+        train = (families == family) & (splits == "train")
+        test = (families == family) & (splits == "test")
+        if train.any():
+            weights = fit_logistic(features[train], answers[train])
+            right[test] = (features[test] @ weights).argmax(axis=-1) == answers[test]
+    return right

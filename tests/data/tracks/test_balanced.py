@@ -1,0 +1,274 @@
+"""Balanced items: alternative futures, even ranks of the target, and bytes that can be repeated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conf.compose import compose
+from conf.schema import BenchmarkConfig, BuildCommand, Quota, RetrievalTrackConfig, SelectionConfig
+from data.build import ensure_items
+from data.parallel import Workers
+from data.records import ALTERNATIVE, Scene, SelectionItem, original_scene_id
+from data.store import Store, built_files
+from data.tracks.selection import balanced
+from data.tracks.selection.balance import LIMIT, SCORES, Balance, rank_shares
+from data.tracks.selection.futures import (
+    MOVING,
+    alternative_scene,
+    moving_objects,
+    sample_velocities,
+    simulate_futures,
+)
+from data.tracks.shortcuts import (
+    fit_logistic,
+    item_scores,
+    logistic_accuracies,
+    logistic_features,
+    simple_accuracies,
+)
+from data.world.displacement import cross_scene_displacement
+from data.world.physics import shared_simulator
+from tests.data.simulated import CLEVRER, simulate_scene
+
+QUOTAS = {"future_match_gap10": 2, "future_cross_gap10": 2, "contact_offset": 2}
+
+
+def settings(folder_name: str, **changes) -> BenchmarkConfig:
+    cfg = compose("data.build", BuildCommand, ["benchmark=tiny_balanced"]).benchmark
+    cfg.name, cfg.scenes = folder_name, 30
+    cfg.retrieval = RetrievalTrackConfig(standard=0, database=0, source=0, counterfactual_source=0)
+    cfg.selection = SelectionConfig(
+        event={name: Quota(0, test) for name, test in QUOTAS.items()},
+        time={"in_1s": Quota(4, 2), "in_2s": Quota(0, 2)},
+        window={"G1_A_h16_hard": Quota(0, 2), "G2_B_h24_easy": Quota(0, 2)},
+    )
+    return replace(cfg, **changes)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return ensure_items(settings("balanced"), tmp_path_factory.mktemp("store"), Workers(1))
+
+
+@pytest.fixture(scope="module")
+def items(store: Store) -> list[SelectionItem]:
+    return store.selection()
+
+
+def is_own(item: SelectionItem, scene_id: str) -> bool:
+    return scene_id == item.scene_id
+
+
+def test_families_fill_their_quotas(store: Store, items: list[SelectionItem]) -> None:
+    assert {i.family for i in items} == {"event", "time", "window"}
+    assert len(items) > 0.7 * (sum(QUOTAS.values()) + 8 + 4)
+    assert {i.distractors for i in items} == {"alternative"}
+
+
+def test_alternatives_share_the_past_of_their_scene(
+    store: Store, items: list[SelectionItem]
+) -> None:
+    for item in items:
+        scene = store.scene(item.scene_id)
+        for candidate in item.candidates:
+            other = store.scene(candidate.scene_id)
+            assert original_scene_id(candidate.scene_id) == item.scene_id
+            if is_own(item, candidate.scene_id):
+                continue
+            until = item.prefix_stop
+            for name in ("positions", "in_view", "visible_fraction"):
+                own = getattr(scene, name)[: until + 1]
+                np.testing.assert_array_equal(getattr(other, name)[: until + 1], own)
+            assert np.abs(other.velocities[until + 1] - scene.velocities[until + 1]).max() > 0
+            assert (other.split, other.objects) == (scene.split, scene.objects)
+
+
+def test_only_the_target_shows_the_scene_at_its_moment(
+    store: Store, items: list[SelectionItem]
+) -> None:
+    for item in items:
+        frames = [c.frame for c in item.candidates]
+        own = [is_own(item, c.scene_id) for c in item.candidates]
+        at_moment = [frame == item.target_frame for frame in frames]
+        assert [a and b for a, b in zip(own, at_moment, strict=True)].count(True) == 1
+        if item.family == "time":
+            # Each of the scene's own and another future, at each of two moments.
+            assert sorted(zip(own, at_moment, strict=True)) == [
+                (False, False), (False, True), (True, False), (True, True),
+            ]  # fmt: skip
+            assert len(set(frames)) == 2
+        else:
+            assert set(frames) == {item.target_frame}
+
+
+def test_candidates_differ_visibly(store: Store, items: list[SelectionItem]) -> None:
+    for item in items:
+        states = [(store.scene(c.scene_id), c.frame) for c in item.candidates]
+        least = min(cross_scene_displacement(*a, *b) for a, b in combinations(states, 2))
+        assert least >= 12
+        assert least == pytest.approx(item.min_displacement, abs=0.1)
+
+
+def test_hard_distractors_are_nearer_to_the_target_than_easy_ones() -> None:
+    rng = np.random.default_rng(0)
+    places = rng.uniform(0, 100, (14, 2))
+    displacement = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    choices = balanced._choices(moments=1, futures=12)
+    halves = [balanced._of_difficulty(choices, displacement, nearest) for nearest in (True, False)]
+    near, far = (displacement[1, half[:, 1:]].max(axis=-1) for half in halves)
+    assert near.max() <= far.min()
+    assert len(near) == len(far) == len(choices) / 2
+    assert balanced._of_difficulty(choices, displacement, None) is choices
+
+
+def test_alternatives_of_no_item_are_not_kept(store: Store, items: list[SelectionItem]) -> None:
+    used = {c.scene_id for i in items for c in i.candidates if ALTERNATIVE in c.scene_id}
+    paths = (store.folder / "scenes").glob(f"*{ALTERNATIVE}*.npz")
+    assert {path.stem for path in paths} == used
+
+
+def test_bytes_do_not_depend_on_the_number_of_workers(store: Store, tmp_path: Path) -> None:
+    again = ensure_items(settings("balanced"), tmp_path, Workers(2))
+    assert again.manifest["files"] == store.manifest["files"]
+    assert again.identity == store.identity
+
+
+def test_build_with_other_quotas_after_a_kill_leaves_no_alternatives_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("data.build.remove_unused_futures", stop)
+        with pytest.raises(KeyboardInterrupt):
+            ensure_items(settings("killed"), tmp_path, Workers(1))
+    fewer = settings("killed")
+    fewer.selection = replace(fewer.selection, window={}, time={})
+    store = ensure_items(fewer, tmp_path, Workers(1))
+    used = {c.scene_id for i in store.selection() for c in i.candidates}
+    scenes = {Path(name).stem for name in built_files(store.folder) if name.endswith(".npz")}
+    assert {name for name in scenes if ALTERNATIVE in name} == {
+        name for name in used if ALTERNATIVE in name
+    }
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return simulate_scene(0, 3)
+
+
+def test_branch_with_the_true_velocities_continues_the_scene(scene: Scene) -> None:
+    true = np.concatenate([scene.velocities[40], scene.angular_velocities[40]], axis=-1)
+    (states,) = simulate_futures(scene, 40, 70, true[None].astype(float), CLEVRER)
+    np.testing.assert_allclose(states[:, :, :3], scene.positions[40:71], atol=0.01)
+
+
+def test_futures_do_not_depend_on_earlier_simulations(scene: Scene) -> None:
+    moving = moving_objects(scene, 40, range(len(scene.objects)))
+    velocities = sample_velocities(scene, 40, moving, 4, 1, np.random.default_rng(0))
+    first = simulate_futures(scene, 40, 60, velocities, CLEVRER)
+    simulate_scene(0, 5)
+    np.testing.assert_array_equal(simulate_futures(scene, 40, 60, velocities, CLEVRER), first)
+    shared_simulator.cache_clear()
+    np.testing.assert_array_equal(simulate_futures(scene, 40, 60, velocities, CLEVRER), first)
+
+
+def test_alternative_scene_joins_past_and_future(scene: Scene) -> None:
+    moving = moving_objects(scene, 50, range(len(scene.objects)))
+    velocities = sample_velocities(scene, 50, moving, 1, 0, np.random.default_rng(1))
+    (states,) = simulate_futures(scene, 50, 64, velocities, CLEVRER)
+    other = alternative_scene(scene, "other", 50, states, CLEVRER)
+    assert other.frames == 65
+    np.testing.assert_array_equal(other.positions[:51], scene.positions[:51])
+    np.testing.assert_allclose(other.positions[50:], states[:, :, :3], atol=1e-6)
+
+
+@pytest.mark.parametrize("quarter", range(4))
+def test_true_speed_lies_in_its_quarter_of_all_speeds(scene: Scene, quarter: int) -> None:
+    rng = np.random.default_rng(quarter)
+    moving = moving_objects(scene, 30, range(len(scene.objects)))[:1]
+    true = np.linalg.norm(scene.velocities[30, moving[0], :2])
+    assert true > MOVING
+    lower = []
+    for _ in range(40):
+        velocities = sample_velocities(scene, 30, moving, 50, quarter, rng)
+        lower.append(np.linalg.norm(velocities[:, moving[0], :2], axis=-1) < true)
+    assert np.mean(lower) == pytest.approx((quarter + 0.5) / 4, abs=0.04)
+
+
+def test_shares_of_ranks_are_a_distribution_that_splits_ties() -> None:
+    shares = rank_shares(np.array([[2.0, 1.0, 3.0, 4.0], [1.0, 1.0, 1.0, 2.0], [5.0] * 4]))
+    np.testing.assert_allclose(shares, [[0, 1, 0, 0], [1 / 3, 1 / 3, 1 / 3, 0], [1 / 4] * 4])
+
+
+def test_balance_keeps_every_count_within_the_limit() -> None:
+    rng = np.random.default_rng(0)
+    balance, refused = Balance(rng), 0
+    for _ in range(200):
+        # The target is often the lowest, so that an unbalanced choice would reveal it.
+        scores = rng.normal(size=(len(SCORES), 30, 4))
+        scores[..., 0] -= rng.uniform(0, 1)
+        refused += balance.choose(scores) is None
+        assert np.abs(balance.counts - balance.items / 4).max() <= LIMIT + 1e-9
+    assert balance.items > 150
+    only_lowest = np.tile([0.0, 1.0, 2.0, 3.0], (len(SCORES), 1, 1))
+    assert [balance.choose(only_lowest) is None for _ in range(4)][-1]
+
+
+def test_simple_strategies_score_shares_of_ties() -> None:
+    scores = np.zeros((2, len(SCORES), 4))
+    scores[:, 0] = [3.0, 1.0, 2.0, 2.0]
+    right = simple_accuracies(scores, np.array([1, 0]))
+    np.testing.assert_allclose(right[:, :2], [[1, 0], [0, 1]])
+    np.testing.assert_allclose(right[:, 2:], 0.25)
+
+
+def test_logistic_model_finds_a_shortcut_and_nothing_without_one() -> None:
+    rng = np.random.default_rng(0)
+    answers = rng.integers(4, size=1200)
+    scores = rng.normal(size=(1200, len(SCORES), 4))
+    nothing = fit_logistic(logistic_features(scores), answers)
+    assert np.abs(nothing).max() < 0.2
+    # The target is high in one score and low in another: neither alone is decisive.
+    rows = np.arange(1200)
+    scores[rows, 2, answers] += 1.0
+    scores[rows, 3, answers] -= 1.0
+
+    class Item:
+        family = "event"
+
+        def __init__(self, split: str) -> None:
+            self.split = split
+
+    items = [Item("train" if k < 800 else "test") for k in range(1200)]
+    right = logistic_accuracies(items, scores, answers)
+    assert np.isnan(right[:800]).all()
+    assert np.mean(right[800:]) > 0.55 > simple_accuracies(scores, answers).mean(axis=0).max()
+
+
+def test_scores_of_items_are_those_that_were_balanced(
+    store: Store, items: list[SelectionItem], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The scores that the statistics compute from the store equal those of the builder."""
+    chosen = []
+    original = Balance.choose
+
+    def record(self: Balance, scores: np.ndarray) -> int | None:
+        best = original(self, scores)
+        if best is not None:
+            chosen.append(scores[:, best])
+        return best
+
+    monkeypatch.setattr(Balance, "choose", record)
+    again = ensure_items(settings("balanced"), tmp_path, Workers(1))
+    assert again.identity == store.identity
+    built = {tuple(np.sort(s[0]).round(1)) for s in chosen}
+    for item in items[:8]:
+        scores = item_scores(item, store)
+        assert tuple(np.sort(scores[0]).round(1)) in built
