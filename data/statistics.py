@@ -27,7 +27,7 @@ def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
             f"{store.folder} has no selection items, so there are no statistics to report",
             code="empty-split",
         )
-    statistics = compute_statistics(store)
+    statistics = compute_statistics(store, cfg.blind)
     text = format_statistics(statistics)
     log.info("%s", text)
     write_text(run.folder / "report.txt", text + "\n")

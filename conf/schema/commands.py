@@ -51,6 +51,9 @@ class BuildCommand(CommandConfig):
 @dataclass
 class StatisticsCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
+    blind: bool = False
+    """Also train two small models that do not see the prefix, and report their accuracy. This takes
+    minutes and needs the extra `train`."""
 
 
 @dataclass

@@ -18,8 +18,11 @@ from data.world.displacement import cross_scene_displacement
 LOGISTIC = "logistic model of all scores"
 
 
-def compute_statistics(store: Store) -> dict[str, Any]:
+def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
     """Return the statistics of a store that has selection items.
+
+    Args:
+        blind: Whether to train blind models too.
 
     Returns:
         ``scenes``: distributions of objects, collisions and event frames. ``answers``: items by
@@ -44,11 +47,11 @@ def compute_statistics(store: Store) -> dict[str, Any]:
         "cells": count_cells(items, store.manifest["config"]["selection"]),
         "candidates": candidates.fillna(0).to_dict("index"),
         "baselines": _without_nan(baselines),
-        "shortcuts": _without_nan(measure_shortcuts(items, store)),
+        "shortcuts": _without_nan(measure_shortcuts(items, store, blind)),
     }
 
 
-def measure_shortcuts(items: list[SelectionItem], store: Store) -> pd.DataFrame:
+def measure_shortcuts(items: list[SelectionItem], store: Store, blind: bool) -> pd.DataFrame:
     """Return the accuracy of each shortcut on the items of the test split, by category."""
     progress = tqdm(items, desc="scoring shortcuts", unit="item", disable=None)
     scores = np.stack([shortcuts.item_scores(item, store) for item in progress])
@@ -57,10 +60,16 @@ def measure_shortcuts(items: list[SelectionItem], store: Store) -> pd.DataFrame:
         shortcuts.simple_accuracies(scores, answers), columns=list(shortcuts.SIMPLE)
     )
     right[LOGISTIC] = shortcuts.logistic_accuracies(items, scores, answers)
+    if blind:
+        from data.publish.blind import blind_accuracies
+
+        for name, values in blind_accuracies(items, store, store.manifest["seed"]).items():
+            right[name] = values
     right["category"] = [list(_categories(item)) for item in items]
     test = right[[item.split == "test" for item in items]]
     categories = test.explode("category").groupby("category")
-    return categories[[*shortcuts.SIMPLE, LOGISTIC]].mean().assign(items=categories.size())
+    names = [name for name in right if name != "category"]
+    return categories[names].mean().assign(items=categories.size())
 
 
 def _without_nan(table: pd.DataFrame) -> dict[str, dict[str, Any]]:

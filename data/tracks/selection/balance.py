@@ -19,8 +19,9 @@ SCORES = (
 """Scores of a candidate: displacement from the last observed frame, mean difference of pixels from
 it, sums of displacements and of pixel differences from the other candidates, index of the frame,
 sum of the displacements of all objects since the last observed frame, number of visible objects."""
-LIMIT = 1.75
-"""Maximum difference between the count of targets of a rank and a quarter of all items."""
+LIMIT, TOLERANCE = 1.75, 0.015
+"""The count of targets of a rank may differ from a quarter of all items by `LIMIT` and by this share
+of the items. Without the second term, a cell could reach counts that no further item keeps even."""
 START = 0.75
 """Maximum distance from 0 of the counts at the start."""
 
@@ -113,13 +114,13 @@ class Balance:
             scores: (S, T, 4) scores of T choices; the first of four candidates is the target.
 
         Returns:
-            The index of the choice, or None if each would make the count of a rank differ by more
-            than `LIMIT` from a quarter of the items.
+            The index of the choice, or None if each would make the count of a rank differ too much
+            from a quarter of the items (see `LIMIT`).
         """
         shares = rank_shares(scores).swapaxes(0, 1)
         excess = self.counts + shares - (self.items + 1) / 4
         best = int((excess**2).sum(axis=(1, 2)).argmin())
-        if np.abs(excess[best]).max() > LIMIT:
+        if np.abs(excess[best]).max() > LIMIT + TOLERANCE * self.items:
             return None
         self.counts = self.counts + shares[best]
         self.items += 1

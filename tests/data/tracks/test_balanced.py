@@ -16,7 +16,7 @@ from data.parallel import Workers
 from data.records import ALTERNATIVE, Scene, SelectionItem, original_scene_id
 from data.store import Store, built_files
 from data.tracks.selection import balanced
-from data.tracks.selection.balance import LIMIT, SCORES, Balance, rank_shares
+from data.tracks.selection.balance import LIMIT, SCORES, TOLERANCE, Balance, rank_shares
 from data.tracks.selection.futures import (
     MOVING,
     alternative_scene,
@@ -215,7 +215,7 @@ def test_balance_keeps_every_count_within_the_limit() -> None:
         scores = rng.normal(size=(len(SCORES), 30, 4))
         scores[..., 0] -= rng.uniform(0, 1)
         refused += balance.choose(scores) is None
-        assert np.abs(balance.counts - balance.items / 4).max() <= LIMIT + 1e-9
+        assert np.abs(balance.counts - balance.items / 4).max() <= LIMIT + TOLERANCE * balance.items
     assert balance.items > 150
     only_lowest = np.tile([0.0, 1.0, 2.0, 3.0], (len(SCORES), 1, 1))
     assert [balance.choose(only_lowest) is None for _ in range(4)][-1]
