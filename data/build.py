@@ -38,6 +38,7 @@ from data.store import (
     write_atomically,
 )
 from data.tracks.build_items import (
+    OBSERVATIONS,
     family_quotas,
     item_families,
     make_items_and_queries,
@@ -163,7 +164,14 @@ def check_quota_names(cfg: BenchmarkConfig) -> None:
     quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
     from conf.compose import nearest_key
 
-    problems = []
+    problems = [
+        f"benchmark.selection.observation.{name}: unknown name; give event, window or a subtype "
+        "of theirs"
+        for name in cfg.selection.observation
+        if not any(
+            name in (family, *known.get(f"selection.{family}", ())) for family in OBSERVATIONS
+        )
+    ]
     for key, named in {**quotas, "retrieval.builders": cfg.retrieval.builders}.items():
         options = known.get(key, [])
         if named and not options:

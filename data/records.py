@@ -21,6 +21,9 @@ FPS = 25
 """Frame rate of simulated scenes. Questions of retrieval queries count seconds in these frames."""
 SELECTION_SECOND = 26
 """Frames that the time family of selection items counts as a second (128 frames in about 5 s)."""
+SPEED_BOUNDS = (0.6, 1.5, 3.0)
+"""Default upper bounds of the speeds that rationales call slow, steady and quick, simulator units
+per second."""
 LETTERS = "ABCD"
 
 SHAPES = ("cube", "sphere", "cylinder")
@@ -96,6 +99,8 @@ class Scene:
             of its release; None for a scene that is rendered from its oracle.
         scales: sizes of the objects as multiples of their shapes' standard size; empty if all are
             1, or if they are not known.
+        speed_bounds: upper bounds of the speeds that rationales call slow, steady and quick,
+            simulator units per second; empty for the default bounds.
     """
 
     scene_id: str
@@ -115,6 +120,7 @@ class Scene:
     scenario: str = ""
     footage: str | None = None
     scales: tuple[float, ...] = ()
+    speed_bounds: tuple[float, ...] = ()
 
     ARRAYS = (
         "positions", "quaternions", "velocities", "angular_velocities", "image_positions",

@@ -103,9 +103,10 @@ def part_path(folder: Path, inputs: Any) -> Path:
 def save_scene(scene: Scene, path: Path) -> None:
     """Write a scene's oracle as arrays and a JSON header."""
     header = {f.name: getattr(scene, f.name) for f in fields(scene) if f.name not in Scene.ARRAYS}
-    if not scene.scales:
-        # Scenes of the standard world then have the same bytes as before worlds had sizes.
-        del header["scales"]
+    for name in ("scales", "speed_bounds"):
+        if not header[name]:
+            # Scenes of the world of CLEVRER then have the same bytes as before there were worlds.
+            del header[name]
     arrays = {name: getattr(scene, name) for name in Scene.ARRAYS}
     buffer = io.BytesIO()
     np.savez(buffer, header=np.array(json.dumps(header, default=vars)), **arrays)
@@ -123,6 +124,7 @@ def load_scene(path: Path) -> Scene:
             "image_size": tuple(header["image_size"]),
             "landings": tuple(Landing(**landing) for landing in header["landings"]),
             "scales": tuple(header.get("scales", ())),
+            "speed_bounds": tuple(header.get("speed_bounds", ())),
         }
         return Scene(**header, **{name: file[name] for name in Scene.ARRAYS})
 

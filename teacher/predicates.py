@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from data.records import LETTERS, Candidate, Scene, SelectionItem
+from data.records import LETTERS, SPEED_BOUNDS, Candidate, Scene, SelectionItem
 from data.world.visibility import MIN_VISIBLE
 
 CUT_MARGIN = 12
@@ -23,8 +23,8 @@ COURSE_FRAMES = 5
 number of observed frames (paper, Rationale construction)."""
 STATIONARY = 0.05
 """Speed (simulator units/s) below which an object is stationary (paper, Rationale construction)."""
-SPEEDS = ((0.6, "slowly"), (1.5, "steadily"), (3.0, "quickly"))
-"""Words for speeds and their upper bounds (simulator units/s); above these, it is VERY_FAST."""
+SPEEDS = ("slowly", "steadily", "quickly")
+"""Words for speeds below each of the bounds of a scene; above these, it is VERY_FAST."""
 VERY_FAST = "very quickly"
 IMMINENT, SOON = 15, 40
 """Maximum numbers of frames from the cut to a collision that is "imminent", and to a collision that
@@ -354,7 +354,8 @@ def _speed(scene: Scene, index: int, frame: int) -> str:
     speed = float(np.linalg.norm(scene.velocities[frame, index]))
     if speed < STATIONARY:
         return "stationary"
-    return next((word for bound, word in SPEEDS if speed < bound), VERY_FAST)
+    words = zip(SPEEDS, scene.speed_bounds or SPEED_BOUNDS, strict=True)
+    return next((word for word, bound in words if speed < bound), VERY_FAST)
 
 
 def _close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:

@@ -39,7 +39,7 @@ from teacher.predicates import (
 from teacher.validation.claim_extraction import extract_claims
 
 ALL_REGIONS = [region for row in REGIONS for region in row]
-MOVING = [*(word for _, word in SPEEDS), VERY_FAST]
+MOVING = [*SPEEDS, VERY_FAST]
 MISSES_PRINTED = 6
 
 Mutation = tuple[str, tuple[int, int]]

@@ -50,13 +50,21 @@ class SelectionConfig(Settings):
     """Quota of each time cell."""
     window: dict[str, Quota] = field(default_factory=dict)
     """Quota of each window cell, such as G1_A_h8_easy. The quota of a group and family, such as
-    G1_A, is divided evenly among its six cells."""
+    G1_A, is divided evenly among those of its six cells that have no quota of their own."""
+    observation: dict[str, int] = field(default_factory=dict)
+    """Number of observed frames, by family (event or window) or by subtype, such as {window: 20}.
+    By default, event items have 21 and window items 16. Time items always have 26, a second."""
     matched: Quota = field(default_factory=Quota)
     """Pairs of matched-anchor items. The two questions of a pair ask for the same target, one by an
     event and the other by a time."""
 
     def __post_init__(self) -> None:
         self.window = divide_window_quotas(self.window)
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        for name, frames in self.observation.items():
+            if not 5 <= frames <= SCENE_FRAMES // 2:
+                yield f"{group}observation.{name}={frames} must be from 5 to {SCENE_FRAMES // 2}"
 
 
 @dataclass
@@ -192,21 +200,25 @@ def _unusual_look(world: WorldConfig) -> str | None:
 
 
 def divide_window_quotas(quotas: dict[str, Quota]) -> dict[str, Quota]:
-    """Divide the quota of each group and family, such as G1_A, evenly among its cells.
-
-    The first cells get the remainder. A quota given under a cell's name replaces the cell's share.
-    """
+    """Divide the quota of each group and family, such as G1_A, evenly among those of its cells that
+    have no quota of their own. The first cells get the remainder."""
     cells: dict[str, Quota] = {}
     for name, quota in quotas.items():
         group, _, family = name.partition("_")
         if len(family) != 1 or family not in WINDOW_FAMILIES.get(group, ""):
             cells[name] = quota
             continue
-        shares = list(product(WINDOW_HORIZONS, WINDOW_DIFFICULTIES))
-        for k, (horizon, difficulty) in enumerate(shares):
+        every = product(WINDOW_HORIZONS, WINDOW_DIFFICULTIES)
+        names = [f"{name}_h{horizon}_{difficulty}" for horizon, difficulty in every]
+        shared = [cell for cell in names if cell not in quotas]
+        for cell in names:
+            if cell in quotas:
+                cells[cell] = quotas[cell]
+                continue
+            k = shared.index(cell)
             train, test = (
-                total // len(shares) + (k < total % len(shares))
+                total // len(shared) + (k < total % len(shared))
                 for total in (quota.train, quota.test)
             )
-            cells.setdefault(f"{name}_h{horizon}_{difficulty}", Quota(train, test))
-    return cells | {name: quota for name, quota in quotas.items() if name in cells}
+            cells[cell] = Quota(train, test)
+    return cells

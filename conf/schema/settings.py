@@ -46,7 +46,8 @@ class Settings:
                 problems += value.check(f"{key}.")
             elif isinstance(value, dict):
                 for name, nested in value.items():
-                    problems += nested.check(f"{key}.{name}.")
+                    if isinstance(nested, Settings):
+                        problems += nested.check(f"{key}.{name}.")
             else:
                 problems += _check_value(key, value, **entry.metadata)
         return [*problems, *self.find_problems(group)]

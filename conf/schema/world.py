@@ -253,10 +253,16 @@ class WorldConfig(Settings):
     """RGB colour above the horizon, 0 to 255."""
     parts: dict[str, PartConfig] = field(default_factory=dict)
     """Boxes that do not move, by a name of your choice."""
+    speed_bounds: list[float] = vector(0.6, 1.5, 3.0)
+    """Upper bounds of the speeds (units/s) that rationales call slow, steady and quick; objects
+    above the last move very quickly. Below 0.05, an object is stationary."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         for name in ("floor", "background"):
             yield from check_color(f"{group}{name}", getattr(self, name))
+        bounds = self.speed_bounds
+        if len(bounds) != 3 or not 0.05 < bounds[0] < bounds[1] < bounds[2]:
+            yield f"{group}speed_bounds={bounds}: give 3 rising numbers above 0.05"
         if self.start.kind == "strike" and self.objects.max_count > MAX_ROW:
             yield (
                 f"{group}start.kind=strike with {group}objects.max_count="

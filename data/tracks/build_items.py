@@ -33,10 +33,12 @@ from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota
 from data.tracks.retrieval import counterfactual, future
 from data.tracks.selection import event, time, window
-from data.tracks.selection.distractors import BUILDERS_VERSION, Family
+from data.tracks.selection.distractors import BUILDERS_VERSION, Family, Timing
 from data.world.physics import GENERATOR_VERSION
 
 DYNAPIX_FAMILIES = {"event": event.FAMILY, "time": time.FAMILY, "window": window.FAMILY}
+OBSERVATIONS = ("event", "window")
+"""Families whose number of observed frames is a setting."""
 COUNTERFACTUAL = "counterfactual"
 CACHED_SCENES = 20_000
 """Number of scenes that a worker keeps in memory, at about 50 KB each."""
@@ -60,7 +62,8 @@ def make_items_and_queries(
         train, test = (math.ceil(QUERY_RESERVE * n) for n in astuple(quotas[name]))
         quotas[name] = Quota(train, test)
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
-    inputs = [GENERATOR_VERSION, BUILDERS_VERSION, scene_ids, cfg.distractors, *settings]
+    recipe = cfg.distractors, cfg.selection.observation
+    inputs = [GENERATOR_VERSION, BUILDERS_VERSION, scene_ids, *recipe, *settings]
     paths = {
         name: part_path(folder, [*inputs, name, asdict(quota)]) for name, quota in quotas.items()
     }
@@ -86,7 +89,22 @@ def make_items_and_queries(
 
 def item_families(cfg: BenchmarkConfig) -> Mapping[str, Family]:
     """Return the families of a benchmark's suite by name."""
-    return TRANSFER_SUITES.get(suite_name(cfg), DYNAPIX_FAMILIES)
+    if suite_name(cfg) in TRANSFER_SUITES:
+        return TRANSFER_SUITES[suite_name(cfg)]
+    lengths = cfg.selection.observation
+    return DYNAPIX_FAMILIES | {
+        name: _with_observation(DYNAPIX_FAMILIES[name], name, lengths) for name in OBSERVATIONS
+    }
+
+
+def _with_observation(family: Family, name: str, lengths: Mapping[str, int]) -> Family:
+    """Return a family whose prefixes have the given numbers of frames, by family or subtype."""
+
+    def timings(subtype: str, scene: Scene) -> list[Timing]:
+        length = lengths.get(subtype, lengths.get(name))
+        return family.timings(subtype, scene, *([] if length is None else [length]))
+
+    return replace(family, timings=timings)
 
 
 def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:

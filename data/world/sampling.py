@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from conf.errors import UserError
-from data.records import COLORS, MATERIALS, Scene, SceneObject
+from data.records import COLORS, MATERIALS, SPEED_BOUNDS, Scene, SceneObject
 from data.world.camera import Camera
 from data.world.parts import world_boxes
 from data.world.physics import Body, shared_simulator
@@ -179,5 +179,6 @@ def record_scene(name: str, split: str, sample: Sample, world: WorldConfig) -> S
         landings=motion.landings,
         scenario=sample.scenario,
         scales=() if set(scales) == {1.0} else scales,
+        speed_bounds=() if world.speed_bounds == [*SPEED_BOUNDS] else tuple(world.speed_bounds),
         **{key: array.astype(np.float32) for key, array in floats.items()},
     )

@@ -304,3 +304,10 @@ def test_displacement_has_a_direction_and_an_extent():
     late = extract_predicates(item, scene, None).candidates[1].differences
     assert [(d.object, d.kind) for d in late] == [(scene.objects[0].noun_phrase, "displaced")]
     assert (late[0].heading, late[0].extent) == ("east", "slightly")
+
+
+def test_bounds_of_a_scene_change_its_speed_words():
+    scene = synthetic.scene([(0, 0), (0, -1)], [(0.7, 0.0), (0.2, 0.0)])
+    half = replace(scene, speed_bounds=(0.1, 0.3, 0.6))
+    words = [[o.speed for o in extract_facts(s, 0, 20, 60).objects] for s in (scene, half)]
+    assert words == [["steadily", "slowly"], ["very quickly", "steadily"]]

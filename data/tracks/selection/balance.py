@@ -20,8 +20,8 @@ SCORES = (
 it, sums of displacements and of pixel differences from the other candidates, index of the frame,
 sum of the displacements of all objects since the last observed frame, number of visible objects."""
 LIMIT, TOLERANCE = 1.75, 0.015
-"""The count of targets of a rank may differ from a quarter of all items by `LIMIT` and by this share
-of the items. Without the second term, a cell could reach counts that no further item keeps even."""
+"""The count of targets of a rank may differ from a quarter of all items by `LIMIT`, and by this
+share of the items. Without the second term, a cell could reach counts that no item improves."""
 START = 0.75
 """Maximum distance from 0 of the counts at the start."""
 

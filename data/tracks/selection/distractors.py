@@ -33,6 +33,11 @@ class Timing:
     target: int
     event: int | None = None
 
+    @property
+    def observed(self) -> int:
+        """Number of frames of the prefix."""
+        return self.stop - self.start + 1
+
     def outside_prefix(self, frames: Iterable[int]) -> list[int]:
         """Return the frames outside the prefix; a model would recognise frames from inside it."""
         return [int(f) for f in frames if not self.start <= f <= self.stop]

@@ -25,8 +25,8 @@ from data.world.displacement import object_match_scores
 from data.world.events import collision_frames
 
 QUESTION = "Which image is closest to the correct future state of the whole scene?"
-PREFIX_SPAN = 20
-"""Difference between the last and the first frame index of a prefix."""
+OBSERVED = 21
+"""Default number of frames of a prefix: its first and last frame differ by 20."""
 TAIL = 10
 """Minimum number of frames after the target."""
 OFFSETS = (16, 32, 48)
@@ -54,15 +54,15 @@ CELLS = {
 """Cells by subtype (paper, Table "The seven event-anchored subtypes")."""
 
 
-def timings(subtype: str, scene: Scene) -> list[Timing]:
-    """Return a timing for each collision that leaves room for the prefix, the target and
-    `TAIL`."""
+def timings(subtype: str, scene: Scene, observed: int = OBSERVED) -> list[Timing]:
+    """Return a timing for each collision that leaves room for a prefix of `observed` frames, the
+    target and `TAIL`."""
     cell = CELLS[subtype]
     lead = cell.gap if cell.framing == "future" else 0
     return [
-        Timing(stop - PREFIX_SPAN, stop, stop + cell.gap, event)
+        Timing(stop - observed + 1, stop, stop + cell.gap, event)
         for event in collision_frames(scene)
-        if (stop := event - lead) >= PREFIX_SPAN and stop + cell.gap <= scene.frames - 1 - TAIL
+        if (stop := event - lead) >= observed - 1 and stop + cell.gap <= scene.frames - 1 - TAIL
     ]
 
 
@@ -75,8 +75,8 @@ def make_item(
         pools = []
     elif cell.distractors == "cross_scene":
         scenes = picker.sample_scenes(scene, rng, CROSS_SCENES)
-        targets = ((other, [t.target for t in timings(subtype, other)]) for other in scenes)
-        pools = [((Candidate(o.scene_id, t[0], "cross_scene") for o, t in targets if t), 3)]
+        targets = ((other, timings(subtype, other, timing.observed)) for other in scenes)
+        pools = [((Candidate(o.scene_id, t[0].target, "cross_scene") for o, t in targets if t), 3)]
     else:
         wrong = scene_candidates(scene, _wrong_frames(cell, scene, timing, rng), cell.distractors)
         pools = balance_in_time(wrong, timing.target, rng)

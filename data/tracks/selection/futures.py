@@ -127,6 +127,7 @@ def scene_with_states(scene: Scene, name: str, states: np.ndarray, world: WorldC
         fps=scene.fps,
         scenario=scene.scenario,
         scales=scene.scales,
+        speed_bounds=scene.speed_bounds,
         **{key: array.astype(np.float32) for key, array in floats.items()},
     )
 

@@ -28,7 +28,8 @@ from data.world.displacement import object_match_scores, visible_positions
 from data.world.events import collisions_in, window_group
 
 QUESTION = "Which image best matches the next scene state?"
-PREFIX_FRAMES = 16
+OBSERVED = 16
+"""Default number of frames of a prefix."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,12 @@ CELLS = {
 }
 
 
-def timings(subtype: str, scene: Scene) -> list[Timing]:
-    """Return all timings with the horizon of the cell; `make_item` then checks the group."""
+def timings(subtype: str, scene: Scene, observed: int = OBSERVED) -> list[Timing]:
+    """Return all timings with a prefix of `observed` frames and the horizon of the cell;
+    `make_item` then checks the group."""
     horizon = CELLS[subtype].horizon
-    stops = range(PREFIX_FRAMES - 1, scene.frames - horizon)
-    return [Timing(stop - PREFIX_FRAMES + 1, stop, stop + horizon) for stop in stops]
+    stops = range(observed - 1, scene.frames - horizon)
+    return [Timing(stop - observed + 1, stop, stop + horizon) for stop in stops]
 
 
 def make_item(
