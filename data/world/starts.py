@@ -25,8 +25,9 @@ ROW_STEP = (0.75, 1.1)
 """Range of distances between neighbours in a row of objects of scale 1, simulator units."""
 DROP_SPEED = (0.2, 0.8)
 """Range of the horizontal speed of an object that falls on a row, simulator units per second."""
-MARGIN = 20
-"""Width in px of the image's border in which no object may start, at 480 x 320."""
+MARGIN = 20 / 105
+"""Width of the image's border in which no object may start, as a fraction of the length in px of a
+simulator unit in the middle of the image. In the world of CLEVRER, it is 20 px."""
 CLEARANCE = 0.05
 """Height above a part from which an object at rest is released, simulator units."""
 
@@ -134,10 +135,11 @@ def _near_middle(world: WorldConfig, rng: np.random.Generator) -> np.ndarray:
 def is_on_screen(place: np.ndarray, height: float, camera: Camera) -> bool:
     """Return whether a point above a ground position is on screen, with a margin of `MARGIN`."""
     pixel, depth = camera.project(np.array([*place, height]))
+    margin = round(MARGIN * camera.magnification)
     return bool(
         depth > 1
-        and MARGIN < pixel[0] < camera.width - MARGIN
-        and MARGIN < pixel[1] < camera.height - MARGIN
+        and margin < pixel[0] < camera.width - margin
+        and margin < pixel[1] < camera.height - margin
     )
 
 
