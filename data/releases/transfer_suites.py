@@ -62,9 +62,12 @@ class TimeCell:
         return time.question(self.seconds)
 
     def timings(self, scene: Scene) -> list[Timing]:
+        # As in the suite `dynapix`, the target is the first frame after the stated seconds; a scene
+        # of MoVi-A ends one frame earlier.
         second = round(scene.fps)
-        target = second - 1 + second * self.seconds
-        return [Timing(0, second - 1, target)] if target < scene.frames else []
+        target = min(second * (1 + self.seconds), scene.frames - 1)
+        is_long_enough = scene.frames >= second * (1 + self.seconds)
+        return [Timing(0, second - 1, target)] if is_long_enough else []
 
 
 def transfer_family(
@@ -147,13 +150,12 @@ EVENTS: dict[str, Callable[[Scene], list[int]]] = {
 
 
 CELLS = {
-    # At MoVi-A's 12 fps, these spans and gaps last nearly as long as those of the suite `dynapix`
-    # at 25 fps. A scene lasts two seconds, so there is no in_2s.
+    # Spans and gaps are the paper's numbers of frames at every frame rate. A scene of MoVi-A lasts
+    # two seconds, so there is no in_2s.
     "movi_a": {
-        "event": {"contact": EventCell("contact", span=10, gap=5)},
+        "event": {"contact": EventCell("contact", span=20, gap=10)},
         "time": {"in_1s": TimeCell(1)},
     },
-    # Physion's spans and gaps are the same numbers of frames at every frame rate.
     "physion": {
         "event": {
             "A1_contact": EventCell("contact", span=20, gap=10),

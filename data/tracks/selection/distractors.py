@@ -16,7 +16,7 @@ from data.world.displacement import (
     visible_positions,
 )
 
-BUILDERS_VERSION = "6"
+BUILDERS_VERSION = "7"
 """Version of the code that makes items and queries. Increase it when a change gives other items or
 queries for the same scenes."""
 
