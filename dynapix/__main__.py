@@ -42,6 +42,7 @@ def overview() -> str:
         *(f"  {name:<26}{purpose}" for name, purpose in COMMANDS.items()),
         "",
         "Benchmarks (benchmark=NAME): " + ", ".join(preset_names()),
+        "Worlds (world=NAME): " + ", ".join(preset_names("world")),
         "",
         "make run trains and evaluates a tiny student and a tiny retriever. README.md has more.",
     ]

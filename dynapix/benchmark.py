@@ -38,7 +38,8 @@ def load(
     """Open a benchmark, and build it first if it is a preset that has not been built.
 
     Args:
-        benchmark: The name of a preset, such as `tiny`, or the folder of a built benchmark.
+        benchmark: The name of a preset, such as `tiny`, also with the name of a world, such as
+            `tiny-near`, or the folder of a built benchmark.
         split: `train` or `test`.
         store: The folder of the built benchmarks.
         frames: The number of frames of a prefix, evenly spaced. A shorter prefix has all its
@@ -69,18 +70,20 @@ def load(
     return Benchmark(open_store(folder), split, frames, image_size)
 
 
-def preset_names() -> list[str]:
-    """Return the names of the benchmark presets."""
-    return sorted(p.name.removesuffix(".yaml") for p in (files("conf") / "benchmark").iterdir())
+def preset_names(group: str = "benchmark") -> list[str]:
+    """Return the names of the presets of a group of settings, such as `benchmark` or `world`."""
+    return sorted(p.name.removesuffix(".yaml") for p in (files("conf") / group).iterdir())
 
 
 def _build(name: str, root: Path) -> Store:
-    presets = preset_names()
-    if name not in presets:
+    presets, worlds = preset_names(), preset_names("world")
+    preset, _, world = name.partition("-")
+    if preset not in presets or (world and world not in worlds):
         built = sorted(path.parent.name for path in root.glob(f"*/{MANIFEST}"))
         raise UserError(
-            f"there is no benchmark {name!r}: give a preset ({', '.join(presets)}), a built "
-            f"benchmark in {root} ({', '.join(built) or 'none'}), or the folder of one",
+            f"there is no benchmark {name!r}: give a preset ({', '.join(presets)}), a preset and a "
+            f"world such as tiny-near ({', '.join(worlds)}), a built benchmark in {root} "
+            f"({', '.join(built) or 'none'}), or the folder of one",
             code="unknown-benchmark",
         )
     try:
@@ -93,7 +96,8 @@ def _build(name: str, root: Path) -> Store:
             "pip install -e '.[simulate]'",
             code="missing-package",
         ) from error
-    cfg = compose("data.build", BuildCommand, [f"benchmark={name}"])
+    overrides = [f"benchmark={preset}", *([f"world={world}"] if world else [])]
+    cfg = compose("data.build", BuildCommand, overrides)
     return ensure_benchmark(cfg.benchmark, root, cfg.workers)
 
 

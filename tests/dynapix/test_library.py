@@ -336,9 +336,26 @@ def test_a_rationale_is_scored_by_the_oracle(micro_store) -> None:
     assert "numbers: two" in str(score)
 
 
+def test_name_of_a_preset_and_a_world_builds_the_benchmark_in_the_world(
+    tmp_path, monkeypatch
+) -> None:
+    built = []
+
+    def remember(cfg, root, workers):
+        built.append((cfg.store_name, cfg.world.physics.rolling_friction, root))
+        return micro
+
+    micro = object()
+    monkeypatch.setattr("data.build.ensure_benchmark", remember)
+    assert dynapix.load("tiny-settling", store=tmp_path).store is micro
+    assert built == [("tiny-settling", 0.02, tmp_path)]
+
+
 def test_unknown_and_damaged_benchmarks_are_refused(micro_store, tmp_path) -> None:
     with raises_user_error("unknown-benchmark", contains=("tinny", "tiny", "micro")):
         dynapix.load("tinny", store=micro_store.folder.parent)
+    with raises_user_error("unknown-benchmark", contains=("tiny-mars", "settling")):
+        dynapix.load("tiny-mars", store=micro_store.folder.parent)
     with raises_user_error("unknown-option", contains="train or test"):
         dynapix.load(micro_store.folder, split="validation")
     with raises_user_error("invalid-setting", contains="frames=0"):
