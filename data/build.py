@@ -26,6 +26,7 @@ from data.store import (
     MANIFEST,
     PARTS,
     PLAN,
+    SCENES_FOLDER,
     Store,
     built_files,
     component_versions,
@@ -112,7 +113,8 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
             return
         scene_ids, invalid = make_scenes(cfg, partial, workers, strict)
         items, queries, dropped = make_items_and_queries(cfg, partial, scene_ids, workers)
-        remove_unused_futures(partial, items)
+        if cfg.distractors == "balanced":
+            remove_unused_futures(partial, items)
         scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(partial, name)))
         queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
         if not items and not queries:
@@ -215,7 +217,7 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
             shutil.rmtree(partial, ignore_errors=True)
             yield None
             return
-        if (partial / PLAN).exists():
+        if (partial / PLAN).exists() and any((partial / SCENES_FOLDER).glob("*.npz")):
             # Simulating scenes can take hours, so a changed setting must not discard them silently.
             check_same_settings(json.loads((partial / PLAN).read_text()), plan, partial)
         for leftover in partial.rglob(".*.partial"):

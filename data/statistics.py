@@ -20,7 +20,7 @@ def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
     from data.parallel import Workers
     from data.publish.statistics import compute_statistics, format_statistics
 
-    # Statistics need no frames, and rendering those of a large benchmark takes hours.
+    # Small images are rendered for the shortcuts; the frames of the benchmark are not needed.
     store = ensure_items(cfg.benchmark, Path(cfg.store), Workers(cfg.workers))
     if not store.selection():
         raise UserError(

@@ -167,6 +167,11 @@ class BenchmarkConfig(Settings):
                 f"futures are simulated; set {group}simulator=bullet and {group}recipe=dynapix"
             )
         if recipe != "dynapix":
+            if self.selection.observation:
+                yield (
+                    f"{group}selection.observation with {group}recipe={recipe}: this recipe has "
+                    "observations of its own; leave it out"
+                )
             if any(quota.train + quota.test for quota in self.retrieval.builders.values()):
                 yield (
                     f"{group}retrieval.builders with {group}recipe={recipe}: this recipe has no "

@@ -7,6 +7,7 @@ defaults are the world of CLEVRER.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import dist, hypot
@@ -20,6 +21,10 @@ STARTS = ("slide", "throw", "strike")
 MAX_TILT = 45.0
 """Maximum tilt of a part, degrees. On steeper ramps, cubes tumble and leave the surface instead of
 sliding."""
+RADIUS = 0.2
+"""Radius of an object of scale 1, simulator units."""
+SLIDE_FRAMES = 33
+"""Minimum number of frames of scenes in which objects slide; see `data.world.sliding`."""
 MAX_ROW = 6
 """Maximum number of objects in a scene that starts with a row of objects."""
 
@@ -163,18 +168,19 @@ class StartConfig(Settings):
     middle: list[float] = vector(-0.7, 0.0)
     """Point [x, y] of the floor towards which moving objects start."""
     spread: float = setting(1.0, least=0)
-    """Maximum distance along x and y by which the directions of moving objects miss `middle`."""
+    """Moving objects start towards a random point at most this far from `middle` along x and y.
+    Thrown objects that rest lie in the same square."""
     distance: list[float] = vector(2.6, 4.0)
     """Range of the distance from which an object slides in (from `middle`, or from the row)."""
     speed: list[float] = vector(1.0, 3.0)
-    """Range of the initial speed of moving objects (units/s)."""
+    """Range of the initial speed of moving objects (units/s); one that falls on a row is slower."""
     at_rest: float = setting(0.35, least=0, most=1)
     """Share of objects that start at rest: of those placed to collide (slide) or of all (throw)."""
     area: list[float] = vector(-3.5, -2.2, 1.2, 2.2)
     """Part of the floor [x min, y min, x max, y max] for objects at rest (slide), for thrown
     objects, or for the first object of a row (strike)."""
     height: list[float] = vector(0.5, 1.5)
-    """Range of the initial height above the surface, for objects that start in the air."""
+    """Range of the initial height of the centre above the surface, for objects in the air."""
     max_collisions: int | None = setting(3, least=1)
     """Maximum number of collisions in a scene; null for any number."""
 
@@ -182,6 +188,8 @@ class StartConfig(Settings):
         yield from check_vector(f"{group}middle", self.middle, "x y")
         for name in ("distance", "speed", "height"):
             yield from check_range(f"{group}{name}", getattr(self, name), 0)
+        if len(self.distance) == 2 and self.distance[0] == 0 and self.kind != "throw":
+            yield f"{group}distance={self.distance}: the distance must be above 0"
         area = self.area
         if len(area) != 4 or not (area[0] < area[2] and area[1] < area[3]):
             yield f"{group}area={area}: give [x min, y min, x max, y max], each min below its max"
@@ -196,7 +204,7 @@ class LightConfig(Settings):
     ambient: float = setting(0.45, least=0, most=1)
     """Brightness of surfaces that face away from the light."""
     diffuse: float = setting(0.6, least=0, most=1)
-    """Brightness that surfaces that face the light have in addition."""
+    """Additional brightness of surfaces that face the light."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         key = f"{group}direction"
@@ -228,7 +236,7 @@ class PartConfig(Settings):
     def find_problems(self, group: str) -> Iterator[str]:
         for name in ("position", "size"):
             yield from check_vector(f"{group}{name}", getattr(self, name), "x y z")
-        if min(self.size) <= 0.02:
+        if len(self.size) == 3 and min(self.size) <= 0.02:
             yield f"{group}size={self.size}: each edge must be longer than 0.02"
         yield from check_color(f"{group}color", self.color)
         if abs(self.tilt) > MAX_TILT:
@@ -241,7 +249,8 @@ class PartConfig(Settings):
 @dataclass
 class WorldConfig(Settings):
     name: str = "clevrer"
-    """Name of the world. It ends the name of the benchmark's folder, except for clevrer."""
+    """Name of the world: lower-case letters, digits and underscores. The folder of a benchmark in
+    another world than clevrer ends with it."""
     camera: CameraConfig = field(default_factory=CameraConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
@@ -260,6 +269,19 @@ class WorldConfig(Settings):
     def find_problems(self, group: str) -> Iterator[str]:
         for name in ("floor", "background"):
             yield from check_color(f"{group}{name}", getattr(self, name))
+        if not re.fullmatch(r"[a-z0-9_]+", self.name):
+            yield f"{group}name={self.name}: use lower-case letters, digits and underscores"
+        if self.start.kind == "slide" and self.physics.frames < SLIDE_FRAMES:
+            yield (
+                f"{group}physics.frames={self.physics.frames} with {group}start.kind=slide: "
+                f"objects that slide need at least {SLIDE_FRAMES} frames"
+            )
+        radius = RADIUS * max(self.objects.scale)
+        if self.start.kind != "slide" and min(self.start.height) < radius:
+            yield (
+                f"{group}start.height={self.start.height}: the centre of an object with the radius "
+                f"{radius:g} would start inside the surface; raise it"
+            )
         bounds = self.speed_bounds
         if len(bounds) != 3 or not 0.05 < bounds[0] < bounds[1] < bounds[2]:
             yield f"{group}speed_bounds={bounds}: give 3 rising numbers above 0.05"

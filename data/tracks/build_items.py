@@ -22,6 +22,7 @@ from data.parallel import Workers
 from data.records import ALTERNATIVE, FAMILIES, RetrievalQuery, Scene, SelectionItem
 from data.releases.transfer_suites import TRANSFER_SUITES, suite_name
 from data.store import (
+    PARTS,
     SCENES_FOLDER,
     load_scene,
     part_path,
@@ -72,6 +73,8 @@ def make_items_and_queries(
     for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train):
         cell = CellInputs(scene_ids, partial(_load, folder), quota, *settings)
         jobs[paths[name]] = partial(_run_job, cfg, name, cell, paths[name])
+    if cfg.distractors == "balanced":
+        remove_other_parts(folder, paths.values())
     workers.write_files(jobs, "making items and queries", "cell")
     items: list[SelectionItem] = []
     queries: list[RetrievalQuery] = []
@@ -83,7 +86,8 @@ def make_items_and_queries(
             dropped["queries dropped, too alike"] += part["dropped"]
         else:
             items += map(SelectionItem.from_row, part["rows"])
-            dropped[f"items dropped, too alike/{name.partition('/')[0]}"] += part["dropped"]
+            reason = "no suitable distractors" if cfg.distractors == "balanced" else "too alike"
+            dropped[f"items dropped, {reason}/{name.partition('/')[0]}"] += part["dropped"]
     return items, queries, dict(dropped)
 
 
@@ -151,6 +155,16 @@ def remove_unused_futures(folder: Path, items: Iterable[SelectionItem]) -> None:
     for path in (folder / SCENES_FOLDER).glob(f"*{ALTERNATIVE}*.npz"):
         if path.stem not in used:
             path.unlink()
+
+
+def remove_other_parts(folder: Path, kept: Iterable[Path]) -> None:
+    """Delete the results of jobs below `folder` that are not in `kept`.
+
+    The alternative futures of balanced items have the same names for other settings, so that a
+    result from before a change of settings may refer to futures that were simulated since.
+    """
+    for path in {*(folder / PARTS).glob("*.json")} - {*kept}:
+        path.unlink()
 
 
 def _run_job(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> None:

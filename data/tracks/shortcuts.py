@@ -12,12 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image
 
-from data.records import FrameRef, Scene, SelectionItem
+from data.records import FrameRef, SelectionItem
 from data.render.frame_cache import render_frames
 from data.store import Store
-from data.tracks.selection.balance import SCORES, rank_shares
+from data.tracks.selection.balance import SCORES, CandidateFrames, rank_shares
 from data.tracks.selection.balanced import IMAGE_SIZE
-from data.world.displacement import DIAGONAL, cross_scene_displacement, visible_positions
 
 SIMPLE = tuple(f"{score}, {end}" for score in SCORES for end in ("lowest", "highest"))
 """Names of the simple strategies."""
@@ -27,26 +26,11 @@ PENALTY = 1e-2
 
 def item_scores(item: SelectionItem, store: Store) -> np.ndarray:
     """Return the scores (S, 4) of an item's candidates, in the order of `SCORES`."""
-    last = FrameRef(item.scene_id, item.prefix_stop)
-    frames = [last, *item.candidates]
+    frames = [FrameRef(item.scene_id, item.prefix_stop), *item.candidates]
     states = [(store.scene(f.scene_id), f.frame) for f in frames]
-    displacement = np.array([[cross_scene_displacement(*a, *b) for b in states] for a in states])
-    images = np.stack([_small_image(frame, store) for frame in frames]).astype(np.float32)
-    flat = images.reshape(len(images), -1)
-    pixels = np.abs(flat[:, None] - flat[None]).mean(axis=-1)
-    visible = [visible_positions(scene)[1][frame].sum() for scene, frame in states[1:]]
-    return np.array(
-        [
-            displacement[0, 1:],
-            pixels[0, 1:],
-            displacement[1:, 1:].sum(axis=-1),
-            pixels[1:, 1:].sum(axis=-1),
-            [candidate.frame for candidate in item.candidates],
-            [_travel(*states[0], *state) for state in states[1:]],
-            visible,
-        ],
-        dtype=float,
-    )
+    images = np.stack([_small_image(frame, store) for frame in frames])
+    compared = CandidateFrames.of(states, [f.frame for f in frames], images)
+    return compared.scores(np.array([[1, 2, 3, 4]]))[:, 0]
 
 
 def _small_image(frame: FrameRef, store: Store) -> np.ndarray:
@@ -58,22 +42,6 @@ def _small_image(frame: FrameRef, store: Store) -> np.ndarray:
     if pixels.shape[:2] == (height, width):
         return pixels
     return np.asarray(Image.fromarray(pixels).resize(IMAGE_SIZE))
-
-
-def _travel(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:
-    """Return the sum of the displacements of all objects between frames of two scenes, px at
-    336 x 336. An object that one scene lacks counts with the image's diagonal."""
-    positions, visible = (array[frame] for array in visible_positions(scene))
-    other_positions, other_visible = (array[other_frame] for array in visible_positions(other))
-    index = {key: k for k, key in enumerate(other.object_keys)}
-    total = 0.0
-    for k, key in enumerate(scene.object_keys):
-        match = index.pop(key, None)
-        if match is None:
-            total += DIAGONAL * visible[k]
-        elif visible[k] or other_visible[match]:
-            total += float(np.linalg.norm(positions[k] - other_positions[match]))
-    return total + DIAGONAL * float(other_visible[list(index.values())].sum())
 
 
 def simple_accuracies(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ A scene depends only on the seed, its index, the world and GENERATOR_VERSION.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from conf.errors import UserError
 from data.records import COLORS, MATERIALS, SPEED_BOUNDS, Scene, SceneObject
-from data.world.camera import Camera
+from data.world.camera import HEIGHT, WIDTH, Camera
 from data.world.parts import world_boxes
 from data.world.physics import Body, shared_simulator
 from data.world.sliding import NO_PLACE, slide
@@ -40,6 +40,8 @@ ATTEMPTS = 300
 """Number of samples after which a world is refused because none was suitable."""
 NEAREST = 0.3
 """Minimum depth (simulator units) of a part, which the renderer cannot clip."""
+DEEPEST = -0.05
+"""Height (simulator units) of the lowest corner that a part may have."""
 LOWEST = -0.1
 """Height (simulator units) below which a centre has fallen through the floor."""
 
@@ -64,8 +66,9 @@ def sample_scene(world: WorldConfig, seed: int, index: int) -> Sample:
     """Sample scene `index` of a world: its bodies and their motion.
 
     Raises:
-        UserError: the camera does not see the middle, or is inside or in front of a part; or no
-            suitable scene was found, and the message names the most frequent reason.
+        UserError: the camera does not see the middle; a part is not entirely in front of the camera
+            and above the floor; or no suitable scene was found, and the message names the most
+            frequent reason.
     """
     camera = Camera.from_settings(world.camera)
     check_view(world, camera)
@@ -88,9 +91,10 @@ def sample_scene(world: WorldConfig, seed: int, index: int) -> Sample:
 
 
 def check_view(world: WorldConfig, camera: Camera) -> None:
-    """Raises UserError if the camera does not see the middle, or if a part is not in front of the
-    camera."""
-    if not is_on_screen(np.array(world.start.middle), 0.0, camera):
+    """Raises UserError if the camera does not see the middle, or if a part is not entirely in front
+    of the camera and above the floor."""
+    uses_middle = world.start.kind != "strike"
+    if uses_middle and not is_on_screen(np.array(world.start.middle), 0.0, camera):
         raise UserError(
             f"world {world.name}: the camera does not see benchmark.world.start.middle="
             f"{world.start.middle}: change benchmark.world.camera.aim={world.camera.aim} or "
@@ -102,6 +106,12 @@ def check_view(world: WorldConfig, camera: Camera) -> None:
             raise UserError(
                 f"world {world.name}: benchmark.world.parts.{name} is not entirely in front of the "
                 "camera: move it or the camera",
+                code="impossible-world",
+            )
+        if (lowest := box.corners[:, 2].min()) < DEEPEST:
+            raise UserError(
+                f"world {world.name}: benchmark.world.parts.{name} reaches {-lowest:.2f} below the "
+                "floor, where it would be drawn over it: raise the z of its position",
                 code="impossible-world",
             )
 
@@ -152,11 +162,32 @@ def simulate_without(
 
 def record_scene(name: str, split: str, sample: Sample, world: WorldConfig) -> Scene:
     """Return the oracle of a sampled scene, with image positions and visibility."""
-    camera, motion, physics = Camera.from_settings(world.camera), sample.motion, world.physics
-    objects = tuple(body.object for body in sample.bodies)
     scales = tuple(body.scale for body in sample.bodies)
-    states = np.split(motion.states, [3, 7, 10], axis=-1)
-    positions, quaternions, velocities, angular_velocities = states
+    bounds = tuple(world.speed_bounds)
+    return Scene(
+        scene_id=name,
+        split=split,
+        objects=(objects := tuple(body.object for body in sample.bodies)),
+        collisions=sample.motion.collisions,
+        image_size=(WIDTH, HEIGHT),
+        fps=world.physics.fps,
+        landings=sample.motion.landings,
+        scenario=sample.scenario,
+        scales=() if set(scales) == {1.0} else scales,
+        speed_bounds=() if bounds == SPEED_BOUNDS else bounds,
+        **oracle_arrays(objects, scales, sample.motion.states, world),
+    )
+
+
+def oracle_arrays(
+    objects: tuple[SceneObject, ...],
+    scales: Sequence[float],
+    states: np.ndarray,
+    world: WorldConfig,
+) -> dict[str, np.ndarray]:
+    """Return the arrays of a scene (`Scene.ARRAYS`) for the states (F, N, 13) of its objects."""
+    camera = Camera.from_settings(world.camera)
+    positions, quaternions, velocities, angular_velocities = np.split(states, [3, 7, 10], axis=-1)
     in_view, fraction = compute_visibility(
         objects, positions, quaternions, camera, scales, world_boxes(world)
     )
@@ -168,17 +199,5 @@ def record_scene(name: str, split: str, sample: Sample, world: WorldConfig) -> S
         "image_positions": camera.project(positions)[0],
         "visible_fraction": fraction,
     }
-    return Scene(
-        scene_id=name,
-        split=split,
-        objects=objects,
-        collisions=motion.collisions,
-        in_view=in_view,
-        image_size=(camera.width, camera.height),
-        fps=physics.fps,
-        landings=motion.landings,
-        scenario=sample.scenario,
-        scales=() if set(scales) == {1.0} else scales,
-        speed_bounds=() if world.speed_bounds == [*SPEED_BOUNDS] else tuple(world.speed_bounds),
-        **{key: array.astype(np.float32) for key, array in floats.items()},
-    )
+    arrays = {key: array.astype(np.float32) for key, array in floats.items()}
+    return arrays | {"in_view": in_view}

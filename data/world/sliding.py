@@ -117,10 +117,12 @@ class _Slide:
         if alone.touching_at_start:
             return None
         distance = np.linalg.norm(motion.positions - alone.positions, axis=-1)
-        # Objects at this distance at every frame never touch, because between two frames their
-        # distance falls by less than 0.1.
+        # Objects at this distance at every frame never touch: between two frames, the distance
+        # falls by at most the margin.
+        speed = np.linalg.norm(motion.velocities, axis=-1).max()
+        margin = max(0.2, speed / self.world.physics.fps)
         scale = self.world.objects.scale[1]
-        if distance.min() < 2 * max(BOUNDING_RADIUS.values()) * scale + 0.2:
+        if distance.min() < 2 * max(BOUNDING_RADIUS.values()) * scale + margin:
             return None
         return replace(motion, states=np.concatenate([motion.states, alone.states], axis=1))
 

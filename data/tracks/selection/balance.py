@@ -6,19 +6,27 @@ a quarter of the items if the target has each of the four ranks equally often.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
 from data.records import Scene
-from data.world.displacement import frame_displacements, visible_positions
+from data.world.displacement import DIAGONAL, cross_scene_displacement, visible_positions
+from data.world.shapes import RADIUS
 
 SCORES = (
-    "nearness", "pixel_nearness", "oddness", "pixel_oddness", "moment", "travel", "visible",
+    "nearness", "pixel nearness", "oddness", "pixel oddness", "moment", "travel", "visible", "gap",
 )  # fmt: skip
 """Scores of a candidate: displacement from the last observed frame, mean difference of pixels from
 it, sums of displacements and of pixel differences from the other candidates, index of the frame,
-sum of the displacements of all objects since the last observed frame, number of visible objects."""
+sum of the displacements of all objects since the last observed frame, number of visible objects,
+and the smallest gap between two of them."""
+TOUCHING = 0.05
+"""Gap (simulator units) below which two objects count as touching."""
+APART = 10.0
+"""Gap (simulator units) of a frame in which fewer than two objects are visible."""
 LIMIT, TOLERANCE = 1.75, 0.015
 """The count of targets of a rank may differ from a quarter of all items by `LIMIT`, and by this
 share of the items. Without the second term, a cell could reach counts that no item improves."""
@@ -27,37 +35,42 @@ START = 0.75
 
 
 @dataclass(frozen=True)
-class Pool:
-    """Frames from which the candidates of an item are chosen, and what the scores need of them.
+class CandidateFrames:
+    """The last observed frame and frames from which candidates are chosen, as scores need them.
 
     Attributes:
         displacement: (M, M) displacement between two frames, px at 336 x 336.
         pixels: (M, M) mean difference of pixels.
-        moment: (M,) index of the frame in its scene.
-        travel: (M,) sum of the displacements of the objects since frame 0.
-        visible: (M,) number of visible objects.
+        single: (4, M) moment, travel, number of visible objects and gap of each frame.
     Frame 0 is the last observed frame.
     """
 
     displacement: np.ndarray
     pixels: np.ndarray
-    moment: np.ndarray
-    travel: np.ndarray
-    visible: np.ndarray
+    single: np.ndarray
 
     @classmethod
-    def of(cls, scene: Scene, images: np.ndarray, moment: np.ndarray) -> Pool:
-        """Return the pool of all frames of a scene, whose images are (M, H, W, 3) uint8."""
-        positions, visible = visible_positions(scene)
-        shift = np.linalg.norm(positions - positions[0], axis=-1)
+    def of(
+        cls, frames: Sequence[tuple[Scene, int]], moments: Sequence[int], images: np.ndarray
+    ) -> CandidateFrames:
+        """Compare frames, given as scenes and indices, whose images are (M, H, W, 3) uint8.
+
+        Args:
+            moments: (M,) indices of the frames in time.
+        """
+        displacement = np.zeros((len(frames), len(frames)))
+        for a, b in combinations(range(len(frames)), 2):
+            distance = cross_scene_displacement(*frames[a], *frames[b])
+            displacement[a, b] = displacement[b, a] = distance
         flat = images.reshape(len(images), -1).astype(np.float32)
-        return cls(
-            frame_displacements(scene),
-            np.abs(flat[:, None] - flat[None]).mean(axis=-1),
-            moment,
-            np.where(visible | visible[0], shift, 0.0).sum(axis=-1),
-            visible.sum(axis=-1),
-        )
+        single = [
+            moments,
+            [_travel(*frames[0], *frame) for frame in frames],
+            [visible_positions(scene)[1][frame].sum() for scene, frame in frames],
+            [_gap(scene, frame) for scene, frame in frames],
+        ]
+        pixels = np.stack([np.abs(flat - image).mean(axis=-1) for image in flat])
+        return cls(displacement, pixels, np.array(single, dtype=float))
 
     def scores(self, candidates: np.ndarray) -> np.ndarray:
         """Return the scores (S, T, 4) of T choices of candidates, (T, 4) indices of frames."""
@@ -68,11 +81,38 @@ class Pool:
                 self.pixels[0, candidates],
                 self.displacement[one, other].sum(axis=-1),
                 self.pixels[one, other].sum(axis=-1),
-                self.moment[candidates],
-                self.travel[candidates],
-                self.visible[candidates],
+                *self.single[:, candidates],
             ]
         )
+
+
+def _travel(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:
+    """Return the sum of the displacements of all objects between frames of two scenes, px at
+    336 x 336. An object that one scene lacks counts with the image's diagonal."""
+    positions, visible = (array[frame] for array in visible_positions(scene))
+    other_positions, other_visible = (array[other_frame] for array in visible_positions(other))
+    index = {key: k for k, key in enumerate(other.object_keys)}
+    total = 0.0
+    for k, key in enumerate(scene.object_keys):
+        match = index.pop(key, None)
+        if match is None:
+            total += DIAGONAL * visible[k]
+        elif visible[k] or other_visible[match]:
+            total += float(np.linalg.norm(positions[k] - other_positions[match]))
+    return total + DIAGONAL * float(other_visible[list(index.values())].sum())
+
+
+def _gap(scene: Scene, frame: int) -> float:
+    """Return the smallest gap between two visible objects of a frame, simulator units. Gaps below
+    `TOUCHING` count as equal."""
+    seen = np.flatnonzero(visible_positions(scene)[1][frame])
+    scales = scene.object_scales
+    gaps = [
+        np.linalg.norm(scene.positions[frame, a] - scene.positions[frame, b])
+        - RADIUS * (scales[a] + scales[b])
+        for a, b in combinations(seen.tolist(), 2)
+    ]
+    return max(float(min(gaps, default=APART)), TOUCHING)
 
 
 def rank_shares(scores: np.ndarray) -> np.ndarray:
@@ -119,9 +159,10 @@ class Balance:
         """
         shares = rank_shares(scores).swapaxes(0, 1)
         excess = self.counts + shares - (self.items + 1) / 4
-        best = int((excess**2).sum(axis=(1, 2)).argmin())
-        if np.abs(excess[best]).max() > LIMIT + TOLERANCE * self.items:
+        allowed = np.abs(excess).max(axis=(1, 2)) <= LIMIT + TOLERANCE * self.items
+        if not allowed.any():
             return None
+        best = int(np.where(allowed, (excess**2).sum(axis=(1, 2)), np.inf).argmin())
         self.counts = self.counts + shares[best]
         self.items += 1
         return best

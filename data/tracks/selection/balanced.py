@@ -14,17 +14,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from itertools import combinations, product
+from itertools import combinations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
 from data.render import get_renderer
-from data.tracks.selection.balance import SCORES, Balance, Pool
+from data.tracks.selection.balance import SCORES, Balance, CandidateFrames
 from data.tracks.selection.distractors import DistractorPicker, Timing
 from data.tracks.selection.futures import (
+    Group,
     alternative_scene,
+    joint_groups,
     moving_objects,
     sample_velocities,
     scene_states,
@@ -36,7 +38,7 @@ from data.world.displacement import frame_displacements
 if TYPE_CHECKING:
     from conf.schema import WorldConfig
 
-FUTURES = {"event": 10, "time": 8, "window": 12}
+FUTURES = {"event": 10, "time": 12, "window": 12}
 """Number of alternative futures from which the distractors of an item are chosen, by family."""
 NEAREST = {"same_obj_match": True, "same_near": True, "cross_scene": False, "same_far": False}
 """Whether the distractors of a balanced item are the nearest to the target or the farthest, by the
@@ -45,8 +47,10 @@ TRIES = 3
 """Number of timings of a scene for which futures are simulated in one cell."""
 IMAGE_SIZE = 72, 48
 """Width and height in px of the images that are compared by pixels."""
-EARLIEST = 5
-"""Minimum number of frames between the prefix and a wrong moment."""
+LARGEST_SHARE = 0.9
+"""Maximum time to the earlier of two moments, as a share of the time to the later one."""
+JOINT = 0.75
+"""Share of event and window items in which objects that collide change by one velocity."""
 
 
 @dataclass
@@ -77,7 +81,7 @@ class BalancedPicker:
         scene: Scene,
         timing: Timing,
         _pools: object,
-        about: tuple[int, ...] | None = None,
+        about: tuple[int, ...],
         *,
         family: str,
         subtype: str,
@@ -92,8 +96,8 @@ class BalancedPicker:
             distractors: The distractors of the paper's recipe, a key of `NEAREST` or another.
             fields: The question, and the other fields of the item that apply to its family.
         """
-        moving = self._moving(scene, timing, about or ())
-        if not moving:
+        groups = self._groups(scene, timing, about, family)
+        if not groups:
             return None
         moments = [timing.target]
         if family == "time":
@@ -103,33 +107,34 @@ class BalancedPicker:
         velocities = sample_velocities(
             scene,
             timing.stop,
-            moving,
+            groups,
             FUTURES[family],
             self.balance.rarest_rank("nearness"),
             self.rng,
         )
         futures = simulate_futures(scene, timing.stop, max(moments), velocities, self.world)
-        # Frames of the pool: the last observed one, the target, the scene's own future at the wrong
-        # moment, and the alternative futures at each moment.
+        # In order: the last observed frame, the target, the scene's own future at the wrong moment,
+        # and the alternative futures at each moment.
         own = scene_states(scene)[[timing.stop, *moments]]
         others = [futures[:, moment - timing.stop] for moment in moments]
         name = f"{scene.scene_id}{ALTERNATIVE}{subtype}-{timing.stop}"
         frames = scene_with_states(scene, name, np.concatenate([own, *others]), self.world)
-        moment_of = [timing.stop, *moments, *np.repeat(moments, len(futures))]
+        moment_of = [timing.stop, *moments, *np.repeat(moments, len(futures)).tolist()]
         choices = _choices(len(moments), len(futures))
         displacement = frame_displacements(frames, about)
         choices = _distinct(choices, displacement, self.min_displacement)
         choices = _of_difficulty(choices, displacement, NEAREST.get(distractors))
         if not len(choices):
             return self._drop()
-        pool = Pool.of(frames, self._render(frames), np.array(moment_of))
-        best = self.balance.choose(pool.scores(choices))
+        states = [(frames, k) for k in range(frames.frames)]
+        compared = CandidateFrames.of(states, moment_of, self._render(frames))
+        best = self.balance.choose(compared.scores(choices))
         if best is None:
             return self._drop()
         chosen = choices[best]
         candidates = []
         for frame in chosen.tolist():
-            moment = int(moment_of[frame])
+            moment = moment_of[frame]
             if frame <= len(moments):
                 source = "target" if frame == 1 else "same_time"
                 candidates.append(Candidate(scene.scene_id, moment, source))
@@ -157,30 +162,47 @@ class BalancedPicker:
             **fields,
         )
 
-    def _moving(self, scene: Scene, timing: Timing, about: tuple[int, ...]) -> list[int]:
-        """Return the objects of `about` whose other velocities may give an item: they move at the
-        end of the prefix, and visibly until the target. Return none after `TRIES` timings."""
+    def _groups(
+        self, scene: Scene, timing: Timing, about: tuple[int, ...], family: str
+    ) -> list[Group]:
+        """Return the groups of objects whose other velocities may give an item.
+
+        Their objects move at the end of the prefix, and visibly until the target. Where a collision
+        determines the target, most items change objects that collide by one velocity: otherwise
+        the target would often be the only candidate in which objects touch. Return none after
+        `TRIES` timings of a scene.
+        """
         shift = frame_displacements(scene, about)[timing.stop, timing.target]
         moving = moving_objects(scene, timing.stop, about)
         if not moving or shift < self.min_displacement:
             return []
         tried, tries = self._tries
         self._tries = scene.scene_id, tries + 1 if tried == scene.scene_id else 1
-        return moving if self._tries[1] <= TRIES else []
+        if self._tries[1] > TRIES:
+            return []
+        if family != "time" and self.rng.random() < JOINT:
+            return joint_groups(scene, timing.stop, timing.target, moving)
+        return [(k,) for k in moving]
 
     def _drop(self) -> None:
         self.dropped += 1
 
     def _wrong_moment(self, scene: Scene, timing: Timing, about: tuple[int, ...]) -> list[int]:
         """Sample a moment after the prefix that differs visibly from the target, on the side of the
-        target that balances its rank in time; return an empty list if there is none."""
-        moments = np.arange(timing.stop + EARLIEST, scene.frames)
-        differs = frame_displacements(scene, about)[timing.target, moments]
-        moments = moments[differs >= self.min_displacement]
+        target that balances its rank in time; return an empty list if there is none.
+
+        The time from the prefix to the earlier of the two moments is a random share of the time to
+        the later one, from the same range on both sides: otherwise the share would tell which
+        moment is right.
+        """
+        horizon = timing.target - timing.stop
+        least = horizon / (scene.frames - 1 - timing.stop)
+        share = self.rng.uniform(least, LARGEST_SHARE)
         counts = self.balance.counts[SCORES.index("moment")]
-        is_earlier = moments < timing.target
-        side = moments[is_earlier if counts[0] >= counts[3] else ~is_earlier]
-        return [int(self.rng.choice(side))] if len(side) else []
+        lead = horizon * share if counts[0] >= counts[3] else horizon / share
+        moment = timing.stop + int(lead)
+        shift = frame_displacements(scene, about)[timing.target, moment]
+        return [moment] if shift >= self.min_displacement else []
 
     def _render(self, frames: Scene) -> np.ndarray:
         """Render all frames of a scene as small images, (M, H, W, 3) uint8."""
@@ -197,15 +219,13 @@ def _choices(moments: int, futures: int) -> np.ndarray:
     """Return all choices of candidates (T, 4) as indices of frames of the pool; the first is the
     target.
 
-    With two moments, a choice contains each of the scene's own and of another future at each of the
-    moments.
+    With two moments, a choice contains the scene's own and one other future, each at both moments.
     """
     first = 1 + moments
     if moments == 1:
         triples = list(combinations(range(first, first + futures), 3))
         return np.array([[1, *triple] for triple in triples])
-    pairs = product(range(futures), repeat=2)
-    return np.array([[1, 2, first + i, first + futures + j] for i, j in pairs])
+    return np.array([[1, 2, first + k, first + futures + k] for k in range(futures)])
 
 
 def _distinct(choices: np.ndarray, displacement: np.ndarray, least: float) -> np.ndarray:

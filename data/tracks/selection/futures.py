@@ -14,45 +14,69 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data.records import Scene
-from data.world.camera import Camera
-from data.world.parts import world_boxes
+from data.world.displacement import visible_positions
+from data.world.events import collisions_in
 from data.world.physics import shared_simulator
-from data.world.visibility import compute_visibility
+from data.world.sampling import oracle_arrays
 
 if TYPE_CHECKING:
     from conf.schema import WorldConfig
 
 MOVING = 0.1
 """Speed (simulator units/s) above which an object counts as moving."""
-SPEED = np.log(2.0)
-"""Maximum of the random logarithm by which a speed differs from the centre of its futures."""
-TURN = np.radians(60)
-"""Maximum of the random angle by which a direction differs from the centre of its futures."""
+SEEN_FRAMES = 5
+"""Number of last frames of a prefix in which an object must be visible to get another velocity: in
+fewer frames, its true velocity could not be observed."""
+MAX_LOG_FACTOR = np.log(2.0)
+"""Speeds differ from a central speed by a factor of at most 2; this is its logarithm."""
+MAX_TURN = np.radians(60)
+"""Maximum angle between a direction and the central direction, to either side."""
+
+Group = tuple[int, ...]
+"""Indices of objects whose velocities change together."""
 
 
 def moving_objects(scene: Scene, frame: int, about: Sequence[int]) -> list[int]:
-    """Return the objects of `about` that move along the ground at a frame."""
+    """Return the objects of `about` that move along the ground at a frame and that are visible in
+    the last `SEEN_FRAMES` frames up to it."""
     speeds = np.linalg.norm(scene.velocities[frame, :, :2], axis=-1)
-    return [k for k in about if speeds[k] > MOVING]
+    seen = visible_positions(scene)[1][max(frame - SEEN_FRAMES + 1, 0) : frame + 1].all(axis=0)
+    return [k for k in about if speeds[k] > MOVING and seen[k]]
+
+
+def joint_groups(scene: Scene, frame: int, last: int, moving: Sequence[int]) -> list[Group]:
+    """Divide moving objects into groups that keep the collisions of the scene.
+
+    Objects that collide with each other after `frame` and up to `last`, directly or through others,
+    form a group: if all get the same additional velocity, they still collide at the same moments.
+    Objects that do not collide form groups of their own.
+    """
+    groups = [{k} for k in range(len(scene.objects))]
+    for collision in collisions_in(scene, frame + 1, last):
+        one, two = (next(g for g in groups if k in g) for k in collision.objects)
+        if one is not two:
+            groups.remove(two)
+            one |= two
+    return [tuple(sorted(group)) for group in groups if group & {*moving}]
 
 
 def sample_velocities(
     scene: Scene,
     frame: int,
-    moving: Sequence[int],
+    groups: Sequence[Group],
     count: int,
     quarter: int,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Sample other velocities of moving objects at a frame.
+    """Sample other velocities of one or two groups of objects at a frame.
 
-    One or two objects get other speeds and directions, the same objects in all futures. The true
-    velocities are one more sample of the distribution of the others: all have a random distance
-    from a centre. If the true velocity were the centre itself, the most typical candidate would be
-    right.
+    The same groups change in all futures. The mean velocity of a group gets another speed and
+    direction; the velocities of its objects relative to each other stay. The true velocity is one
+    more sample of the distribution of the others: all have a random distance from a centre. If the
+    true velocity were the centre itself, the most typical candidate would be right.
 
     Args:
-        moving: Indices of objects that move at the frame.
+        groups: Groups of objects, from which one or two are chosen.
         quarter: The quarter of the range of speeds in which the true speed lies: with 0, most other
             speeds are higher, and with 3, most are lower.
 
@@ -61,12 +85,17 @@ def sample_velocities(
     """
     original = np.concatenate([scene.velocities[frame], scene.angular_velocities[frame]], axis=-1)
     velocities = np.repeat(original[None].astype(float), count, axis=0)
-    for k in rng.choice(moving, min(len(moving), int(rng.integers(1, 3))), replace=False):
-        true_speed = SPEED * (rng.uniform(quarter, quarter + 1) / 2 - 1)
-        factors = np.exp(rng.uniform(-SPEED, SPEED, count) - true_speed)
-        angles = rng.uniform(-TURN, TURN, count) - rng.uniform(-TURN, TURN)
+    chosen = rng.choice(len(groups), min(len(groups), int(rng.integers(1, 3))), replace=False)
+    for group in (list(groups[k]) for k in chosen):
+        true_speed = MAX_LOG_FACTOR * (rng.uniform(quarter, quarter + 1) / 2 - 1)
+        factors = np.exp(rng.uniform(-MAX_LOG_FACTOR, MAX_LOG_FACTOR, count) - true_speed)
+        angles = rng.uniform(-MAX_TURN, MAX_TURN, count) - rng.uniform(-MAX_TURN, MAX_TURN)
         for changed, factor, angle in zip(velocities, factors, angles, strict=True):
-            changed[k] = factor * _turn(changed[k], angle)
+            if len(group) == 1:
+                changed[group] = factor * _turn(changed[group[0]], angle)
+            else:
+                mean = changed[group].mean(axis=0)
+                changed[group, :3] += (factor * _turn(mean, angle) - mean)[:3]
     return velocities
 
 
@@ -104,32 +133,8 @@ def scene_states(scene: Scene) -> np.ndarray:
 def scene_with_states(scene: Scene, name: str, states: np.ndarray, world: WorldConfig) -> Scene:
     """Return a scene with the objects of another one and the states (F, N, 13) of each frame. Its
     collisions and landings are empty."""
-    camera = Camera.from_settings(world.camera)
-    positions, quaternions, velocities, angular = np.split(states, [3, 7, 10], axis=-1)
-    in_view, fraction = compute_visibility(
-        scene.objects, positions, quaternions, camera, scene.object_scales, world_boxes(world)
-    )
-    floats = {
-        "positions": positions,
-        "quaternions": quaternions,
-        "velocities": velocities,
-        "angular_velocities": angular,
-        "image_positions": camera.project(positions)[0],
-        "visible_fraction": fraction,
-    }
-    return Scene(
-        scene_id=name,
-        split=scene.split,
-        objects=scene.objects,
-        collisions=(),
-        in_view=in_view,
-        image_size=scene.image_size,
-        fps=scene.fps,
-        scenario=scene.scenario,
-        scales=scene.scales,
-        speed_bounds=scene.speed_bounds,
-        **{key: array.astype(np.float32) for key, array in floats.items()},
-    )
+    arrays = oracle_arrays(scene.objects, scene.object_scales, states, world)
+    return replace(scene, scene_id=name, collisions=(), landings=(), **arrays)
 
 
 def alternative_scene(
