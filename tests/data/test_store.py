@@ -13,6 +13,7 @@ import psutil
 import pytest
 
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
+from conf.schema.world import ObjectsConfig, WorldConfig
 from data import store as stores
 from data.build import build, ensure_benchmark, ensure_items, lock_partial_build
 from data.parallel import Workers
@@ -104,8 +105,9 @@ def test_partial_build_with_other_scenes_is_kept(tmp_path) -> None:
     with raises_user_error("empty-benchmark"):
         build(small(**nothing), tmp_path / "small", Workers(1))
     assert not (tmp_path / "small").exists()
-    with raises_user_error("different-settings", contains="benchmark.max_objects was 6"):
-        build(small(max_objects=5), tmp_path / "small", Workers(1))
+    fewer = WorldConfig(objects=ObjectsConfig(max_count=5))
+    with raises_user_error("different-settings", contains="world.objects.max_count was 6"):
+        build(small(world=fewer), tmp_path / "small", Workers(1))
     scenes = tmp_path / ".small.partial" / "scenes"
     first = {p.name: p.stat().st_mtime_ns for p in scenes.iterdir()}
     assert len(first) == 6

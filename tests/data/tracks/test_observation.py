@@ -22,6 +22,7 @@ def config(**selection) -> BenchmarkConfig:
     return cfg
 
 
+@pytest.mark.slow
 def test_observation_sets_the_frames_of_a_family_or_of_a_subtype(tmp_path: Path) -> None:
     cfg = config(
         event={"contact_offset": Quota(test=2), "contact_match": Quota(test=2)},

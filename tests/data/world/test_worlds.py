@@ -295,6 +295,7 @@ def test_surface_height_follows_a_tilted_part() -> None:
     assert surface_height([box], np.array([3.0, 0.0])) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WORLDS)
 def test_scene_is_a_function_of_seed_and_index(name: str) -> None:
     world = preset_world(name)
@@ -303,6 +304,7 @@ def test_scene_is_a_function_of_seed_and_index(name: str) -> None:
     assert {(s.frames, s.fps) for s in scenes} == {(world.physics.frames, world.physics.fps)}
 
 
+@pytest.mark.slow
 def test_presets_have_the_motions_that_they_are_named_after() -> None:
     falling, ramp, settling, screen = (
         [simulate_scene(1, k, preset_world(name)) for k in range(5)]
@@ -337,7 +339,7 @@ def world_store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
     """A small benchmark of the recipe dynapix in another world, with all kinds of records."""
     command = compose("data.build", BuildCommand, ["benchmark=tiny", f"world={request.param}"])
     cfg = command.benchmark
-    cfg.scenes = 25
+    cfg.scenes = 40
     tracks = cfg.selection, cfg.retrieval
     quotas = [*tracks[0].event.values(), *tracks[0].time.values(), *tracks[0].window.values()]
     for quota in (*quotas, *tracks[1].builders.values(), tracks[1].counterfactual):
@@ -349,6 +351,7 @@ def world_store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
     return ensure_items(cfg, tmp_path_factory.mktemp("store"), Workers(1))
 
 
+@pytest.mark.slow
 def test_every_builder_and_the_predicates_work_in_every_world(world_store: Store) -> None:
     world = world_store.manifest["config"]["world"]["name"]
     assert world_store.name == f"tiny-{world}"
@@ -362,6 +365,7 @@ def test_every_builder_and_the_predicates_work_in_every_world(world_store: Store
     assert all(f.answer == i.letter for f, i in zip(facts, items, strict=True) if f)
 
 
+@pytest.mark.slow
 def test_identity_contains_the_world(world_store: Store) -> None:
     changed = world_store.manifest | {
         "world_changes": world_store.manifest["world_changes"] | {"gravity": 1.0}
@@ -381,6 +385,7 @@ def standin(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return ensure_items(cfg, tmp_path_factory.mktemp("store"), Workers(1))
 
 
+@pytest.mark.slow
 def test_standin_has_its_own_suite_and_only_test_items(standin: Store) -> None:
     items = standin.selection()
     assert {i.suite for i in items} == {standin.name} == {standin.suite}
@@ -391,6 +396,7 @@ def test_standin_has_its_own_suite_and_only_test_items(standin: Store) -> None:
     assert len(items) == 2 * (len(config["event"]) + len(config["time"]))
 
 
+@pytest.mark.slow
 def test_frames_have_the_light_and_floor_of_their_world(standin: Store) -> None:
     scene, config = standin.scene(standin.scene_ids("test")[0]), standin.manifest["config"]
     own = render_frames(scene, [3], config)[3]
@@ -413,6 +419,7 @@ def test_background_is_drawn_above_the_horizon() -> None:
     assert pixels[-1, 0, 1] < 190
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("world", "key"),
     [
