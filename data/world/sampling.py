@@ -24,7 +24,7 @@ from data.world.starts import (
     OVERLAP,
     RejectedError,
     Sample,
-    Sized,
+    SizedObject,
     is_on_screen,
     strike,
     throw,
@@ -116,7 +116,7 @@ def check_view(world: WorldConfig, camera: Camera) -> None:
             )
 
 
-def sample_objects(rng: np.random.Generator, world: WorldConfig) -> list[Sized]:
+def sample_objects(rng: np.random.Generator, world: WorldConfig) -> list[SizedObject]:
     """Sample the number of objects in a scene, their distinct appearances and their sizes."""
     settings = world.objects
     every = [SceneObject(*each) for each in product(settings.shapes, MATERIALS, COLORS)]
@@ -124,7 +124,7 @@ def sample_objects(rng: np.random.Generator, world: WorldConfig) -> list[Sized]:
     chosen = [every[k] for k in rng.choice(len(every), count, replace=False)]
     low, high = settings.scale
     scales = rng.uniform(low, high, count).tolist() if low < high else [low] * count
-    return [Sized(*each) for each in zip(chosen, scales, strict=True)]
+    return [SizedObject(*each) for each in zip(chosen, scales, strict=True)]
 
 
 def check_sample(sample: Sample, world: WorldConfig, camera: Camera) -> None:

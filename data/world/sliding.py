@@ -11,7 +11,14 @@ import numpy as np
 from data.world.camera import Camera
 from data.world.physics import Body, Motion, shared_simulator
 from data.world.shapes import BOUNDING_RADIUS, half_height
-from data.world.starts import NO_COLLISION, RejectedError, Sample, Sized, is_on_screen, unit_vector
+from data.world.starts import (
+    NO_COLLISION,
+    RejectedError,
+    Sample,
+    SizedObject,
+    is_on_screen,
+    unit_vector,
+)
 
 if TYPE_CHECKING:
     from conf.schema import WorldConfig
@@ -32,7 +39,7 @@ NO_PLACE = "no place is found for an object"
 
 
 def slide(
-    objects: Sequence[Sized], world: WorldConfig, camera: Camera, rng: np.random.Generator
+    objects: Sequence[SizedObject], world: WorldConfig, camera: Camera, rng: np.random.Generator
 ) -> Sample:
     """Sample bodies whose first body slides into the view.
 
@@ -49,7 +56,7 @@ class _Slide:
     camera: Camera
     rng: np.random.Generator
 
-    def sample(self, objects: Sequence[Sized]) -> Sample:
+    def sample(self, objects: Sequence[SizedObject]) -> Sample:
         intended = int(self.rng.choice(list(COLLISIONS), p=list(COLLISIONS.values())))
         goal = min(intended, self.world.start.max_collisions or intended)
         bodies = [self._entering(objects[0])]
@@ -64,13 +71,15 @@ class _Slide:
             raise RejectedError(NO_COLLISION)
         return Sample(bodies, motion)
 
-    def _body(self, added: Sized, place: np.ndarray, velocity: np.ndarray | None = None) -> Body:
+    def _body(
+        self, added: SizedObject, place: np.ndarray, velocity: np.ndarray | None = None
+    ) -> Body:
         """Return a body at a place on the floor with a random yaw; by default at rest."""
         velocity = np.zeros(2) if velocity is None else velocity
         yaw = self.rng.uniform(0, 2 * np.pi)
         return Body(added.object, place, yaw, velocity, scale=added.scale)
 
-    def _entering(self, added: Sized) -> Body:
+    def _entering(self, added: SizedObject) -> Body:
         """Sample a body that moves from far away towards the middle."""
         rng, start = self.rng, self.world.start
         middle = np.array(start.middle)
@@ -81,7 +90,7 @@ class _Slide:
         return self._body(added, begin, rng.uniform(*start.speed) * direction)
 
     def _try_body(
-        self, bodies: list[Body], motion: Motion, added: Sized, goal: int
+        self, bodies: list[Body], motion: Motion, added: SizedObject, goal: int
     ) -> tuple[list[Body], Motion] | None:
         """Add a body that collides with another body or, once there are `goal` collisions, with
         none.
@@ -126,7 +135,7 @@ class _Slide:
             return None
         return replace(motion, states=np.concatenate([motion.states, alone.states], axis=1))
 
-    def _colliding(self, added: Sized, motion: Motion) -> Body | None:
+    def _colliding(self, added: SizedObject, motion: Motion) -> Body | None:
         """Sample a body that should collide with another body on screen: at rest in its path, or
         moving towards its future position. Returns None if the sample is unsuitable."""
         rng, physics, start = self.rng, self.world.physics, self.world.start
@@ -146,7 +155,7 @@ class _Slide:
         direction = unit_vector(rng.uniform(0, 2 * np.pi))
         return self._body(added, place - travel * direction, speed * direction)
 
-    def _resting(self, added: Sized, motion: Motion) -> Body | None:
+    def _resting(self, added: SizedObject, motion: Motion) -> Body | None:
         """Sample a body at rest on screen; return None if it is off screen or near another's
         path."""
         rng, (left, near, right, far) = self.rng, self.world.start.area
@@ -156,5 +165,5 @@ class _Slide:
             return None
         return self._body(added, place)
 
-    def _is_on_screen(self, place: np.ndarray, added: Sized) -> bool:
+    def _is_on_screen(self, place: np.ndarray, added: SizedObject) -> bool:
         return is_on_screen(place, half_height("sphere", added.scale), self.camera)

@@ -50,7 +50,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Sized:
+class SizedObject:
     """An object and its size, as a multiple of the standard size of its shape."""
 
     object: SceneObject
@@ -58,7 +58,7 @@ class Sized:
 
 
 def throw(
-    objects: Sequence[Sized], world: WorldConfig, camera: Camera, rng: np.random.Generator
+    objects: Sequence[SizedObject], world: WorldConfig, camera: Camera, rng: np.random.Generator
 ) -> Sample:
     """Sample objects above the floor or above a part that move towards the middle.
 
@@ -93,7 +93,7 @@ def throw(
 
 
 def strike(
-    objects: Sequence[Sized], world: WorldConfig, camera: Camera, rng: np.random.Generator
+    objects: Sequence[SizedObject], world: WorldConfig, camera: Camera, rng: np.random.Generator
 ) -> Sample:
     """Sample a row of objects at rest, and an object that strikes the first object of the row.
 
