@@ -12,7 +12,7 @@ easy items are the farthest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -22,7 +22,7 @@ import numpy as np
 from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
 from data.render import get_renderer
 from data.tracks.selection.balance import SCORES, Balance, CandidateFrames
-from data.tracks.selection.distractors import DistractorPicker, Timing
+from data.tracks.selection.distractors import DistractorPicker, Timing, new_item
 from data.tracks.selection.futures import (
     Group,
     alternative_scene,
@@ -47,6 +47,8 @@ TRIES = 3
 """Number of timings of a scene for which futures are simulated in one cell."""
 IMAGE_SIZE = 72, 48
 """Width and height in px of the images that are compared by pixels."""
+TARGET = 1
+"""Index of the target among the frames from which candidates are chosen."""
 LARGEST_SHARE = 0.9
 """Maximum time to the earlier of two moments, as a share of the time to the later one."""
 JOINT = 0.75
@@ -83,9 +85,6 @@ class BalancedPicker:
         _pools: object,
         about: tuple[int, ...],
         *,
-        family: str,
-        subtype: str,
-        suite: str = "dynapix",
         distractors: str,
         **fields: Any,
     ) -> SelectionItem | None:
@@ -94,8 +93,9 @@ class BalancedPicker:
         Args:
             about: Indices of the objects that may move differently and whose positions count.
             distractors: The distractors of the paper's recipe, a key of `NEAREST` or another.
-            fields: The question, and the other fields of the item that apply to its family.
+            fields: Fields of the item, as for `new_item`.
         """
+        family = fields["family"]
         groups = self._groups(scene, timing, about, family)
         if not groups:
             return None
@@ -104,63 +104,55 @@ class BalancedPicker:
             moments += self._wrong_moment(scene, timing, about)
             if len(moments) == 1:
                 return self._drop()
-        velocities = sample_velocities(
-            scene,
-            timing.stop,
-            groups,
-            FUTURES[family],
-            self.balance.rarest_rank("nearness"),
-            self.rng,
-        )
-        futures = simulate_futures(scene, timing.stop, max(moments), velocities, self.world)
-        # In order: the last observed frame, the target, the scene's own future at the wrong moment,
-        # and the alternative futures at each moment.
-        own = scene_states(scene)[[timing.stop, *moments]]
-        others = [futures[:, moment - timing.stop] for moment in moments]
-        name = f"{scene.scene_id}{ALTERNATIVE}{subtype}-{timing.stop}"
-        frames = scene_with_states(scene, name, np.concatenate([own, *others]), self.world)
-        moment_of = [timing.stop, *moments, *np.repeat(moments, len(futures)).tolist()]
-        choices = _choices(len(moments), len(futures))
+        futures = self._simulate(scene, timing.stop, max(moments), groups, FUTURES[family])
+        name = f"{scene.scene_id}{ALTERNATIVE}{fields['subtype']}-{timing.stop}"
+        frames, frame_moments = self._candidate_frames(scene, name, timing.stop, moments, futures)
         displacement = frame_displacements(frames, about)
+        choices = _choices(len(moments), len(futures))
         choices = _distinct(choices, displacement, self.min_displacement)
         choices = _of_difficulty(choices, displacement, NEAREST.get(distractors))
         if not len(choices):
             return self._drop()
         states = [(frames, k) for k in range(frames.frames)]
-        compared = CandidateFrames.of(states, moment_of, self._render(frames))
+        compared = CandidateFrames.of(states, frame_moments, self._render(frames))
         best = self.balance.choose(compared.scores(choices))
         if best is None:
             return self._drop()
-        chosen = choices[best]
         candidates = []
-        for frame in chosen.tolist():
-            moment = moment_of[frame]
+        for frame in choices[best].tolist():
+            moment = frame_moments[frame]
             if frame <= len(moments):
-                source = "target" if frame == 1 else "same_time"
+                source = "target" if frame == TARGET else "same_time"
                 candidates.append(Candidate(scene.scene_id, moment, source))
                 continue
-            index = (frame - 1 - len(moments)) % len(futures)
+            index = (frame - TARGET - len(moments)) % len(futures)
             other = f"{name}-{index}"
             self.save(alternative_scene(scene, other, timing.stop, futures[index], self.world))
             candidates.append(Candidate(other, moment, "alternative"))
-        pairs = frame_displacements(frames)[np.ix_(chosen, chosen)]
-        return SelectionItem(
-            item_id=f"{family}-{subtype}-{scene.scene_id}-{timing.target}",
-            split=scene.split,
-            suite=suite,
-            family=family,
-            subtype=subtype,
-            scene_id=scene.scene_id,
-            prefix_start=timing.start,
-            prefix_stop=timing.stop,
-            target_frame=timing.target,
-            event_frame=timing.event,
-            distractors="alternative",
-            candidates=tuple(candidates),
-            answer=0,
-            min_displacement=float(pairs[np.triu_indices(4, 1)].min()),
-            **fields,
-        )
+        pairs = frame_displacements(frames)[np.ix_(choices[best], choices[best])]
+        least = float(pairs[np.triu_indices(4, 1)].min())
+        return new_item(scene, timing, candidates, least, distractors="alternative", **fields)
+
+    def _simulate(
+        self, scene: Scene, frame: int, last: int, groups: Sequence[Group], count: int
+    ) -> np.ndarray:
+        """Simulate futures from `frame` to `last`, (count, last - frame + 1, N, 13) states."""
+        quarter = self.balance.rarest_rank("nearness")
+        velocities = sample_velocities(scene, frame, groups, count, quarter, self.rng)
+        return simulate_futures(scene, frame, last, velocities, self.world)
+
+    def _candidate_frames(
+        self, scene: Scene, name: str, stop: int, moments: Sequence[int], futures: np.ndarray
+    ) -> tuple[Scene, list[int]]:
+        """Return the frames from which candidates are chosen as a scene, and their moments.
+
+        They are the last observed frame, the scene's own frame at each moment (first the target),
+        and all futures at the first moment, then at the second.
+        """
+        own = scene_states(scene)[[stop, *moments]]
+        others = [futures[:, moment - stop] for moment in moments]
+        frames = scene_with_states(scene, name, np.concatenate([own, *others]), self.world)
+        return frames, [stop, *moments, *np.repeat(moments, len(futures)).tolist()]
 
     def _groups(
         self, scene: Scene, timing: Timing, about: tuple[int, ...], family: str
@@ -216,16 +208,16 @@ Picker = DistractorPicker | BalancedPicker
 
 
 def _choices(moments: int, futures: int) -> np.ndarray:
-    """Return all choices of candidates (T, 4) as indices of frames of the pool; the first is the
-    target.
+    """Return all choices of candidates (T, 4) as indices of the frames of `_candidate_frames`; the
+    first is the target.
 
     With two moments, a choice contains the scene's own and one other future, each at both moments.
     """
-    first = 1 + moments
+    first = TARGET + moments
     if moments == 1:
         triples = list(combinations(range(first, first + futures), 3))
-        return np.array([[1, *triple] for triple in triples])
-    return np.array([[1, 2, first + k, first + futures + k] for k in range(futures)])
+        return np.array([[TARGET, *triple] for triple in triples])
+    return np.array([[TARGET, TARGET + 1, first + k, first + futures + k] for k in range(futures)])
 
 
 def _distinct(choices: np.ndarray, displacement: np.ndarray, least: float) -> np.ndarray:
@@ -242,6 +234,6 @@ def _of_difficulty(
     all choices if `nearest` is None."""
     if nearest is None or len(choices) < 2:
         return choices
-    order = np.argsort(displacement[1, choices[:, 1:]].max(axis=-1), kind="stable")
+    order = np.argsort(displacement[TARGET, choices[:, 1:]].max(axis=-1), kind="stable")
     half = (len(choices) + 1) // 2
     return choices[np.sort(order[:half] if nearest else order[-half:])]

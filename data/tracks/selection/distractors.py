@@ -83,10 +83,6 @@ class DistractorPicker:
         timing: Timing,
         pools: Sequence[Pool],
         about: tuple[int, ...] | None = None,
-        *,
-        family: str,
-        subtype: str,
-        suite: str = "dynapix",
         **fields: Any,
     ) -> SelectionItem | None:
         """Make an item from the first distractors of each pool that differ by `min_displacement`.
@@ -94,7 +90,7 @@ class DistractorPicker:
         Args:
             about: Indices of the objects whose positions count in frames of the item's scene; None
                 for all objects. In frames of other scenes, all objects count.
-            fields: The question, and the other fields of the item that apply to its family.
+            fields: Fields of the item, as for `new_item`.
 
         Returns:
             An item whose first candidate is the target (`data.tracks.quota.fill_quota` shuffles
@@ -118,22 +114,8 @@ class DistractorPicker:
         if len(chosen) < 4:
             self.dropped += 1
             return None
-        return SelectionItem(
-            item_id=f"{family}-{subtype}-{scene.scene_id}-{timing.target}",
-            split=scene.split,
-            suite=suite,
-            family=family,
-            subtype=subtype,
-            scene_id=scene.scene_id,
-            prefix_start=timing.start,
-            prefix_stop=timing.stop,
-            target_frame=timing.target,
-            event_frame=timing.event,
-            candidates=tuple(chosen),
-            answer=0,
-            min_displacement=min(self._displacement(a, b) for a, b in combinations(chosen, 2)),
-            **fields,
-        )
+        least = min(self._displacement(a, b) for a, b in combinations(chosen, 2))
+        return new_item(scene, timing, chosen, least, **fields)
 
     def sample_scenes(self, scene: Scene, rng: np.random.Generator, count: int) -> list[Scene]:
         """Sample up to `count` + 1 other scenes of the split. Scenes that share more objects with
@@ -149,6 +131,40 @@ class DistractorPicker:
         if a.scene_id == b.scene_id:
             return float(frame_displacements(scene, about)[a.frame, b.frame])
         return cross_scene_displacement(scene, a.frame, self.scene_of(b.scene_id), b.frame)
+
+
+def new_item(
+    scene: Scene,
+    timing: Timing,
+    candidates: Sequence[Candidate],
+    min_displacement: float,
+    *,
+    family: str,
+    subtype: str,
+    suite: str = "dynapix",
+    **fields: Any,
+) -> SelectionItem:
+    """Return an item whose first candidate is the target.
+
+    Args:
+        fields: The question, and the other fields of the item that apply to its family.
+    """
+    return SelectionItem(
+        item_id=f"{family}-{subtype}-{scene.scene_id}-{timing.target}",
+        split=scene.split,
+        suite=suite,
+        family=family,
+        subtype=subtype,
+        scene_id=scene.scene_id,
+        prefix_start=timing.start,
+        prefix_stop=timing.stop,
+        target_frame=timing.target,
+        event_frame=timing.event,
+        candidates=tuple(candidates),
+        answer=0,
+        min_displacement=min_displacement,
+        **fields,
+    )
 
 
 def balance_in_time(
