@@ -34,6 +34,7 @@ from data.tracks.shortcuts import (
 )
 from data.world.displacement import cross_scene_displacement
 from data.world.physics import shared_simulator
+from teacher.predicates import extract_predicates
 from tests.data.simulated import CLEVRER, simulate_scene
 
 QUOTAS = {"future_match_gap10": 2, "future_cross_gap10": 2, "contact_offset": 2}
@@ -129,6 +130,17 @@ def test_hard_distractors_are_nearer_to_the_target_than_easy_ones() -> None:
     assert near.max() <= far.min()
     assert len(near) == len(far) == len(choices) / 2
     assert balanced._of_difficulty(choices, displacement, None) is choices
+
+
+@pytest.mark.slow
+def test_predicates_tell_the_candidates_apart(store: Store, items: list[SelectionItem]) -> None:
+    facts = [extract_predicates(i, store.scene(i.scene_id), store.scene) for i in items]
+    pairs = [(f, i) for f, i in zip(facts, items, strict=True) if f]
+    assert len(pairs) > len(items) / 3
+    for found, item in pairs:
+        assert found.answer == item.letter
+        assert not any(candidate.other_objects for candidate in found.candidates)
+        assert all(candidate.differences for candidate in found.candidates if not candidate.agrees)
 
 
 @pytest.mark.slow

@@ -19,7 +19,9 @@ from conf.schema import (
     SelectionConfig,
     WorldConfig,
 )
+from conf.schema.benchmark import SCENE_FPS, SCENE_FRAMES
 from conf.schema.world import (
+    SLIDE_FRAMES,
     ByMaterial,
     CameraConfig,
     LightConfig,
@@ -28,10 +30,11 @@ from conf.schema.world import (
 )
 from data.build import check_quota_names, ensure_items
 from data.parallel import Workers
-from data.records import Scene, SceneObject
+from data.records import FPS, FRAMES, SPEED_BOUNDS, Scene, SceneObject
 from data.render.bullet import OVERSAMPLING, BulletRenderer
 from data.render.frame_cache import render_frames
 from data.store import Store
+from data.world import sliding
 from data.world.camera import Camera
 from data.world.events import find_motion_onsets
 from data.world.parts import part_box, surface_height, world_boxes
@@ -476,6 +479,14 @@ def test_quota_of_a_family_that_the_suite_lacks_is_refused() -> None:
     cfg = compose("data.build", BuildCommand, ["benchmark=standin_movi_a"]).benchmark
     with raises_user_error("unknown-option", contains="benchmark.selection.window"):
         check_quota_names(replace(cfg, selection=window))
+
+
+def test_limits_of_the_schema_are_those_of_the_simulation() -> None:
+    """The schema cannot import the packages that simulate, so that it repeats their constants."""
+    assert SLIDE_FRAMES == sliding.EARLIEST + sliding.TAIL + 1
+    assert (SCENE_FRAMES, SCENE_FPS) == (FRAMES, FPS)
+    assert WorldConfig().speed_bounds == [*SPEED_BOUNDS]
+    assert Camera.from_settings(CameraConfig()) == Camera()
 
 
 def test_camera_projects_its_aim_to_the_middle_of_the_image() -> None:
