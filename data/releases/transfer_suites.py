@@ -101,7 +101,7 @@ def transfer_family(
         return picker.make_item(
             scene,
             timing,
-            [
+            lambda: [
                 (scene_candidates(scene, wrong, "same_time"), same_scene),
                 (cross_scene_candidates(cell, scene, rng, picker), 3 - same_scene),
             ],

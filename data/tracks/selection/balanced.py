@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -72,7 +72,6 @@ class BalancedPicker:
     save: Callable[[Scene], None]
     dropped: int = 0
     balance: Balance = field(init=False)
-    uses_pools: ClassVar[bool] = False
     _tries: tuple[str, int] = ("", 0)
 
     def __post_init__(self) -> None:
@@ -82,7 +81,7 @@ class BalancedPicker:
         self,
         scene: Scene,
         timing: Timing,
-        _pools: object,
+        _make_pools: object,
         about: tuple[int, ...],
         *,
         distractors: str,

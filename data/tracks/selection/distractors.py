@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, islice
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -74,20 +74,19 @@ class DistractorPicker:
     scene_ids: list[str]
     scene_of: Callable[[str], Scene]
     dropped: int = 0
-    uses_pools: ClassVar[bool] = True
-    """Whether `make_item` chooses distractors from the pools that families prepare."""
 
     def make_item(
         self,
         scene: Scene,
         timing: Timing,
-        pools: Sequence[Pool],
+        make_pools: Callable[[], Sequence[Pool]],
         about: tuple[int, ...] | None = None,
         **fields: Any,
     ) -> SelectionItem | None:
         """Make an item from the first distractors of each pool that differ by `min_displacement`.
 
         Args:
+            make_pools: Function that returns the possible distractors. A balanced item needs none.
             about: Indices of the objects whose positions count in frames of the item's scene; None
                 for all objects. In frames of other scenes, all objects count.
             fields: Fields of the item, as for `new_item`.
@@ -96,6 +95,7 @@ class DistractorPicker:
             An item whose first candidate is the target (`data.tracks.quota.fill_quota` shuffles
             the candidates), or None if fewer than three distractors differ enough.
         """
+        pools = make_pools()
         chosen = [Candidate(scene.scene_id, timing.target)]
         for k, (pool, count) in enumerate(pools):
             # Stop if the remaining pools cannot complete the item.

@@ -7,7 +7,7 @@ later.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from data.records import Candidate, Scene, SelectionItem
 from data.tracks.selection.balanced import Picker
 from data.tracks.selection.distractors import (
     Family,
+    Pool,
     Timing,
     balance_in_time,
     scene_candidates,
@@ -71,19 +72,21 @@ def make_item(
 ) -> SelectionItem | None:
     """Make an item of a cell around a collision."""
     cell = CELLS[subtype]
-    if not picker.uses_pools:
-        pools = []
-    elif cell.distractors == "cross_scene":
-        scenes = picker.sample_scenes(scene, rng, CROSS_SCENES)
-        targets = ((other, timings(subtype, other, timing.observed)) for other in scenes)
-        pools = [((Candidate(o.scene_id, t[0].target, "cross_scene") for o, t in targets if t), 3)]
-    else:
-        wrong = scene_candidates(scene, _wrong_frames(cell, scene, timing, rng), cell.distractors)
-        pools = balance_in_time(wrong, timing.target, rng)
+
+    def make_pools() -> Sequence[Pool]:
+        if cell.distractors == "cross_scene":
+            scenes = picker.sample_scenes(scene, rng, CROSS_SCENES)
+            found = ((other, timings(subtype, other, timing.observed)) for other in scenes)
+            targets = (Candidate(o.scene_id, t[0].target, "cross_scene") for o, t in found if t)
+            return [(targets, 3)]
+        frames = _wrong_frames(cell, scene, timing, rng)
+        wrong = scene_candidates(scene, frames, cell.distractors)
+        return balance_in_time(wrong, timing.target, rng)
+
     return picker.make_item(
         scene,
         timing,
-        pools,
+        make_pools,
         visible_objects(scene, timing),
         family="event",
         subtype=subtype,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from data.records import SELECTION_SECOND, Scene, SelectionItem
 from data.tracks.selection.balanced import Picker
 from data.tracks.selection.distractors import (
     Family,
+    Pool,
     Timing,
     balance_in_time,
     scene_candidates,
@@ -44,12 +47,16 @@ def make_item(
     """
     horizon = timing.target - timing.stop
     seconds = horizon // SELECTION_SECOND
-    later = rng.permutation(np.arange(timing.stop + 1, scene.frames))
-    wrong = scene_candidates(scene, later[later != timing.target], "same_time")
+
+    def make_pools() -> Sequence[Pool]:
+        later = rng.permutation(np.arange(timing.stop + 1, scene.frames))
+        wrong = scene_candidates(scene, later[later != timing.target], "same_time")
+        return balance_in_time(wrong, timing.target, rng)
+
     return picker.make_item(
         scene,
         timing,
-        balance_in_time(wrong, timing.target, rng),
+        make_pools,
         visible_objects(scene, timing),
         family="time",
         subtype=f"in_{seconds}s",

@@ -9,6 +9,7 @@ most similar to the target; those of easy items are random frames of the less si
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 
@@ -19,6 +20,7 @@ from data.records import Scene, SelectionItem
 from data.tracks.selection.balanced import Picker
 from data.tracks.selection.distractors import (
     Family,
+    Pool,
     Timing,
     balance_in_time,
     scene_candidates,
@@ -68,16 +70,22 @@ def make_item(
     about = visible if subjects is None else tuple(k for k in subjects if k in visible)
     if not about:
         return None
-    similar = np.argsort(object_match_scores(scene, timing.target, about), kind="stable")
-    frames = np.array(timing.outside_prefix(similar[similar != timing.target]))
-    source = "same_near"
-    if cell.difficulty == "easy":
-        # Shuffled, because the least similar frames are consecutive and the target would stand out.
-        frames, source = rng.permutation(frames[len(frames) // 2 :]), "same_far"
+    is_hard = cell.difficulty == "hard"
+    source = "same_near" if is_hard else "same_far"
+
+    def make_pools() -> Sequence[Pool]:
+        similar = np.argsort(object_match_scores(scene, timing.target, about), kind="stable")
+        frames = np.array(timing.outside_prefix(similar[similar != timing.target]))
+        if not is_hard:
+            # Shuffled, because the least similar frames are consecutive and the target would stand
+            # out.
+            frames = rng.permutation(frames[len(frames) // 2 :])
+        return balance_in_time(scene_candidates(scene, frames, source), timing.target, rng)
+
     return picker.make_item(
         scene,
         timing,
-        balance_in_time(scene_candidates(scene, frames, source), timing.target, rng),
+        make_pools,
         about,
         family="window",
         subtype=subtype,
