@@ -53,6 +53,11 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
 
 def measure_shortcuts(items: list[SelectionItem], store: Store, blind: bool) -> pd.DataFrame:
     """Return the accuracy of each shortcut on the items of the test split, by category."""
+    blind_right = {}
+    if blind:
+        from data.publish.blind import blind_accuracies
+
+        blind_right = blind_accuracies(items, store, store.manifest["seed"])
     progress = tqdm(items, desc="scoring shortcuts", unit="item", disable=None)
     scores = np.stack([shortcuts.item_scores(item, store) for item in progress])
     answers = np.array([item.answer for item in items])
@@ -60,11 +65,8 @@ def measure_shortcuts(items: list[SelectionItem], store: Store, blind: bool) -> 
         shortcuts.simple_accuracies(scores, answers), columns=list(shortcuts.SIMPLE)
     )
     right[LOGISTIC] = shortcuts.logistic_accuracies(items, scores, answers)
-    if blind:
-        from data.publish.blind import blind_accuracies
-
-        for name, values in blind_accuracies(items, store, store.manifest["seed"]).items():
-            right[name] = values
+    for name, values in blind_right.items():
+        right[name] = values
     right["category"] = [list(_categories(item)) for item in items]
     test = right[[item.split == "test" for item in items]]
     categories = test.explode("category").groupby("category")

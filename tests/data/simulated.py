@@ -8,6 +8,11 @@ from data.records import Scene
 from data.world.sampling import format_scene_id, record_scene, sample_scene
 
 CLEVRER = WorldConfig()
+WORLDS = [
+    "clevrer", "dusk", "falling", "masses", "movi_a", "near", "physion", "ramp", "screen",
+    "settling",
+]  # fmt: skip
+"""Names of the presets in conf/world."""
 
 
 def preset_world(name: str) -> WorldConfig:
