@@ -33,7 +33,6 @@ def test_blind_model_finds_a_shortcut_and_nothing_without_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(blind, "EPOCHS", 6)
-    monkeypatch.setattr(blind, "WIDTH", 32)
     features, answers = random_features(900)
     nothing = train_model("nothing", features[:600], answers[:600], seed=0)
     assert is_right(nothing, features[600:], answers[600:]).mean() < 0.33
