@@ -56,5 +56,11 @@ def summarize_store(store: Store) -> str:
     """Format a store's counts and shortfalls as a table."""
     lines = [f"{store.folder} ({len(store.manifest['files'])} files, {store.identity})"]
     lines += [f"  {name:<36}{n:>8,}" for name, n in store.manifest["counts"].items()]
-    lines += [f"  short: {cell} has {n}" for cell, n in store.manifest["shortfalls"].items()]
+    shortfalls = store.manifest["shortfalls"]
+    lines += [f"  short: {cell} has {n}" for cell, n in shortfalls.items()]
+    if shortfalls:
+        lines.append(
+            "  to fill them, raise benchmark.scenes, or lower their quotas or "
+            "benchmark.selection.min_displacement"
+        )
     return "\n".join(lines)

@@ -32,6 +32,7 @@ from data.tracks.shortcuts import (
     logistic_features,
     simple_accuracies,
 )
+from data.tracks.shortfalls import summarize_store
 from data.world.displacement import cross_scene_displacement
 from data.world.parts import world_boxes
 from data.world.physics import shared_simulator
@@ -93,6 +94,16 @@ def test_families_fill_their_quotas(store: Store, items: list[SelectionItem]) ->
     assert {i.family for i in items} == {"event", "time", "window"}
     assert len(items) > 0.7 * (sum(QUOTAS.values()) + 8 + 4)
     assert {i.distractors for i in items} == {"alternative"}
+
+
+@pytest.mark.slow
+def test_short_cells_are_named_with_the_settings_to_change(tmp_path: Path) -> None:
+    selection = replace(settings("short").selection, min_displacement=90.0, time={}, window={})
+    cfg = settings("short", scenes=6, selection=selection)
+    cfg.retrieval.builders = {"1": Quota(2, 0)}
+    summary = summarize_store(ensure_items(cfg, tmp_path, Workers(1)))
+    assert "short: event/contact_offset/test has 0 of 2" in summary
+    assert "raise benchmark.scenes" in summary.splitlines()[-1]
 
 
 @pytest.mark.slow
