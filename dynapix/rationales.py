@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from conf.errors import UserError
 from dynapix.benchmark import Item
 from teacher.numbers.detection import find_numbers
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from teacher.reading.grounding import VERDICTS, Claim
 from teacher.validation.claim_extraction import extract_claims
 

@@ -23,7 +23,7 @@ from conf.errors import UserError
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
 from teacher.narrator import write_rationale
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from teacher.rationale_log import Journal, save_accepted
 from teacher.report import Figures, rejection_reasons, select_accepted, summarize, write_report
 from teacher.servers.responses import Response

@@ -14,7 +14,8 @@ import numpy as np
 import yaml
 
 from data.records import Scene, SelectionItem
-from teacher.predicates import (
+from teacher.predicates.extraction import extract_facts
+from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
     Difference,
@@ -22,7 +23,6 @@ from teacher.predicates import (
     Meeting,
     ObjectFacts,
     Predicates,
-    extract_facts,
 )
 
 PHRASES = yaml.safe_load((files("teacher") / "templates" / "phrases.yaml").read_text())

@@ -11,7 +11,7 @@ from importlib.resources import files
 
 from conf.schema import TeacherConfig
 from data.records import SelectionItem
-from teacher.predicates import Predicates
+from teacher.predicates.facts import Predicates
 from teacher.sections import SECTIONS
 
 PROMPT_VERSION = "3"

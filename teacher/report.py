@@ -15,7 +15,7 @@ import numpy as np
 
 from conf.files import write_json, write_text
 from data.records import COLORS, MATERIALS, Rationale, SelectionItem
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from teacher.validation.validator import WORD
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from teacher.prompts import build_messages
 from teacher.sections import GRAMMAR
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited

@@ -28,14 +28,8 @@ from pydantic import TypeAdapter
 from data.records import COLORS, LETTERS
 from data.store import open_store
 from teacher.narrator import write_rationale
-from teacher.predicates import (
-    COMPASS,
-    REGIONS,
-    SPEEDS,
-    VERY_FAST,
-    Predicates,
-    extract_predicates,
-)
+from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.facts import COMPASS, REGIONS, SPEEDS, VERY_FAST, Predicates
 from teacher.validation.claim_extraction import extract_claims
 
 ALL_REGIONS = [region for row in REGIONS for region in row]

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
 
-from teacher.predicates import COMPASS, OUT_OF_VIEW, Difference, ObjectFacts, Predicates
+from teacher.predicates.facts import COMPASS, OUT_OF_VIEW, Difference, ObjectFacts, Predicates
 from teacher.reading.phrases import COARSE
 
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"

@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import yaml
 
-from teacher.predicates import COMPASS
+from teacher.predicates.facts import COMPASS
 
 COARSE = "~"
 """Prefix of a value that the text states only roughly. "Leftward" has the value "~west": true for

@@ -12,7 +12,7 @@ from collections.abc import Container, Iterator, Sequence
 from typing import NamedTuple
 
 from data.records import COLORS, LETTERS, MATERIALS, SHAPES
-from teacher.predicates import REGIONS
+from teacher.predicates.facts import REGIONS
 from teacher.reading.phrases import COARSE, VOCABULARY
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")

@@ -7,7 +7,7 @@ The package `teacher.reading` describes the steps.
 
 from __future__ import annotations
 
-from teacher.predicates import Predicates
+from teacher.predicates.facts import Predicates
 from teacher.reading.candidates import CandidateReader
 from teacher.reading.grounding import CUT, EITHER, TARGET, Claim, IndexedPredicates
 from teacher.reading.scenes import SceneReader

@@ -9,7 +9,7 @@ from collections import Counter
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
 from teacher.narrator import NARRATOR_VERSION
-from teacher.predicates import Predicates
+from teacher.predicates.facts import Predicates
 from teacher.prompts import PROMPT_VERSION
 from teacher.reading.grounding import VERDICTS
 from teacher.sections import GRAMMAR_VERSION

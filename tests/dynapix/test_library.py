@@ -314,7 +314,7 @@ def test_embeddings_of_another_shape_or_database_are_refused(bench) -> None:
 
 def test_a_rationale_is_scored_by_the_oracle(micro_store) -> None:
     from teacher.narrator import write_rationale
-    from teacher.predicates import extract_predicates
+    from teacher.predicates.extraction import extract_predicates
 
     train = dynapix.load(micro_store.folder, split="train")
     item = next(

@@ -10,7 +10,7 @@ import numpy as np
 from conf.schema import TeacherConfig
 from data.records import Scene, SelectionItem
 from teacher.narrator import write_rationale
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from teacher.prompts import build_messages
 from tests.teacher import synthetic
 

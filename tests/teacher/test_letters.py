@@ -8,7 +8,7 @@ import pytest
 from conf.schema import TeacherConfig
 from teacher.candidate_letters import find_letters, relabel_text, reorder_candidates
 from teacher.narrator import write_rationale
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from teacher.validation.validator import validate_rationale
 
 ORDERS = list(permutations(range(4)))

@@ -10,7 +10,7 @@ import pytest
 from conf.schema import TeacherConfig
 from teacher.narrator import write_description, write_rationale
 from teacher.numbers.detection import find_numbers
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from teacher.validation.validator import WORD, validate_rationale
 from tests.children import run_child
 from tests.teacher import synthetic

@@ -9,15 +9,10 @@ from itertools import combinations
 import numpy as np
 
 from teacher.numbers.detection import find_numbers
-from teacher.predicates import (
-    COMPASS,
-    REGIONS,
-    compass_direction,
-    extract_facts,
-    extract_predicates,
-    find_collision_courses,
-    find_cut,
-)
+from teacher.predicates.extraction import extract_facts, extract_predicates
+from teacher.predicates.facts import COMPASS, REGIONS
+from teacher.predicates.motion import find_collision_courses, find_cut
+from teacher.predicates.places import compass_direction
 from tests.teacher import synthetic
 
 

@@ -21,7 +21,7 @@ from models.student.prompts import (
 )
 from teacher.candidate_letters import relabel_text, reorder_candidates
 from teacher.narrator import write_match_lines
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
 from train.tiny_base import questions

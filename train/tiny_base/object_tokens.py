@@ -20,7 +20,7 @@ from transformers import ProcessorMixin
 from data.records import COLORS, MATERIALS, SHAPES
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
-from teacher.predicates import COMPASS
+from teacher.predicates.facts import COMPASS
 from train.student.trainer import StudentTrainer
 
 WEIGHT = 6.0

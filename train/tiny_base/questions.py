@@ -28,14 +28,10 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.prompts import Clip, ObjectLabel, Sample, answer_line, conversation, load_clip
 from teacher.narrator import write_description, write_match_lines
-from teacher.predicates import (
-    REGIONS,
-    Predicates,
-    extract_facts,
-    extract_predicates,
-    object_heading,
-    object_region,
-)
+from teacher.predicates.extraction import extract_facts, extract_predicates
+from teacher.predicates.facts import REGIONS, Predicates
+from teacher.predicates.motion import object_heading
+from teacher.predicates.places import object_region
 from train.student.lazy_samples import LazySample, seeded_rng
 
 FRAME = "Describe the frame."

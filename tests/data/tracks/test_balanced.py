@@ -37,7 +37,7 @@ from data.world.displacement import cross_scene_displacement
 from data.world.parts import world_boxes
 from data.world.physics import shared_simulator
 from data.world.shapes import RADIUS, rotation_matrix
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from tests.data.simulated import CLEVRER, simulate_scene
 
 QUOTAS = {"future_match_gap10": 2, "future_cross_gap10": 2, "contact_offset": 2}

@@ -38,7 +38,7 @@ from data.world.camera import Camera
 from data.world.events import find_motion_onsets
 from data.world.sampling import sample_scene
 from data.world.shapes import RADIUS
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from tests.data.simulated import WORLDS, preset_world, simulate_scene
 from tests.data.world.test_physics import fingerprint
 from tests.user_errors import raises_user_error

@@ -13,7 +13,7 @@ from models.student.answer_parser import parse_choice
 from models.student.collator import encode
 from models.student.prompts import answer_line, instruction
 from teacher.narrate import ensure_rationales
-from teacher.predicates import extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale

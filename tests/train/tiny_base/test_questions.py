@@ -12,7 +12,8 @@ import pytest
 from data.records import LETTERS
 from data.store import Store
 from models.student.prompts import Sample
-from teacher.predicates import find_cut, object_region
+from teacher.predicates.motion import find_cut
+from teacher.predicates.places import object_region
 from train.student.lazy_samples import LazySample
 from train.tiny_base import questions
 from train.tiny_base.questions import visible_objects, visible_regions

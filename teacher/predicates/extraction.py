@@ -1,0 +1,153 @@
+"""Extracts the predicates of an item from the oracle of its scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from data.records import LETTERS, Candidate, Scene, SelectionItem
+from teacher.predicates.facts import (
+    OUT_OF_VIEW,
+    CandidateFacts,
+    Difference,
+    Facts,
+    ObjectFacts,
+    Predicates,
+)
+from teacher.predicates.motion import (
+    describe_meeting,
+    find_collision_courses,
+    find_cut,
+    motion_start,
+    object_heading,
+    object_speed,
+)
+from teacher.predicates.places import (
+    IMAGE_SIZE,
+    close_pairs,
+    compass_direction,
+    object_region,
+    object_sight,
+    square_position,
+)
+
+STAYS, SHIFTS = 8.0, 60.0
+"""Upper bounds of the displacement (px of the square image) of an object that "stays", and of one
+that "shifts slightly". An object that moves further "moves across"."""
+BORDER = 6.0
+"""Displacement (px of the square image) below which a change of region is ignored."""
+DISPLACED, CLEARLY = 12.0, 40.0
+"""Displacements (px of the square image) from which an object counts as displaced, and as displaced
+"clearly" rather than "slightly"."""
+
+
+def extract_facts(
+    scene: Scene, start: int, stop: int, target: int, moment: str = "at the target moment"
+) -> Facts | None:
+    """Return the facts for the prefix [start, stop] and a target frame; None if the prefix is too
+    short (see `find_cut`). `moment` names the target in words."""
+    cut = find_cut(scene, start, stop)
+    if cut is None:
+        return None
+    objects = tuple(_object_facts(scene, i, cut, target) for i in range(len(scene.objects)))
+    contacts = [c.objects for c in scene.collisions if cut < c.frame <= target]
+    return Facts(
+        instant="at the end of the observation" if cut == stop else "just before the contact",
+        moment=moment,
+        objects=objects,
+        entering=tuple(o.object for o in objects if o.enters),
+        leaving=tuple(o.object for o in objects if o.leaves),
+        courses=tuple(describe_meeting(scene, p, cut) for p in find_collision_courses(scene, cut)),
+        contacts=tuple(describe_meeting(scene, pair, cut) for pair in dict.fromkeys(contacts)),
+        close=close_pairs(scene, target),
+    )
+
+
+def extract_predicates(
+    item: SelectionItem, scene: Scene, scene_of: Callable[[str], Scene]
+) -> Predicates | None:
+    """Return the predicates of an item; None if the prefix is too short (see `find_cut`).
+
+    `scene_of` returns a scene by its id; it is called for candidates from other scenes.
+    """
+    moment = {"future": "at the collision", "contact": "just after the collision"}.get(
+        item.framing or "", "at the target moment"
+    )
+    facts = extract_facts(scene, item.prefix_start, item.prefix_stop, item.target_frame, moment)
+    if facts is None:
+        return None
+    candidates = tuple(
+        CandidateFacts(letter, True, False, ())
+        if letter == item.letter
+        else _candidate_facts(letter, scene, item.target_frame, candidate, scene_of)
+        for letter, candidate in zip(LETTERS, item.candidates, strict=True)
+    )
+    return Predicates(**vars(facts), candidates=candidates)
+
+
+def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFacts:
+    sight, target_sight = object_sight(scene, cut, index), object_sight(scene, target, index)
+    speed = heading = travel = None
+    if sight != OUT_OF_VIEW:
+        speed = object_speed(scene, index, cut)
+        heading = object_heading(scene, index, motion_start(scene, index, cut), cut)
+    shift = square_position(scene, target, index) - square_position(scene, cut, index)
+    distance = float(np.hypot(*shift))
+    if sight == OUT_OF_VIEW == target_sight:
+        extent = "unseen"
+    elif distance < STAYS:
+        extent = "stays"
+    else:
+        extent = "shifts slightly" if distance < SHIFTS else "moves across"
+        travel = compass_direction(shift)
+    return ObjectFacts(
+        object=scene.objects[index].noun_phrase,
+        region=object_region(scene, cut, index),
+        sight=sight,
+        speed=speed,
+        heading=heading,
+        target_region=object_region(scene, target, index),
+        target_sight=target_sight,
+        extent=extent,
+        travel=travel,
+    )
+
+
+def _candidate_facts(
+    letter: str,
+    scene: Scene,
+    target: int,
+    candidate: Candidate,
+    scene_of: Callable[[str], Scene],
+) -> CandidateFacts:
+    other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
+    frame = candidate.frame
+    in_target, in_candidate = (
+        {key: k for k, key in enumerate(s.object_keys)} for s in (scene, other)
+    )
+    ranked: list[tuple[tuple[bool, bool, float], Difference]] = []
+    for key in {**in_target, **in_candidate}:
+        name, i, j = key[0].noun_phrase, in_target.get(key), in_candidate.get(key)
+        expected = i is not None and object_sight(scene, target, i) == "shown"
+        visible = j is not None and object_sight(other, frame, j) == "shown"
+        if expected != visible:
+            difference = Difference(name, "missing" if expected else "extra")
+            ranked.append(((True, True, float(IMAGE_SIZE)), difference))
+        elif i is not None and j is not None:
+            shift = square_position(other, frame, j) - square_position(scene, target, i)
+            distance = float(np.hypot(*shift))
+            region = object_region(other, frame, j)
+            if region != object_region(scene, target, i):
+                bound, difference = BORDER, Difference(name, "region", region=region)
+            else:
+                extent = "clearly" if distance >= CLEARLY else "slightly"
+                heading = compass_direction(shift)
+                difference = Difference(name, "displaced", heading=heading, extent=extent)
+                bound = DISPLACED
+            ranked.append(((visible and distance >= bound, visible, distance), difference))
+    ranked.sort(key=lambda entry: entry[0], reverse=True)
+    # If every difference is below its bound, name the largest: the candidate is not the target.
+    differences = tuple(d for (clear, *_), d in ranked if clear) or (ranked[0][1],)
+    other_objects = in_target.keys() != in_candidate.keys()
+    return CandidateFacts(letter, False, other_objects, differences)

@@ -1,0 +1,134 @@
+"""Predicates: qualitative facts from the oracle that a rationale may state.
+
+They describe the scene at two frames, the cut and the target. The cut is the last frame that the
+rationale treats as observed: the end of the prefix, or an earlier frame if a collision follows
+shortly (see `teacher.predicates.motion.find_cut`). No fact contains a number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SPEEDS = ("slowly", "steadily", "quickly")
+"""Words for speeds below each of the bounds of a scene; above these, it is VERY_FAST."""
+VERY_FAST = "very quickly"
+COMPASS = ("east", "southeast", "south", "southwest", "west", "northwest", "north", "northeast")
+"""Directions in the image, clockwise from the x axis, which points right; south is down."""
+REGIONS = (
+    ("near the top-left", "near the top", "near the top-right"),
+    ("near the left", "near the center", "near the right"),
+    ("near the bottom-left", "near the bottom", "near the bottom-right"),
+)
+OUT_OF_VIEW = "out of view"
+
+
+@dataclass(frozen=True)
+class ObjectFacts:
+    """One object at the cut and at the target.
+
+    `sight` and `target_sight` are "shown", "hidden" (in view but covered) or "out of view". `speed`
+    is "stationary" or a word for the speed at the cut, and `heading` the compass word of the motion
+    at the cut. Both are None if the object is out of view; `heading` is also None if the object is
+    stationary or is hit at the cut. `extent` describes the displacement from the cut to the target;
+    it is "unseen" if the object is out of view at both. `travel` is the compass word of this
+    displacement; None if the object stays or is unseen.
+    """
+
+    object: str
+    region: str
+    sight: str
+    speed: str | None
+    heading: str | None
+    target_region: str
+    target_sight: str
+    extent: str
+    travel: str | None
+
+    @property
+    def enters(self) -> bool:
+        return self.sight == OUT_OF_VIEW != self.target_sight
+
+    @property
+    def leaves(self) -> bool:
+        return self.sight != OUT_OF_VIEW == self.target_sight
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """Two objects, and when they collide after the cut.
+
+    `when` is "imminent", "soon" or "later"; None if they do not collide any more, or "unseen" if
+    the scene ends while they still approach each other.
+    """
+
+    objects: tuple[str, str]
+    when: str | None
+
+
+@dataclass(frozen=True)
+class Closeness:
+    """Two objects that are very close at the target, and the region midway between them."""
+
+    objects: tuple[str, str]
+    region: str
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One object that a candidate shows differently from the target.
+
+    `kind` is "region" (the candidate shows the object in another region, `region`), "displaced"
+    (it shows the object in the same region, but displaced toward `heading` by an `extent` of
+    "slightly" or "clearly"), "missing" (the object is visible only in the target) or "extra" (it is
+    visible only in the candidate).
+    """
+
+    object: str
+    kind: str
+    region: str | None = None
+    heading: str | None = None
+    extent: str | None = None
+
+
+@dataclass(frozen=True)
+class CandidateFacts:
+    """A candidate compared with the target.
+
+    `agrees` is true for the target itself. `differences` are sorted, the largest first.
+    `other_objects` is true if the candidate's scene has a different set of objects.
+    """
+
+    letter: str
+    agrees: bool
+    other_objects: bool
+    differences: tuple[Difference, ...]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """A scene at the cut and at the target; `instant` names the cut in words, `moment` the target.
+
+    `entering` and `leaving` are the objects that come into view and go out of view from the cut to
+    the target. `courses` are pairs on a collision course at the cut. `contacts` are all pairs that
+    collide from the cut to the target. `close` are pairs that are very close at the target.
+    """
+
+    instant: str
+    moment: str
+    objects: tuple[ObjectFacts, ...]
+    entering: tuple[str, ...]
+    leaving: tuple[str, ...]
+    courses: tuple[Meeting, ...]
+    contacts: tuple[Meeting, ...]
+    close: tuple[Closeness, ...]
+
+
+@dataclass(frozen=True)
+class Predicates(Facts):
+    """Facts about an item's scene and about its four candidates."""
+
+    candidates: tuple[CandidateFacts, ...]
+
+    @property
+    def answer(self) -> str:
+        return next(c.letter for c in self.candidates if c.agrees)
