@@ -14,6 +14,9 @@ from teacher.predicates.facts import (
     Facts,
     ObjectFacts,
     Predicates,
+    Relation,
+    RelationalPredicates,
+    View,
 )
 from teacher.predicates.motion import (
     describe_meeting,
@@ -31,6 +34,7 @@ from teacher.predicates.places import (
     object_sight,
     square_position,
 )
+from teacher.predicates.relations import Bounds, Places, find_changes, find_relations
 
 STAYS, SHIFTS = 8.0, 60.0
 """Upper bounds of the displacement (px of the square image) of an object that "stays", and of one
@@ -50,7 +54,9 @@ def extract_facts(
     cut = find_cut(scene, start, stop)
     if cut is None:
         return None
-    objects = tuple(_object_facts(scene, i, cut, target) for i in range(len(scene.objects)))
+    objects = tuple(
+        _object_facts(scene, i, cut, scene, i, target) for i in range(len(scene.objects))
+    )
     contacts = [c.objects for c in scene.collisions if cut < c.frame <= target]
     return Facts(
         instant="at the end of the observation" if cut == stop else "just before the contact",
@@ -65,11 +71,16 @@ def extract_facts(
 
 
 def extract_predicates(
-    item: SelectionItem, scene: Scene, scene_of: Callable[[str], Scene]
+    item: SelectionItem,
+    scene: Scene,
+    scene_of: Callable[[str], Scene],
+    bounds: Bounds | None = None,
 ) -> Predicates | None:
     """Return the predicates of an item; None if the prefix is too short (see `find_cut`).
 
-    `scene_of` returns a scene by its id; it is called for candidates from other scenes.
+    Args:
+        scene_of: Returns a scene by its id; it is called for candidates from other scenes.
+        bounds: Bounds of relations; without them, the result is not `RelationalPredicates`.
     """
     moment = {"future": "at the collision", "contact": "just after the collision"}.get(
         item.framing or "", "at the target moment"
@@ -83,31 +94,92 @@ def extract_predicates(
         else _candidate_facts(letter, scene, item.target_frame, candidate, scene_of)
         for letter, candidate in zip(LETTERS, item.candidates, strict=True)
     )
-    return Predicates(**vars(facts), candidates=candidates)
+    if bounds is None:
+        return Predicates(**vars(facts), candidates=candidates)
+    cut = find_cut(scene, item.prefix_start, item.prefix_stop)
+    observed, views = _describe_views(item, scene, scene_of, cut, bounds)
+    return RelationalPredicates(
+        **vars(facts), candidates=candidates, observed=observed, views=views
+    )
 
 
-def _object_facts(scene: Scene, index: int, cut: int, target: int) -> ObjectFacts:
-    sight, target_sight = object_sight(scene, cut, index), object_sight(scene, target, index)
+def _describe_views(
+    item: SelectionItem,
+    scene: Scene,
+    scene_of: Callable[[str], Scene],
+    cut: int,
+    bounds: Bounds,
+) -> tuple[tuple[Relation, ...], tuple[View, ...]]:
+    """Return the relations at the cut, and the views of the candidates."""
+    earlier = Places.of(scene, cut)
+    views = []
+    for letter, candidate in zip(LETTERS, item.candidates, strict=True):
+        other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
+        index = {key: k for k, key in enumerate(other.object_keys)}
+        objects = tuple(
+            _object_facts(scene, k, cut, other, index.get(key), candidate.frame)
+            for k, key in enumerate(scene.object_keys)
+        )
+        later = Places.of(other, candidate.frame)
+        at_rest = {o.object for o in objects if o.extent == "stays"}
+        relations = find_relations(later, bounds)
+        relations |= find_changes(earlier, later, at_rest, bounds)
+        close = close_pairs(other, candidate.frame)
+        offsets = _offsets(scene, item.target_frame, other, candidate.frame)
+        views.append(View(letter, objects, close, tuple(sorted(relations)), offsets))
+    return tuple(sorted(find_relations(earlier, bounds))), tuple(views)
+
+
+def _offsets(scene: Scene, target: int, other: Scene, frame: int) -> dict[str, float]:
+    """Return how far each object is from its place at the target; see `View`."""
+    index = {key: k for k, key in enumerate(other.object_keys)}
+    offsets = {}
+    for k, key in enumerate(scene.object_keys):
+        j = index.get(key)
+        was, shown = object_sight(scene, target, k), j is not None and object_sight(other, frame, j)
+        if was != "shown" and shown != "shown":
+            offset = 0.0
+        elif was == shown:
+            shift = square_position(other, frame, j) - square_position(scene, target, k)
+            offset = float(np.hypot(*shift))
+        else:
+            offset = float(IMAGE_SIZE)
+        offsets[key[0].noun_phrase] = offset
+    return offsets
+
+
+def _object_facts(
+    scene: Scene, index: int, cut: int, other: Scene, other_index: int | None, target: int
+) -> ObjectFacts:
+    """Return the facts of an object at the cut of a scene and at a frame of another scene, where it
+    has another index; None if that scene lacks the object."""
+    sight, target_sight = object_sight(scene, cut, index), OUT_OF_VIEW
+    target_region = OUT_OF_VIEW
+    if other_index is not None:
+        target_sight = object_sight(other, target, other_index)
+        target_region = object_region(other, target, other_index)
     speed = heading = travel = None
     if sight != OUT_OF_VIEW:
         speed = object_speed(scene, index, cut)
         heading = object_heading(scene, index, motion_start(scene, index, cut), cut)
-    shift = square_position(scene, target, index) - square_position(scene, cut, index)
-    distance = float(np.hypot(*shift))
     if sight == OUT_OF_VIEW == target_sight:
         extent = "unseen"
-    elif distance < STAYS:
-        extent = "stays"
+    elif other_index is None:
+        extent = "moves across"
     else:
-        extent = "shifts slightly" if distance < SHIFTS else "moves across"
-        travel = compass_direction(shift)
+        shift = square_position(other, target, other_index) - square_position(scene, cut, index)
+        distance = float(np.hypot(*shift))
+        extent = "stays"
+        if distance >= STAYS:
+            extent = "shifts slightly" if distance < SHIFTS else "moves across"
+            travel = compass_direction(shift)
     return ObjectFacts(
         object=scene.objects[index].noun_phrase,
         region=object_region(scene, cut, index),
         sight=sight,
         speed=speed,
         heading=heading,
-        target_region=object_region(scene, target, index),
+        target_region=target_region,
         target_sight=target_sight,
         extent=extent,
         travel=travel,

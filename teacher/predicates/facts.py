@@ -8,6 +8,8 @@ shortly (see `teacher.predicates.motion.find_cut`). No fact contains a number.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 SPEEDS = ("slowly", "steadily", "quickly")
 """Words for speeds below each of the bounds of a scene; above these, it is VERY_FAST."""
@@ -132,3 +134,59 @@ class Predicates(Facts):
     @property
     def answer(self) -> str:
         return next(c.letter for c in self.candidates if c.agrees)
+
+
+class Relation(NamedTuple):
+    """A statement about one to three objects of a frame.
+
+    `teacher.predicates.relations` lists the kinds and their values. The statements of a `View` also
+    have the kinds "region", with the values of `ObjectFacts`, and "sight", with the value "unseen".
+    """
+
+    kind: str
+    objects: tuple[str, ...]
+    value: str
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame as a reader of a rationale sees it, with what has changed since the cut.
+
+    `objects` are the item's objects, with this frame as the target; an object that the frame's
+    scene lacks is out of view. `relations` are normalized and sorted. `offsets` are the distances
+    (px of the square image) of the objects from their places at the target, or the side of the
+    image for an object that is visible in only one of the two.
+    """
+
+    letter: str
+    objects: tuple[ObjectFacts, ...]
+    close: tuple[Closeness, ...]
+    relations: tuple[Relation, ...]
+    offsets: dict[str, float]
+
+    @cached_property
+    def statements(self) -> frozenset[Relation]:
+        """All statements that are true of the frame: its relations, the regions of its visible
+        objects, and that the others are unseen."""
+        names = [o.object for o in self.objects]
+        places = {
+            Relation("region", (o.object,), o.target_region)
+            if o.target_sight == "shown"
+            else Relation("sight", (o.object,), "unseen")
+            for o in self.objects
+            if names.count(o.object) == 1
+        }
+        return frozenset(self.relations) | places
+
+
+@dataclass(frozen=True)
+class RelationalPredicates(Predicates):
+    """Predicates with relations: those at the cut, and a view of each candidate. That of the
+    answer is the view of the target."""
+
+    observed: tuple[Relation, ...]
+    views: tuple[View, ...]
+
+    @property
+    def target(self) -> View:
+        return next(view for view in self.views if view.letter == self.answer)

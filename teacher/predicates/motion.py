@@ -8,7 +8,7 @@ import numpy as np
 
 from data.records import SPEED_BOUNDS, Scene
 from teacher.predicates.facts import SPEEDS, VERY_FAST, Meeting
-from teacher.predicates.places import compass_direction, mean_scale, square_position
+from teacher.predicates.places import CONTACT, compass_direction, mean_scale, square_position
 
 CUT_MARGIN = 12
 """Minimum number of frames from the cut to the next collision (paper, Rationale construction)."""
@@ -20,9 +20,6 @@ STATIONARY = 0.05
 IMMINENT, SOON = 15, 40
 """Maximum numbers of frames from the cut to a collision that is "imminent", and to a collision that
 comes "soon" (paper, Rationale construction)."""
-CONTACT = 0.4
-"""Ground-plane distance (simulator units) at which two objects of scale 1 touch; it grows with the
-mean scale of the objects."""
 COURSE_MARGIN = 0.1
 """Maximum gap (simulator units) between two objects on a collision course when they would pass."""
 COURSE_HORIZON = 60

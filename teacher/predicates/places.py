@@ -12,6 +12,9 @@ from teacher.predicates.facts import COMPASS, OUT_OF_VIEW, REGIONS, Closeness
 
 IMAGE_SIZE = 336
 """Side (px) of the square image in which displacements are measured: the models' input size."""
+CONTACT = 0.4
+"""Ground-plane distance (simulator units) at which two objects of scale 1 touch; it grows with the
+mean scale of the objects."""
 VERY_CLOSE = 0.6
 """Ground-plane distance (simulator units) below which two objects of scale 1 are very close; it
 grows with their mean scale."""

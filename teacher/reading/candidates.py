@@ -3,8 +3,9 @@ and which candidate agrees with the target."""
 
 from __future__ import annotations
 
+from teacher.predicates.relations import KINDS
 from teacher.reading.grounding import TARGET
-from teacher.reading.tagging import BOUNDARIES, Tag
+from teacher.reading.tagging import BOUNDARIES, RelationPhrase, Tag
 from teacher.reading.topics import TopicReader
 
 ERRORS = {"error", "errors", "mistake", "mistakes", "fault", "faults", "flaw", "flaws"}
@@ -52,6 +53,23 @@ class CandidateReader(TopicReader):
             self.add_claim("region", str(tag.value), True, tag)
 
     on_into = on_region
+
+    def on_relation(self, tag: Tag) -> None:
+        partners = self.find_partners(tag)
+        if self.skipped or not self.objects or partners is None:
+            return
+        phrase = tag.value
+        assert isinstance(phrase, RelationPhrase)
+        kind = KINDS[phrase.value]
+        if self.expected and not self.contrasted:
+            # Where the object should be: a claim about the target.
+            for name in self.objects:
+                names = (name, *partners)
+                claim = self.claim(kind, names, phrase.value, not self.negated, TARGET, tag)
+                self.drafts.append(claim)
+        else:
+            denied = self.negated or self.contrasted
+            self.add_claim(kind, phrase.value, not denied, tag, partners)
 
     def on_direction(self, tag: Tag) -> None:
         if self.near(-1).words != "from" and not self.expected and not self.negated:

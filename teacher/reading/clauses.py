@@ -6,7 +6,18 @@ from teacher.reading.pairs import PairReader
 from teacher.reading.reader import Names
 from teacher.reading.tagging import BOUNDARIES, Tag
 
-PRECEDING = {"from", "region", "direction", "speed", "still", "moving", "rest", "out", "hidden"}
+PRECEDING = {
+    "from",
+    "region",
+    "relation",
+    "direction",
+    "speed",
+    "still",
+    "moving",
+    "rest",
+    "out",
+    "hidden",
+}
 """Tags of claims that may precede their subject, as in "near the top is the red cube"."""
 OPENING = PRECEDING | {"into", "toward", "slight", "word", "by", "be", "comma", "pronoun", "future"}
 OPENING |= {"expected"}
@@ -25,7 +36,7 @@ class ClauseReader(PairReader):
         self.list_start = 0
         """The index in `subjects` from which claims before the verb are about them: in "the cube
         near the top and the sphere, near the left, are at rest", that of the sphere."""
-        self.pending: list[tuple[str, str, bool, str, Tag]] = []
+        self.pending: list[tuple[str, str, bool, str, Tag, tuple[str, ...]]] = []
         """Arguments of `add_claim` for claims that precede their subject."""
         self.has_verb = False
         """Whether the subject has its verb. The next noun phrase is then another subject."""
@@ -178,14 +189,19 @@ class ClauseReader(PairReader):
         when: str,
         tag: Tag,
         subjects: Names | None = None,
+        partners: tuple[str, ...] = (),
     ) -> None:
-        """Record a claim, or keep it in `pending` if the clause has no subject yet."""
+        """Record a claim, or keep it in `pending` if the clause has no subject yet.
+
+        Args:
+            partners: The other objects of a relation.
+        """
         if self.maybe or self.blocked:
             return
         if subjects is None:
             if not self.subjects:
                 if not self.denied_subject:
-                    self.pending.append((kind, value, affirmed, when, tag))
+                    self.pending.append((kind, value, affirmed, when, tag, partners))
                 return
             if self.has_verb:
                 subjects = self.subjects
@@ -196,7 +212,8 @@ class ClauseReader(PairReader):
                 subjects = self.subjects[self.list_start :]
             self.gapped |= not self.has_verb and (self.had_verb or self._is_verbless(kind))
         for name in subjects:
-            self.claims.append(self.claim(kind, (name,), value, affirmed, when, tag))
+            names = (name, *partners)
+            self.claims.append(self.claim(kind, names, value, affirmed, when, tag))
         if affirmed:
             self.record_shared(kind, value, subjects, tag)
 

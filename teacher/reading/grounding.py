@@ -6,7 +6,17 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
 
-from teacher.predicates.facts import COMPASS, OUT_OF_VIEW, Difference, ObjectFacts, Predicates
+from teacher.predicates.facts import (
+    COMPASS,
+    OUT_OF_VIEW,
+    Difference,
+    ObjectFacts,
+    Predicates,
+    Relation,
+    RelationalPredicates,
+    View,
+)
+from teacher.predicates.relations import VALUES, normalize_relation
 from teacher.reading.phrases import COARSE
 
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
@@ -28,6 +38,8 @@ class Claim(NamedTuple):
     "extent", "sight", "leaves", "enters". For a pair: "course", "meeting", "time" (of the meeting),
     "close", "close region" (of a close pair), "place of either" (of the pair or its second object).
     For a candidate: "agrees", "other objects"; objects: "region", "lacks", "extra", "displaced".
+    For two or three objects, of the scene or of a candidate: the kinds of relations (see
+    `teacher.predicates.relations`).
     """
 
     kind: str
@@ -61,6 +73,13 @@ class IndexedPredicates:
         self.differences: dict[str, dict[str, Difference]] = {
             c.letter: {d.object: d for d in c.differences} for c in predicates.candidates
         }
+        self.observed: frozenset[Relation] | None = None
+        """Relations at the cut; None if the predicates have no relations."""
+        self.views: dict[str, View] = {}
+        if isinstance(predicates, RelationalPredicates):
+            self.observed = frozenset(predicates.observed)
+            self.views = {view.letter: view for view in predicates.views}
+        self.answer = predicates.answer
         self.extras = {
             name
             for found in self.differences.values()
@@ -82,6 +101,8 @@ class IndexedPredicates:
 
     def truth(self, claim: Claim) -> bool | None:
         """Return whether a claim without its negation holds; None if predicates do not tell."""
+        if claim.kind in VALUES:
+            return self._truth_of_relation(claim)
         if claim.candidate is not None:
             return self._truth_in_candidate(claim.candidate, claim)
         if claim.kind == "mention":
@@ -96,6 +117,23 @@ class IndexedPredicates:
             return self._truth_of_any(claim)
         facts = self.objects.get(claim.subjects[0])
         return None if facts is None else OBJECT_CHECKS[claim.kind](facts, claim.value, claim.when)
+
+    def _truth_of_relation(self, claim: Claim) -> bool | None:
+        """Return whether a relation holds at the claim's moment; None if an object is unseen."""
+        if self.observed is None or not claim.subjects:
+            return None
+        relation = normalize_relation(Relation(claim.kind, claim.subjects, claim.value))
+        view = self.views.get(claim.candidate or self.answer)
+        if view is None or not set(claim.subjects) <= self.objects.keys():
+            return None
+        shown = {o.object for o in view.objects if o.target_sight == "shown"}
+        at_target = relation in view.statements if shown >= set(claim.subjects) else None
+        if claim.candidate is not None or claim.when in (TARGET, BETWEEN):
+            # A candidate that lacks an object does not show it in any relation.
+            return False if claim.candidate is not None and at_target is None else at_target
+        shown = {o.object for o in self.objects.values() if o.sight == "shown"}
+        at_cut = relation in self.observed if shown >= set(claim.subjects) else None
+        return at_cut if claim.when == CUT else _either(at_cut, at_target)
 
     def _truth_in_candidate(self, letter: str, claim: Claim) -> bool | None:
         if letter not in self.candidates:

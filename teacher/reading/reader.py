@@ -7,7 +7,7 @@ from collections.abc import Container, Sequence
 
 from teacher.reading.certainty import CertaintyCheck
 from teacher.reading.grounding import CUT, EITHER, Claim, IndexedPredicates
-from teacher.reading.tagging import Noun, Sentence, Tag
+from teacher.reading.tagging import Noun, RelationPhrase, Sentence, Tag
 
 MAX_OBJECTS = 9
 """Maximum number of objects in a list, and in the subject of a clause."""
@@ -124,9 +124,25 @@ class Reader:
             ]
         return claims
 
-    def _find_objects(self, tag: Tag) -> Names:
-        """Return the objects that a noun phrase names, and record the claim that they exist."""
-        noun = tag.value
+    def find_partners(self, tag: Tag) -> tuple[str, ...] | None:
+        """Return the other objects of a relation; None if one is a pronoun or not a known one."""
+        phrase = tag.value
+        assert isinstance(phrase, RelationPhrase)
+        partners: list[str] = []
+        for noun in phrase.nouns:
+            names = [None] if noun is None else self._find_objects(tag, noun)
+            if len(names) != 1 or names[0] is None:
+                return None
+            partners.append(names[0])
+        return tuple(partners)
+
+    def _find_objects(self, tag: Tag, noun: Noun | None = None) -> Names:
+        """Return the objects that a noun phrase names, and record the claim that they exist.
+
+        Args:
+            noun: The noun phrase, if it is a part of the tag.
+        """
+        noun = noun or tag.value
         assert isinstance(noun, Noun)
         known = [*self.predicates.objects, *(self.predicates.extras if self.allows_extras else ())]
         fitting = [name for name in known if noun.fits(name)]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from teacher.predicates.relations import CHANGES, KINDS
 from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET
 from teacher.reading.pairs import RELATIONS
 from teacher.reading.phrases import COARSE
 from teacher.reading.subjects import SubjectReader
-from teacher.reading.tagging import BOUNDARIES, COLUMNS, MIDDLE, ROWS, Tag
+from teacher.reading.tagging import BOUNDARIES, COLUMNS, MIDDLE, ROWS, RelationPhrase, Tag
 
 STILL_VERBS = {
     *("does", "do", "did", "is", "are", "has", "have", "shows", "show", "keeps", "keep"),
@@ -43,7 +44,7 @@ class SceneReader(SubjectReader):
             return
         if previous in ("semicolon", "break") and following in ("pronoun", "object"):
             if following == "object":
-                self.pending.append(("region", str(tag.value), True, when or self.moment, tag))
+                self.pending.append(("region", str(tag.value), True, when or self.moment, tag, ()))
             return
         if not when:
             when = TARGET if self.future else CUT if self.past else self.moment
@@ -71,6 +72,23 @@ class SceneReader(SubjectReader):
     def _is_former(self) -> bool:
         """Return whether the next tag dates the claim earlier, as in "out of view before"."""
         return self.near(1).name == "past" or self.near(1).words == "before"
+
+    def on_relation(self, tag: Tag) -> None:
+        if self.relation:
+            return
+        phrase = tag.value
+        assert isinstance(phrase, RelationPhrase)
+        kind = KINDS[phrase.value]
+        partners = self.find_partners(tag)
+        if kind in CHANGES:
+            self.record_verb()
+        if partners is None:
+            return
+        if kind in CHANGES:
+            when = BETWEEN
+        else:
+            when = TARGET if self.future else CUT if self.past else self.moment
+        self.add_claim(kind, phrase.value, not self.negated, when, tag, partners=partners)
 
     def on_into(self, tag: Tag) -> None:
         self.on_region(tag, CUT if self.moment == CUT and not self.mentions_motion else TARGET)

@@ -71,7 +71,8 @@ class SubjectReader(ClauseReader):
         """Record the pending claims for the subject; those of regions only if `places` is true."""
         for pending in self.pending:
             if places or pending[0] != "region":
-                self.add_claim(*pending, subjects=self.subjects)
+                *claim, partners = pending
+                self.add_claim(*claim, subjects=self.subjects, partners=partners)
         self.pending = []
 
     def _is_clause_next(self) -> bool:

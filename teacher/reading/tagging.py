@@ -1,8 +1,8 @@
 """Split a section of a rationale into tags: pieces of text with a name that says what they are.
 
 The names are "object" ("the red cube"), "region" ("near the left"; "into", "from" or "toward" after
-these prepositions), "candidate" (a letter), "comma", "semicolon", "stop", "word" (a word without a
-meaning here), and the names in phrases.yaml.
+these prepositions), "relation" ("left of the red cube"), "candidate" (a letter), "comma",
+"semicolon", "stop", "word" (a word without a meaning here), and the names in phrases.yaml.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from data.records import COLORS, LETTERS, MATERIALS, SHAPES
 from teacher.predicates.facts import REGIONS
+from teacher.predicates.relations import KINDS
 from teacher.reading.phrases import COARSE, VOCABULARY
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")
@@ -64,6 +65,19 @@ PREPOSITIONS = {
 """Prepositions that may begin a region."""
 REGION_TAGS = {"to": "into", "towards": "toward"} | {w: w for w in ("into", "from", "toward")}
 """The tag of a region after these prepositions; after others, the tag is "region"."""
+PRONOUNS = {"it", "them"}
+"""Pronouns for the other object of a relation."""
+PLACED = {
+    *("is", "are", "be", "was", "were", "been", "not", "as", "stays", "remains", "lies", "sits"),
+    *("rests", "stands", "stay", "remain", "lie", "sit", "rest", "stand"),
+}
+"""Words before "between" that make it a relation."""
+JOINTS = {
+    "between": ("and",), "arrival": ("and",), "nearer": ("than to", "than"),
+}  # fmt: skip
+"""Words between the two other objects of a relation. Other kinds have one object or none."""
+ALONE = {"extreme", "edge"}
+"""Kinds of relations without other objects."""
 IMAGE_NOUNS = {"view", "scene", "image", "frame", "picture", "screen", "field"}
 REGION_FILLERS = {"the", "its", "very", "far", "area", "region", "near", "same", "around", "of"}
 REGION_STARTS = {*PREPOSITIONS, *ROWS, *COLUMNS, *MIDDLE, "the"}
@@ -93,16 +107,25 @@ class Noun(NamedTuple):
         return {self.color, self.material, self.shape} - {""} <= set(name.split())
 
 
+class RelationPhrase(NamedTuple):
+    """A relation to other objects, such as "left of the red cube": its value, and the objects; None
+    for a pronoun."""
+
+    value: str
+    nouns: tuple[Noun | None, ...]
+
+
 class Tag(NamedTuple):
     """A piece of a sentence, text[start:stop], and its text in lower case, `words`.
 
     `name` says what the piece is, and selects the method of a reader that reads it. `value` is its
     meaning: for "near the top left corner", the name is "region" and the value is "near the
-    top-left". It is a `Noun` if the name is "object", and "" if the name says everything.
+    top-left". It is a `Noun` if the name is "object", a `RelationPhrase` if it is "relation", and
+    "" if the name says everything.
     """
 
     name: str
-    value: str | Noun
+    value: str | Noun | RelationPhrase
     start: int
     stop: int
     words: str
@@ -181,7 +204,7 @@ def _split_words(
     return [*words, ""], raw, spans
 
 
-Found = tuple[str, str | Noun, int]
+Found = tuple[str, str | Noun | RelationPhrase, int]
 """The name and value of a tag, and the index of the word after it."""
 
 
@@ -198,7 +221,10 @@ def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
         return found
     for phrase, name, value in VOCABULARY.get(word, ()):
         if tuple(words[i : i + len(phrase)]) == phrase:
-            return name, value, i + len(phrase)
+            if name != "relation":
+                return name, value, i + len(phrase)
+            if found := _find_relation(words, i, i + len(phrase), value):
+                return found
     if word in ARTICLES or word in LABELS:
         return "", "", i + 1
     return "word", word, i + 1
@@ -228,6 +254,30 @@ def _find_noun(words: list[str], i: int) -> Found | None:
     if shape is None or not (color or material or shape):
         return None
     return "object", Noun(color, material, shape, words[i] in PLURALS, still, is_other), i + 1
+
+
+def _find_relation(words: list[str], begin: int, i: int, value: str) -> Found | None:
+    """Return the relation at word `begin` whose objects begin at word i, if they are there."""
+    kind = KINDS[value]
+    if kind in ("between", "arrival") and words[begin - 1] not in PLACED | LOOKS:
+        # "A contact between the red cube and the blue sphere" is not a relation.
+        return None
+    nouns: list[Noun | None] = []
+    while len(nouns) < (0 if kind in ALONE else 2 if kind in JOINTS else 1):
+        if nouns:
+            joint = next((j for j in JOINTS[kind] if words[i:][: len(j.split())] == j.split()), "")
+            if not joint:
+                return None
+            i += len(joint.split())
+        if words[i] in PRONOUNS:
+            nouns.append(None)
+            i += 1
+        elif found := _find_noun(words, i):
+            nouns.append(found[1])
+            i = found[2]
+        else:
+            return None
+    return "relation", RelationPhrase(value, tuple(nouns)), i
 
 
 def _find_region(words: list[str], i: int) -> Found | None:

@@ -217,6 +217,11 @@ class TopicReader(Reader):
         self.skipped |= denied
         if self.skipped:
             return
+        placed = self.near(1).name == "relation"
+        if self.lacking and placed:
+            # "A does not show the red cube left of the sphere" denies the relation.
+            self.lacking, self.negated = False, True
+            return
         if self.lacking:
             self.add_claim("lacks", "", True, last)
             self.objects = []
@@ -261,13 +266,20 @@ class TopicReader(Reader):
 
     # Claims about the topic.
 
-    def add_claim(self, kind: str, value: str, affirmed: bool, tag: Tag) -> None:
-        """Record a claim about the current objects in each candidate of the topic."""
+    def add_claim(
+        self, kind: str, value: str, affirmed: bool, tag: Tag, partners: tuple[str, ...] = ()
+    ) -> None:
+        """Record a claim about the current objects in each candidate of the topic.
+
+        Args:
+            partners: The other objects of a relation.
+        """
         if self.skipped or self.denies_candidate:
             return
         for name in self.objects:
+            names = (name, *partners)
             for letter in self.letters or ("",):
-                self.drafts.append(self.claim(kind, (name,), value, affirmed, TARGET, tag, letter))
+                self.drafts.append(self.claim(kind, names, value, affirmed, TARGET, tag, letter))
         if affirmed:
             self.record_shared(kind, value, self.objects, tag)
 

@@ -224,8 +224,9 @@ def test_predicates_of_a_benchmark_contain_no_number(benchmark_store):
         assert not any(c.isdigit() for c in text)
 
 
-def random_cases(count):
-    """Yield items of random scenes with their predicates, at most `count`."""
+def random_cases(count, bounds=None):
+    """Yield items of random scenes with their predicates, at most `count`. With `bounds`, the
+    predicates have relations."""
     rng = np.random.default_rng(1)
     for k in range(count):
         scene, other = synthetic.random_scene(rng), synthetic.random_scene(rng, "other")
@@ -241,7 +242,7 @@ def random_cases(count):
             scene_ids=foreign,
             framing=(None, "future", "contact")[k % 3],
         )
-        predicates = extract_predicates(item, scene, {"other": other}.__getitem__)
+        predicates = extract_predicates(item, scene, {"other": other}.__getitem__, bounds)
         if predicates is not None:
             yield item, predicates
 

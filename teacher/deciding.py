@@ -1,0 +1,72 @@
+"""Chooses the statements that decide an item: those that are true of the target and, together,
+false of every distractor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from random import Random
+
+from teacher.predicates.facts import Relation, RelationalPredicates
+
+CLEARNESS = 0.5
+"""A statement is preferred if its objects' offsets in the candidates that it excludes are at least
+this share of the largest offsets of all statements that exclude as many."""
+SIMPLICITY = (
+    ("region", "sight"),
+    ("side", "height", "gap", "cover", "between", "extreme"),
+    ("nearer",),
+)
+"""Kinds of statements that a single frame shows, the simplest first. Changes since the cut are not
+among them."""
+LEVELS = {kind: level for level, kinds in enumerate(SIMPLICITY) for kind in kinds}
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Statements that decide an item.
+
+    Attributes:
+        statements: The smallest set of statements that excludes as many distractors as possible.
+        rivals: Letters of the distractors of which every statement of the target is true.
+    """
+
+    statements: tuple[Relation, ...]
+    rivals: tuple[str, ...]
+
+
+def choose_statements(predicates: RelationalPredicates, seed: int | str) -> Decision:
+    """Choose the fewest statements that exclude as many distractors as possible.
+
+    Statements are added one by one; each excludes as many of the remaining distractors as possible.
+    With three distractors, no smaller set exists: either a statement excludes all, or two do, or
+    each excludes one. Of equally good statements that are clear, one of the simplest kind is chosen
+    at random.
+    """
+    rng = Random(seed)
+    views = [view for view in predicates.views if view.letter != predicates.answer]
+    excluded_by = {
+        statement: {view.letter for view in views if statement not in view.statements}
+        for statement in sorted(predicates.target.statements)
+        if statement.kind in LEVELS
+    }
+    left, chosen = {view.letter for view in views}, []
+    while left:
+        most = max((len(excluded & left) for excluded in excluded_by.values()), default=0)
+        if not most:
+            break
+        clearness = {
+            statement: min(
+                max(view.offsets[name] for name in statement.objects)
+                for view in views
+                if view.letter in excluded & left
+            )
+            for statement, excluded in excluded_by.items()
+            if len(excluded & left) == most
+        }
+        least = CLEARNESS * max(clearness.values())
+        clear = [statement for statement, value in clearness.items() if value >= least]
+        simplest = min(LEVELS[statement.kind] for statement in clear)
+        options = [statement for statement in clear if LEVELS[statement.kind] == simplest]
+        chosen.append(rng.choice(options))
+        left -= excluded_by[chosen[-1]]
+    return Decision(tuple(chosen), tuple(sorted(left)))

@@ -1,0 +1,252 @@
+"""Relations: how the objects of a frame lie to each other, in words without measures.
+
+A relation has a kind, objects and a value:
+
+| kind | objects | values |
+|---|---|---|
+| side | a, b | left of, right of, aligned with |
+| height | a, b | above, below, level with |
+| gap | a, b | against, near, apart from |
+| cover | a, b | in front of, behind |
+| between | a, b, c | between: a is between b and c |
+| nearer | a, b, c | nearer to: a is nearer to b than to c |
+| extreme | a | leftmost, rightmost, topmost, lowest |
+| passing | a, b | moves past, crosses in front of, crosses behind |
+| arrival | a, b, c | comes between |
+| edge | a | reaches the left edge, and right, top and bottom |
+
+The last three describe the change from an earlier frame. Sides and heights are those of the centres
+in the image; gaps are measured on the ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from itertools import combinations, permutations
+from typing import NamedTuple
+
+from data.records import Scene
+from teacher.predicates.facts import Relation
+from teacher.predicates.places import CONTACT, object_sight
+
+OPPOSITES = {
+    "left of": "right of", "above": "below", "in front of": "behind",
+}  # fmt: skip
+OPPOSITES |= {value: key for key, value in OPPOSITES.items()}
+"""The value of a relation of two objects if they change places; other values stay."""
+VALUES = {
+    "side": ("left of", "aligned with", "right of"),
+    "height": ("above", "level with", "below"),
+    "gap": ("against", "near", "apart from"),
+    "cover": ("in front of", "behind"),
+    "between": ("between",),
+    "nearer": ("nearer to",),
+    "extreme": ("leftmost", "rightmost", "topmost", "lowest"),
+    "passing": ("moves past", "crosses in front of", "crosses behind"),
+    "arrival": ("comes between",),
+    "edge": tuple(f"reaches the {edge} edge" for edge in ("left", "right", "top", "bottom")),
+}
+"""The values of each kind of relation."""
+KINDS = {value: kind for kind, values in VALUES.items() for value in values}
+"""The kind of each value."""
+CHANGES = ("passing", "arrival", "edge")
+"""Kinds of relations that describe a change from the cut to the target."""
+SYMMETRIC = {"side", "height", "gap", "cover"}
+"""Kinds that are true of two objects in either order, with the opposite value."""
+EDGES = ("left", "right", "top", "bottom")
+
+
+class Bounds(NamedTuple):
+    """Bounds of the words for relations."""
+
+    level: float = 0.04
+    """Share of the image's width or height below which two objects are aligned or level, and by
+    which the leftmost object must lie to the left of all others."""
+    against: float = 0.15
+    """Gap, as a share of an object's width, below which two objects are against each other."""
+    near: float = 1.0
+    """Gap, as a share of an object's width, below which two objects are near each other."""
+    between_ends: float = 0.2
+    """An object between two others divides their distance; each part has at least this share."""
+    between_offset: float = 0.25
+    """Maximum distance of an object between two others from the line through them, as a share of
+    their distance."""
+    nearer: float = 1.25
+    """An object is nearer to another than to a third if the latter distance is at least as many
+    times the former."""
+    covered: float = 0.9
+    """Visible fraction of an object below which one before it is in front of it."""
+    cover_distance: float = 0.12
+    """Maximum distance in the image of an object from one that it covers, as a share of the
+    width."""
+    edge: float = 0.06
+    """Distance from the image's edge, as a share of its width or height, below which an object has
+    reached the edge."""
+
+
+def flip_relation(relation: Relation) -> Relation:
+    """Return the same statement about two objects in the other order."""
+    kind, objects, value = relation
+    return Relation(kind, objects[::-1], OPPOSITES.get(value, value))
+
+
+def normalize_relation(relation: Relation) -> Relation:
+    """Return the same statement with its interchangeable objects in alphabetical order."""
+    kind, objects, value = relation
+    if kind in SYMMETRIC and objects[0] > objects[1]:
+        return flip_relation(relation)
+    if kind in ("between", "arrival") and objects[1] > objects[2]:
+        return Relation(kind, (objects[0], objects[2], objects[1]), value)
+    return relation
+
+
+class Places(NamedTuple):
+    """The visible objects of a frame by name: their places in the image as shares of its width and
+    height, their places on the ground in widths of an object of scale 1, their scales and visible
+    fractions. Objects that look alike are left out, since words cannot tell them apart."""
+
+    image: dict[str, tuple[float, float]]
+    ground: dict[str, tuple[float, float]]
+    scale: dict[str, float]
+    fraction: dict[str, float]
+
+    @classmethod
+    def of(cls, scene: Scene, frame: int) -> Places:
+        """Return the places of the visible objects of a frame."""
+        image = (scene.image_positions[frame] / scene.image_size).tolist()
+        ground = (scene.positions[frame, :, :2] / CONTACT).tolist()
+        fraction = scene.visible_fraction[frame].tolist()
+        names = [each.noun_phrase for each in scene.objects]
+        seen = {
+            name: k
+            for k, name in enumerate(names)
+            if names.count(name) == 1 and object_sight(scene, frame, k) == "shown"
+        }
+        return cls(
+            {name: tuple(image[k]) for name, k in seen.items()},
+            {name: tuple(ground[k]) for name, k in seen.items()},
+            {name: scene.object_scales[k] for name, k in seen.items()},
+            {name: fraction[k] for name, k in seen.items()},
+        )
+
+
+def find_relations(places: Places, bounds: Bounds) -> set[Relation]:
+    """Return the relations of the visible objects of a frame, normalized."""
+    names = sorted(places.image)
+    found: set[Relation] = set()
+    distance: dict[tuple[str, str], float] = {}
+    for a, b in combinations(names, 2):
+        (ax, ay), (bx, by) = places.image[a], places.image[b]
+        side = _compare(ax, bx, bounds.level, VALUES["side"])
+        height = _compare(ay, by, bounds.level, VALUES["height"])
+        (gx, gy), (hx, hy) = places.ground[a], places.ground[b]
+        apart = ((gx - hx) ** 2 + (gy - hy) ** 2) ** 0.5
+        distance[a, b] = distance[b, a] = apart
+        gap = 2 * apart / (places.scale[a] + places.scale[b]) - 1
+        closeness = "against" if gap < bounds.against else "near"
+        found |= {
+            Relation("side", (a, b), side),
+            Relation("height", (a, b), height),
+            Relation("gap", (a, b), closeness if gap < bounds.near else "apart from"),
+        }
+        if (covering := _covering(places, a, b, bounds)) is not None:
+            value = "in front of" if covering == a else "behind"
+            found.add(Relation("cover", (a, b), value))
+    for a in names:
+        others = [name for name in names if name != a]
+        for b, c in combinations(others, 2):
+            if _is_between(places.image[a], places.image[b], places.image[c], bounds):
+                found.add(Relation("between", (a, b, c), "between"))
+        for b, c in permutations(others, 2):
+            if distance[a, c] >= bounds.nearer * distance[a, b]:
+                found.add(Relation("nearer", (a, b, c), "nearer to"))
+    found.update(_find_extremes(places.image, bounds))
+    return found
+
+
+def find_changes(
+    earlier: Places, later: Places, at_rest: set[str], bounds: Bounds
+) -> set[Relation]:
+    """Return how the places of objects change that are visible at both of two frames, normalized.
+
+    Args:
+        at_rest: Objects that hardly move from the earlier to the later frame: they pass no object.
+    """
+    found: set[Relation] = set()
+    both = sorted(earlier.image.keys() & later.image.keys())
+    for a, b in permutations(both, 2):
+        if a not in at_rest:
+            before, after = (places.image[a][0] - places.image[b][0] for places in (earlier, later))
+            if min(before, after) <= -bounds.level and max(before, after) >= bounds.level:
+                value = _passing_side(earlier, later, a, b, bounds)
+                found.add(Relation("passing", (a, b), value))
+    for a in both:
+        if a in at_rest:
+            continue
+        for b, c in combinations([name for name in both if name != a], 2):
+            was, comes = (
+                _is_between(places.image[a], places.image[b], places.image[c], bounds)
+                for places in (earlier, later)
+            )
+            if comes and not was:
+                found.add(Relation("arrival", (a, b, c), "comes between"))
+        reached = _edges(later.image[a], bounds) - _edges(earlier.image[a], bounds)
+        found |= {Relation("edge", (a,), f"reaches the {edge} edge") for edge in reached}
+    return found
+
+
+def _compare(one: float, other: float, bound: float, words: tuple[str, str, str]) -> str:
+    """Return the first word if `one` is less by at least `bound`, the last if it is more."""
+    if abs(one - other) < bound:
+        return words[1]
+    return words[0] if one < other else words[2]
+
+
+def _covering(places: Places, a: str, b: str, bounds: Bounds) -> str | None:
+    """Return which of two objects hides a part of the other; None if neither does.
+
+    An object lower in the image is nearer to the camera.
+    """
+    (ax, ay), (bx, by) = places.image[a], places.image[b]
+    front, back = (a, b) if ay > by else (b, a)
+    is_close = ((ax - bx) ** 2 + (ay - by) ** 2) ** 0.5 < bounds.cover_distance
+    return front if is_close and places.fraction[back] < bounds.covered else None
+
+
+def _is_between(
+    place: tuple[float, float],
+    one: tuple[float, float],
+    other: tuple[float, float],
+    bounds: Bounds,
+) -> bool:
+    dx, dy = other[0] - one[0], other[1] - one[1]
+    px, py = place[0] - one[0], place[1] - one[1]
+    square = dx * dx + dy * dy
+    if square == 0:
+        return False
+    share, offset = (px * dx + py * dy) / square, abs(px * dy - py * dx) / square
+    ends = bounds.between_ends
+    return ends <= share <= 1 - ends and offset <= bounds.between_offset
+
+
+def _find_extremes(image: Mapping[str, tuple[float, float]], bounds: Bounds) -> Iterator[Relation]:
+    if len(image) < 2:
+        return
+    for value, axis, sign in zip(VALUES["extreme"], (0, 0, 1, 1), (1, -1, 1, -1), strict=True):
+        first, second, *_ = sorted((sign * place[axis], name) for name, place in image.items())
+        if second[0] - first[0] >= bounds.level:
+            yield Relation("extreme", (first[1],), value)
+
+
+def _passing_side(earlier: Places, later: Places, a: str, b: str, bounds: Bounds) -> str:
+    """Return "crosses in front of" if object a is lower in the image than b at both frames."""
+    lower = [places.image[a][1] - places.image[b][1] for places in (earlier, later)]
+    if min(lower) >= bounds.level:
+        return "crosses in front of"
+    return "crosses behind" if max(lower) <= -bounds.level else "moves past"
+
+
+def _edges(place: tuple[float, float], bounds: Bounds) -> set[str]:
+    x, y = place
+    distances = zip(EDGES, (x, 1 - x, y, 1 - y), strict=True)
+    return {edge for edge, distance in distances if distance < bounds.edge}

@@ -1,0 +1,175 @@
+"""Writes rationales whose prediction states what decides the item, in words of relations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.resources import files
+
+import yaml
+
+from teacher.deciding import Decision
+from teacher.predicates.facts import CandidateFacts, Relation, RelationalPredicates, View
+from teacher.predicates.relations import CHANGES, SYMMETRIC, flip_relation, normalize_relation
+from teacher.writers.paper import Detail, Writer
+
+PHRASES = yaml.safe_load((files("teacher") / "templates" / "relations.yaml").read_text())
+
+
+def find_topic(statement: Relation, relations: Sequence[Relation]) -> Relation | None:
+    """Return the relation between the same objects in the same respect, with the same subject.
+
+    For "a is nearer to b than to c", this may be "a is nearer to c than to b".
+    """
+    kind, objects, _ = wanted = normalize_relation(statement)
+    if kind == "nearer":
+        opposite = Relation(kind, (objects[0], objects[2], objects[1]), wanted.value)
+        return next((r for r in (wanted, opposite) if r in relations), None)
+    for relation in relations:
+        if kind in SYMMETRIC and relation[:2] == (kind, objects):
+            return relation if objects == statement.objects else flip_relation(relation)
+    return None
+
+
+class RelationalWriter(Writer):
+    """Writes the sections of a rationale from relational predicates.
+
+    The prediction begins with the statements that decide the item (see `teacher.deciding`), and the
+    candidate analysis holds each candidate against just these.
+    """
+
+    facts: RelationalPredicates
+
+    def __init__(
+        self,
+        facts: RelationalPredicates,
+        decision: Decision,
+        detail: Detail,
+        *keys: int | str,
+        padded: bool = False,
+    ) -> None:
+        super().__init__(facts, detail, *keys, padded=padded)
+        self.rank = {o.object: k for k, o in enumerate(self.ranked)}
+        self.statements = [self.orient(s) for s in decision.statements]
+        named = {name for s in self.statements for name in s.objects}
+        # The objects of the deciding statements come first in every section.
+        self.ranked = sorted(self.ranked, key=lambda o: o.object not in named)
+        self.view_of = {view.letter: view for view in facts.views}
+
+    def orient(self, relation: Relation) -> Relation:
+        """Make the more relevant of two objects the subject of a relation."""
+        if relation.kind in SYMMETRIC:
+            first, second = relation.objects
+            if self.rank[second] < self.rank[first]:
+                return flip_relation(relation)
+        return relation
+
+    # Statements.
+
+    def place(self, relation: Relation, pronoun: bool = False) -> str:
+        """Return what a statement says of its subject, such as "left of the red cube".
+
+        Args:
+            pronoun: Whether to write "it" instead of the other object.
+        """
+        if relation.kind == "region":
+            return relation.value
+        if relation.kind == "sight":
+            return "out of sight"
+        phrasings = PHRASES[relation.value]
+        others = [f"the {name}" for name in relation.objects[1:]]
+        values = dict(zip("bc", ["it"] if pronoun else others, strict=False))
+        return phrasings[self.rng.integers(len(phrasings))].format(**values)
+
+    def statement(self, relation: Relation, verb: str) -> str:
+        return f"the {relation.objects[0]} {verb} {self.place(relation)}"
+
+    def shown(self, relation: Relation) -> str:
+        """Return a statement as the object of "shows"."""
+        return f"the {relation.objects[0]} {self.place(relation)}"
+
+    def all_shown(self) -> str:
+        """Return all deciding statements as the object of "shows"."""
+        parts: list[str] = []
+        for k, s in enumerate(self.statements):
+            if s.kind == "sight":
+                parts.append(f"no {s.objects[0]}")
+            elif k and self.statements[k - 1].objects[0] == s.objects[0]:
+                parts.append(self.place(s))
+            else:
+                parts.append(self.shown(s))
+        return " and ".join(parts)
+
+    # Sections.
+
+    def scene_parse(self) -> list[str]:
+        parts = super().scene_parse()
+        now = [find_topic(s, self.facts.observed) for s in self.statements]
+        parts += [self.statement(s, "is") for s in now if s is not None][: self.detail.pairs]
+        return parts
+
+    def motion_analysis(self) -> list[str]:
+        parts = super().motion_analysis()
+        named = {name for s in self.statements for name in s.objects}
+        changes = [
+            r
+            for r in self.facts.target.relations
+            if r.kind in CHANGES and r.objects[0] in named and set(r.objects) <= named
+        ]
+        for change in changes[: self.detail.pairs]:
+            parts.append(f"the {change.objects[0]} {self.place(change)}")
+        return parts
+
+    def prediction(self) -> list[str]:
+        parts = [self.statement(s, "will be") for s in self.statements]
+        stated = {s.objects[0] for s in self.statements if s.kind in ("region", "sight")}
+        places = [self.expected(o) for o in self.ranked if o.object not in stated]
+        parts += places[: max(self.detail.predicted - len(stated), 0)]
+        parts = parts or places[:1]
+        parts[0] = f"{self.facts.moment}, {parts[0]}"
+        if self.padded:
+            parts.append("the layout at the target moment follows from these motions")
+        return parts
+
+    def judgement(self, candidate: CandidateFacts) -> str:
+        """State which deciding statement is false of a candidate, or that all are true."""
+        if not self.statements:
+            return super().judgement(candidate)
+        view = self.view_of[candidate.letter]
+        for s in self.statements:
+            if normalize_relation(s) not in view.statements:
+                return self.contrast(s, view)
+        text = f"shows {self.all_shown()}"
+        if candidate.agrees:
+            return f"{text}, and agrees"
+        return f"{text} but {self.difference(candidate.differences[0])}"
+
+    def contrast(self, s: Relation, view: View) -> str:
+        """State how a candidate differs from a deciding statement that is false of it."""
+        facts = {o.object: o for o in view.objects}
+        if s.kind == "sight":
+            return f"shows the {s.objects[0]}, which should not be seen"
+        for name in s.objects:
+            if facts[name].target_sight != "shown":
+                return f"lacks the {name}"
+        if s.kind == "region":
+            actual = facts[s.objects[0]].target_region
+            return f"shows the {s.objects[0]} {actual}, not {s.value}"
+        if actual := find_topic(s, view.relations):
+            wanted = f", not {self.place(s, pronoun=True)}" if s.kind in SYMMETRIC else ""
+            return f"shows {self.shown(actual)}{wanted}"
+        return f"shows the {s.objects[0]}, but not {self.place(s)}"
+
+    def match(self, candidate: CandidateFacts) -> str:
+        if candidate.agrees or not self.statements:
+            return super().match(candidate)
+        view = self.view_of[candidate.letter]
+        for s in self.statements:
+            if normalize_relation(s) not in view.statements:
+                return f"Candidate {candidate.letter} does not match: it {self.contrast(s, view)}."
+        return super().match(candidate)
+
+    def outcome(self, answer: str | None) -> list[str]:
+        parts = [self.statement(s, "is") for s in self.statements[:1]]
+        if not parts:
+            return super().outcome(answer)
+        return [*parts, self.say("answer", answer=answer)]

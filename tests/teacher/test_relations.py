@@ -1,0 +1,317 @@
+"""Relations, the statements that decide an item, and rationales that rest on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations, permutations
+
+import numpy as np
+import pytest
+
+from conf.schema import TeacherConfig
+from data.records import Scene
+from teacher.deciding import LEVELS, choose_statements
+from teacher.narrator import write_match_lines, write_rationale
+from teacher.predicates.facts import Relation
+from teacher.predicates.relations import (
+    KINDS,
+    OPPOSITES,
+    SYMMETRIC,
+    Bounds,
+    Places,
+    find_changes,
+    find_relations,
+    flip_relation,
+    normalize_relation,
+)
+from teacher.sufficiency import find_predicted, measure_sufficiency
+from teacher.validation.claim_extraction import extract_claims
+from teacher.validation.validator import validate_rationale
+from tests.teacher import synthetic
+from tests.teacher.test_predicates import random_cases
+
+BOUNDS = Bounds()
+A, B, C = "blue metal cube", "green metal sphere", "red rubber cylinder"
+
+
+def places(**pixels: tuple[float, float]) -> Places:
+    """Objects a, b and c at shares of the image's width and height; ground distances are ten times
+    those in the image."""
+    names = dict(zip("abc", (A, B, C), strict=True))
+    image = {names[key]: place for key, place in pixels.items()}
+    ground = {name: (10 * x, 10 * y) for name, (x, y) in image.items()}
+    return Places(image, ground, dict.fromkeys(image, 1.0), dict.fromkeys(image, 1.0))
+
+
+def values(found: set[Relation], kind: str) -> set[tuple[tuple[str, ...], str]]:
+    return {(objects, value) for k, objects, value in found if k == kind}
+
+
+@pytest.mark.parametrize(
+    ("dx", "side"),
+    [(-0.041, "right of"), (-0.039, "aligned with"), (0.039, "aligned with"), (0.041, "left of")],
+)
+def test_sides_and_heights_follow_their_bound(dx: float, side: str) -> None:
+    along = find_relations(places(a=(0.5, 0.5), b=(0.5 + dx, 0.5)), BOUNDS)
+    assert values(along, "side") == {((A, B), side)}
+    assert values(along, "height") == {((A, B), "level with")}
+    height = {"left of": "above", "right of": "below", "aligned with": "level with"}[side]
+    down = find_relations(places(a=(0.5, 0.5), b=(0.5, 0.5 + dx)), BOUNDS)
+    assert values(down, "height") == {((A, B), height)}
+
+
+@pytest.mark.parametrize(
+    ("width", "scale", "value"),
+    [
+        (1.14, 1.0, "against"), (1.16, 1.0, "near"), (1.99, 1.0, "near"), (2.01, 1.0, "apart from"),
+        (2.01, 2.0, "against"), (3.99, 2.0, "near"),
+    ],
+)  # fmt: skip
+def test_gaps_are_measured_in_widths_of_the_objects(width: float, scale: float, value: str) -> None:
+    found = replace_places(places(a=(0.1, 0.1), b=(0.1, 0.1 + width / 10)), scale=scale)
+    assert values(find_relations(found, BOUNDS), "gap") == {((A, B), value)}
+
+
+def replace_places(old: Places, scale: float) -> Places:
+    return old._replace(scale=dict.fromkeys(old.scale, scale))
+
+
+@pytest.mark.parametrize(
+    ("share", "offset", "between"),
+    [
+        (0.5, 0.0, True),
+        (0.21, 0.0, True),
+        (0.19, 0.0, False),
+        (0.5, 0.24, True),
+        (0.5, 0.26, False),
+    ],
+)
+def test_between_follows_its_bounds(share: float, offset: float, between: bool) -> None:
+    found = find_relations(
+        places(a=(0.2 + 0.5 * share, 0.3 + 0.5 * offset), b=(0.2, 0.3), c=(0.7, 0.3)), BOUNDS
+    )
+    assert (((A, B, C), "between") in values(found, "between")) == between
+
+
+def test_nearer_and_extremes_follow_their_bounds() -> None:
+    found = find_relations(places(a=(0.3, 0.3), b=(0.2, 0.3), c=(0.43, 0.3)), BOUNDS)
+    assert ((A, B, C), "nearer to") in values(found, "nearer")
+    assert values(found, "extreme") == {((B,), "leftmost"), ((C,), "rightmost")}
+    found = find_relations(places(a=(0.3, 0.3), b=(0.2, 0.3), c=(0.42, 0.3)), BOUNDS)
+    assert not {o for o, _ in values(found, "nearer")} & {(A, B, C), (A, C, B)}
+    level = find_relations(places(a=(0.3, 0.3), b=(0.33, 0.3), c=(0.8, 0.5)), BOUNDS)
+    assert ((A,), "leftmost") not in values(level, "extreme")
+
+
+def test_lower_object_covers_one_that_is_partly_hidden() -> None:
+    seen = places(a=(0.5, 0.5), b=(0.52, 0.45))
+    hidden = seen._replace(fraction={A: 1.0, B: 0.6})
+    assert values(find_relations(seen, BOUNDS), "cover") == set()
+    assert values(find_relations(hidden, BOUNDS), "cover") == {((A, B), "in front of")}
+    unknown = seen._replace(fraction={A: float("nan"), B: float("nan")})
+    assert values(find_relations(unknown, BOUNDS), "cover") == set()
+
+
+def test_changes_of_an_object_that_passes_another() -> None:
+    earlier = places(a=(0.2, 0.5), b=(0.5, 0.5), c=(0.9, 0.5))
+    for height, value in (
+        (0.5, "moves past"),
+        (0.6, "crosses in front of"),
+        (0.4, "crosses behind"),
+    ):
+        before = places(a=(0.2, height), b=(0.5, 0.5), c=(0.9, 0.5))
+        after = places(a=(0.7, height), b=(0.5, 0.5), c=(0.9, 0.5))
+        found = find_changes(before, after, {B, C}, BOUNDS)
+        assert values(found, "passing") == {((A, B), value)}
+    later = places(a=(0.7, 0.5), b=(0.5, 0.5), c=(0.9, 0.5))
+    assert values(find_changes(earlier, later, {B, C}, BOUNDS), "arrival") == {
+        ((A, B, C), "comes between")
+    }
+    assert find_changes(earlier, later, {A, B, C}, BOUNDS) == set()
+    leaving = find_changes(earlier, places(a=(0.03, 0.5), b=(0.5, 0.5)), {B}, BOUNDS)
+    assert values(leaving, "edge") == {((A,), "reaches the left edge")}
+
+
+def random_places(seed: int) -> Places:
+    scene = synthetic.random_scene(np.random.default_rng(seed))
+    return Places.of(scene, 60)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_mirroring_the_image_swaps_left_and_right_only(seed: int) -> None:
+    found = random_places(seed)
+    mirrored = found._replace(image={name: (1 - x, y) for name, (x, y) in found.image.items()})
+    swap = {
+        "left of": "right of",
+        "right of": "left of",
+        "leftmost": "rightmost",
+        "rightmost": "leftmost",
+    }
+    expected = {Relation(k, o, swap.get(v, v)) for k, o, v in find_relations(found, BOUNDS)}
+    assert find_relations(mirrored, BOUNDS) == expected
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_relations_are_normalized_and_orders_are_total(seed: int) -> None:
+    found = random_places(seed)
+    relations = find_relations(found, BOUNDS)
+    assert {normalize_relation(r) for r in relations} == relations
+    assert all(normalize_relation(flip_relation(r)) == r for r in relations if r.kind in SYMMETRIC)
+    assert all(KINDS[r.value] == r.kind for r in relations)
+    pairs = set(combinations(sorted(found.image), 2))
+    for kind in ("side", "height", "gap"):
+        assert {objects for objects, _ in values(relations, kind)} == pairs
+    assert all(OPPOSITES[OPPOSITES[v]] == v for v in OPPOSITES)
+
+
+def test_objects_that_look_alike_have_no_relations() -> None:
+    scene = synthetic.scene([(0, 0), (0.5, 0.5), (-0.5, 0.3)], [(0, 0)] * 3)
+    twins = replace(scene, objects=(scene.objects[0], scene.objects[0], scene.objects[2]))
+    assert len(Places.of(scene, 0).image) == 3
+    assert list(Places.of(twins, 0).image) == [scene.objects[2].noun_phrase]
+
+
+def test_bounds_of_words_are_settings() -> None:
+    wide = BOUNDS._replace(level=0.2)
+    near = places(a=(0.4, 0.5), b=(0.5, 0.5))
+    assert values(find_relations(near, BOUNDS), "side") == {((A, B), "left of")}
+    assert values(find_relations(near, wide), "side") == {((A, B), "aligned with")}
+
+
+CFG = TeacherConfig(name="template")
+
+
+def test_deciding_statements_are_a_smallest_set() -> None:
+    """No smaller set of statements excludes as many distractors, by exhaustive search."""
+    sizes = []
+    for item, predicates in random_cases(60, BOUNDS):
+        decision = choose_statements(predicates, item.item_id)
+        wrong = [v for v in predicates.views if v.letter != predicates.answer]
+        excluded = {
+            frozenset(v.letter for v in wrong if s not in v.statements)
+            for s in predicates.target.statements
+            if s.kind in LEVELS
+        }
+        possible = frozenset().union(*excluded)
+        assert set(decision.rivals) == {v.letter for v in wrong} - possible
+        chosen = [
+            frozenset(v.letter for v in wrong if s not in v.statements) for s in decision.statements
+        ]
+        assert frozenset().union(*chosen) == possible
+        for size in range(len(chosen)):
+            assert all(
+                frozenset().union(*some) != possible for some in combinations(excluded, size)
+            )
+        sizes.append(len(chosen))
+        assert set(decision.statements) <= predicates.target.statements
+    assert len(sizes) > 40
+    assert max(sizes) > 1
+
+
+def test_every_relational_rationale_is_accepted_and_sufficient() -> None:
+    lengths = {"paper": [], "relational": []}
+    for item, predicates in random_cases(250, BOUNDS):
+        text = write_rationale(predicates, item, seed=3)
+        validation = validate_rationale(text, predicates, item, CFG)
+        assert validation.reasons == (), text
+        rivals = choose_statements(predicates, item.item_id).rivals
+        sufficiency = measure_sufficiency(text, validation.claims, predicates)
+        assert sufficiency >= 1 / (1 + len(rivals)), text
+        lengths["relational"].append(len(text.split()))
+    paper = [len(write_rationale(p, i, seed=3).split()) for i, p in random_cases(250)]
+    assert np.mean(lengths["relational"]) < np.mean(paper)
+
+
+def test_wrong_candidates_are_excluded_by_a_deciding_statement() -> None:
+    for item, predicates in random_cases(60, BOUNDS):
+        text = write_rationale(predicates, item, seed=0)
+        decision = choose_statements(predicates, item.item_id)
+        kinds = {s.kind for s in decision.statements} | {"lacks", "extra", "sight"}
+        claims = extract_claims(text, predicates)
+        for view in predicates.views:
+            about = [c for c in claims if c.candidate == view.letter and c.kind != "agrees"]
+            if view.letter not in (predicates.answer, *decision.rivals):
+                assert {c.kind for c in about} <= kinds, text
+            assert all(c.verdict != "contradicted" for c in about)
+
+
+def test_match_lines_rest_on_the_statements_of_the_rationale() -> None:
+    item, predicates = next(
+        (i, p) for i, p in random_cases(60, BOUNDS) if not choose_statements(p, i.item_id).rivals
+    )
+    lines = write_match_lines(predicates, item)
+    analysis = next(
+        line for line in write_rationale(predicates, item, 0).splitlines() if "analysis: C" in line
+    )
+    for line, view in zip(lines, predicates.views, strict=True):
+        if view.letter == predicates.answer:
+            assert "does not match" not in line
+        else:
+            named = [n for n in view.offsets if n in line]
+            assert named
+            assert named[0] in analysis
+
+
+SUFFICIENT = "Prediction: At the target moment, the {a} will be {place}."
+
+
+def sufficiency_of(prediction: str, pixels: list[tuple[float, float]]) -> float:
+    """The sufficiency of a prediction about a cube that the candidates show at these pixels; the
+    first is the target."""
+    steps = np.array([synthetic.on_ground(pixel)[:2] for pixel in pixels])
+    still = synthetic.scene([(0.0, 0.0), steps[0]], [(0, 0), (0, 0)])
+    positions, image = still.positions.copy(), still.image_positions.copy()
+    for frame, pixel in zip((60, 70, 80, 90), pixels, strict=True):
+        positions[frame, 1, :2], image[frame, 1] = synthetic.on_ground(pixel)[:2], pixel
+    scene = replace(still, positions=positions, image_positions=image, collisions=())
+    return _sufficiency(prediction, scene)
+
+
+def _sufficiency(prediction: str, scene: Scene) -> float:
+    from teacher.predicates.extraction import extract_predicates
+
+    item = synthetic.item((60, 70, 80, 90))
+    predicates = extract_predicates(item, scene, None, BOUNDS)
+    first, second = (o.noun_phrase for o in scene.objects)
+    text = f"Prediction: {prediction.format(b=first, a=second)}\nOutcome: none."
+    return measure_sufficiency(text, extract_claims(text, predicates), predicates)
+
+
+PIXELS = [(100, 60), (100, 160), (400, 60), (120, 250)]
+
+
+@pytest.mark.parametrize(
+    ("prediction", "expected"),
+    [
+        ("The {a} will be near the top-left.", 1.0),
+        ("The {a} will be left of the {b}.", 1 / 3),
+        ("The {a} will be left of the {b}. The {a} will be above the {b}.", 1.0),
+        ("The {a} will not be left of the {b}.", 0.0),
+        ("The {a} will be right of the {b}.", 0.0),
+        ("The {b} will be near the center.", 1 / 4),
+        ("Nothing is known.", 1 / 4),
+        ("The {a} will be near the right.", 1 / 4),
+    ],
+)  # fmt: skip
+def test_sufficiency_is_the_chance_of_a_reader_who_knows_only_the_prediction(
+    prediction: str, expected: float
+) -> None:
+    assert sufficiency_of(prediction, PIXELS) == pytest.approx(expected)
+
+
+def test_only_the_prediction_counts() -> None:
+    for item, predicates in random_cases(20, BOUNDS):
+        text = write_rationale(predicates, item, 0)
+        claims = extract_claims(text, predicates)
+        without = "\n".join(x for x in text.splitlines() if not x.startswith("Prediction"))
+        assert find_predicted(text, claims)
+        assert measure_sufficiency(without, extract_claims(without, predicates), predicates) == 0.25
+
+
+@pytest.mark.parametrize("order", list(permutations(range(2))))
+def test_interchangeable_objects_state_the_same(order: tuple[int, int]) -> None:
+    found = places(a=(0.3, 0.5), b=(0.6, 0.5))
+    relations = find_relations(found, BOUNDS)
+    names = [(A, B)[k] for k in order]
+    value = "left of" if order == (0, 1) else "right of"
+    assert normalize_relation(Relation("side", tuple(names), value)) in relations
