@@ -301,6 +301,13 @@ class Rationale(Record):
     """Whether the built-in narrator wrote the text because no response of the teacher passed."""
     claims: dict[str, list[int]] = field(default_factory=dict)
     """Counts of supported, contradicted and unknown claims about the scene, by kind of claim."""
+    predicates: str = "paper 1"
+    """Vocabulary of the predicates on which the text rests, and its version."""
+    sufficiency: float | None = None
+    """Probability that a reader who knows only the prediction picks the target; None if it was not
+    measured (see `teacher.sufficiency`)."""
+    undecided: bool = False
+    """Whether no statement of the relational vocabulary excludes every distractor of the item."""
 
     @classmethod
     def from_row(cls, row: dict[str, Any]) -> Self:

@@ -23,11 +23,18 @@ from conf.errors import UserError
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
 from teacher.narrator import write_rationale
-from teacher.predicates.extraction import extract_predicates
 from teacher.rationale_log import Journal, save_accepted
-from teacher.report import Figures, rejection_reasons, select_accepted, summarize, write_report
+from teacher.report import (
+    Figures,
+    describe_sufficiency,
+    rejection_reasons,
+    select_accepted,
+    summarize,
+    write_report,
+)
 from teacher.servers.responses import Response
 from teacher.validation.grader import RationaleGrader
+from teacher.vocabulary import choose_vocabulary, describe_item, name_vocabulary
 
 if TYPE_CHECKING:
     from data.store import Store
@@ -58,7 +65,7 @@ class Narration:
         return (
             f"rationales: {f['accepted']} accepted{fallback}, "
             f"{f['set_aside']} items set aside, {f['too_short']} items with too short a prefix; "
-            f"rejections: {rejections or 'none'}"
+            f"rejections: {rejections or 'none'}; {describe_sufficiency(f)}"
         )
 
 
@@ -70,8 +77,7 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     narration = narrate_store(store, cfg.teacher)
     log.info(narration)
     figures = narration.figures
-    seed = cfg.teacher.seed
-    page = write_report(store, narration.rationales, figures, cfg.examples, seed, run.folder)
+    page = write_report(store, narration.rationales, figures, cfg.examples, cfg.teacher, run.folder)
     log.info("report: %s", page)
     return {
         "accepted": float(figures["accepted"]),
@@ -79,6 +85,7 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
         "set_aside": float(figures["set_aside"]),
         "too_short": float(figures["too_short"]),
         "mean_words": float(np.mean(figures["lengths"] or [0])),
+        "sufficiency": figures["sufficiency"].get("all", [0.0])[0],
     }
 
 
@@ -104,6 +111,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
     grader = RationaleGrader(cfg)
     with Journal(store.folder / JOURNAL_FILE) as journal:
         check_items(journal, items)
+        report_other_vocabularies(journal, cfg)
         responses: dict[str, list[Rationale]] = defaultdict(list)
         for rationale in journal.rationales:
             if grader.is_current(rationale) and (cfg.fallback or not rationale.fallback):
@@ -179,15 +187,31 @@ def check_items(journal: Journal, items: list[SelectionItem]) -> None:
         )
 
 
+def report_other_vocabularies(journal: Journal, cfg: TeacherConfig) -> None:
+    """Log which rationales of a journal rest on another vocabulary, or on another version of it.
+    They stay in the file, and are not used."""
+    current = name_vocabulary(cfg)
+    others = Counter(r.predicates for r in journal.rationales if r.predicates != current)
+    for name, count in sorted(others.items()):
+        log.info(
+            "%s has %d responses of the vocabulary %s; they are not used, because "
+            "teacher.predicates=%s asks for %s",
+            *(journal.path, count, name, cfg.predicates, current),
+        )
+
+
 def _write_rationales(
     item: SelectionItem, store: Store, grader: RationaleGrader, first: int = 0
 ) -> list[Rationale]:
     """Write rationales of an item with the built-in narrator, from attempt `first` until one is
     accepted or no attempt is left. An item whose prefix is too short gets none."""
-    predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
+    predicates = describe_item(item, store, grader.cfg)
+    if predicates is None:
+        return []
+    vocabulary = choose_vocabulary(predicates, grader.cfg)
     rationales: list[Rationale] = []
-    for attempt in range(first, grader.cfg.attempts if predicates else 0):
-        text = write_rationale(predicates, item, grader.cfg.seed, attempt)
+    for attempt in range(first, grader.cfg.attempts):
+        text = write_rationale(vocabulary, item, grader.cfg.seed, attempt)
         rationales.append(grader.grade(Response(text), predicates, item, attempt))
         if rationales[-1].accepted:
             break

@@ -6,24 +6,77 @@ The instructions come first and are the same for every item, so that the server 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.resources import files
+from typing import Any
 
 from conf.schema import TeacherConfig
 from data.records import SelectionItem
-from teacher.predicates.facts import Predicates
+from teacher.deciding import choose_statements
+from teacher.predicates.facts import Predicates, Relation, RelationalPredicates
+from teacher.predicates.relations import find_topic
 from teacher.sections import SECTIONS
 
 PROMPT_VERSION = "3"
 
 SYSTEM = (files("teacher") / "templates" / "system_prompt.txt").read_text().rstrip()
+RELATIONAL = (files("teacher") / "templates" / "relational_prompt.txt").read_text().rstrip() + "\n"
+"""The part of the instructions that explains relational predicates."""
 
 
 def build_messages(
     predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
 ) -> list[dict[str, str]]:
     """Return the chat messages that request an item's rationale."""
-    system = SYSTEM.format(sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words)
-    facts = json.dumps(asdict(predicates), separators=(",", ":"))
+    relational = RELATIONAL if isinstance(predicates, RelationalPredicates) else ""
+    system = SYSTEM.format(
+        sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words, relations=relational
+    )
+    facts = json.dumps(format_facts(predicates, item), separators=(",", ":"))
     user = f"Question: {item.question}\nFacts: {facts}\nAnswer to reach: {item.letter}"
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
+
+
+def format_facts(predicates: Predicates, item: SelectionItem) -> dict[str, Any]:
+    """Return predicates as a teacher on a server reads them.
+
+    Of relational predicates, they have the statements that decide the item, with their values now
+    and in each candidate, and the other relations at the target between the same objects.
+    """
+    if not isinstance(predicates, RelationalPredicates):
+        return asdict(predicates)
+    facts = asdict(predicates.without_relations())
+    decision = choose_statements(predicates, item.item_id)
+    named = {name for statement in decision.statements for name in statement.objects}
+    facts["deciding"] = [
+        {
+            "statement": format_statement(statement),
+            "now": _format_topic(statement, predicates.observed),
+            "candidates": {
+                view.letter: statement in view.statements
+                or _format_topic(statement, view.relations)
+                or False
+                for view in predicates.views
+            },
+        }
+        for statement in decision.statements
+    ]
+    facts["relations"] = [
+        format_statement(relation)
+        for relation in predicates.target.relations
+        if set(relation.objects) <= named
+    ]
+    return facts
+
+
+def format_statement(statement: Relation) -> str:
+    """Return a statement in words, such as "red metal cube: left of blue rubber sphere"."""
+    subject, *others = statement.objects
+    joint = " than to " if statement.kind == "nearer" else " and "
+    return f"{subject}: {' '.join(filter(None, (statement.value, joint.join(others))))}"
+
+
+def _format_topic(statement: Relation, relations: Sequence[Relation]) -> str | None:
+    found = find_topic(statement, relations)
+    return None if found is None else format_statement(found)

@@ -113,7 +113,8 @@ def save_accepted(rationales: list[Rationale], path: Path) -> None:
     # All columns but these are text. The counts of claims have no column: a struct needs the same
     # fields in every file, but some kinds of claims may not occur.
     types = dict.fromkeys(("attempt", "seed", "prompt_tokens", "completion_tokens"), pa.int64())
-    types |= {"accepted": pa.bool_(), "fallback": pa.bool_(), "finished": pa.float64()}
+    types |= dict.fromkeys(("accepted", "fallback", "undecided"), pa.bool_())
+    types |= dict.fromkeys(("finished", "sufficiency"), pa.float64())
     types["reasons"] = pa.list_(pa.string())
     types["sections"] = pa.struct([(name, pa.string()) for name in SECTIONS])
     names = [f.name for f in fields(Rationale) if f.name != "claims"]

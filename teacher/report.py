@@ -6,7 +6,6 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,12 +14,14 @@ import numpy as np
 
 from conf.files import write_json, write_text
 from data.records import COLORS, MATERIALS, Rationale, SelectionItem
-from teacher.predicates.extraction import extract_predicates
+from teacher.prompts import format_facts
 from teacher.validation.validator import WORD
+from teacher.vocabulary import choose_vocabulary, describe_item
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from conf.schema import TeacherConfig
     from data.store import Store
 
 Figures = dict[str, Any]
@@ -47,6 +48,9 @@ def summarize(
     - `lengths`: number of words of each accepted rationale; `words`: the most frequent words.
     - `same_text`: number of accepted rationales with the text of an earlier one; `same_but_names`:
       the same if the names of objects are ignored.
+    - `sufficiency`: mean sufficiency of the accepted rationales, and share of those with
+      sufficiency 1, over all items, by family and by difficulty. `undecided`: number of items with
+      a response that no statement of the relational vocabulary decides.
     - `claims`: numbers of supported, contradicted and unknown claims, by kind.
     - `hours`: time in which the servers were in use. Multiply it by their GPUs to get GPU hours.
     """
@@ -82,12 +86,42 @@ def summarize(
         "distinct_words": len(words),
         "same_text": len(accepted) - len({r.text for r in accepted}),
         "same_but_names": len(accepted) - len(without_names),
+        "sufficiency": _summarize_sufficiency(items, accepted),
+        "undecided": len({r.item_id for r in every if r.undecided}),
         "claims": {kind: counts.tolist() for kind, counts in sorted(claims.items())},
         "requests": sum(r.prompt_tokens is not None for r in every),
         "prompt_tokens": sum(r.prompt_tokens or 0 for r in every),
         "completion_tokens": sum(r.completion_tokens or 0 for r in every),
         "hours": float(gaps[gaps < IDLE_SECONDS].sum()) / 3600,
     }
+
+
+def _summarize_sufficiency(
+    items: Sequence[SelectionItem], accepted: Sequence[Rationale]
+) -> dict[str, list[float]]:
+    """Return the mean sufficiency, the share of 1 and the number of rationales, by category."""
+    by_id = {item.item_id: item for item in items}
+    found: dict[str, list[float]] = defaultdict(list)
+    for r in accepted:
+        item = by_id[r.item_id]
+        names = ["all", item.family]
+        if item.difficulty is not None:
+            names.append(f"{item.family}, {item.difficulty}")
+        for name in names if r.sufficiency is not None else ():
+            found[name].append(r.sufficiency)
+    return {
+        name: [float(np.mean(values)), float(np.mean(np.array(values) == 1)), len(values)]
+        for name, values in sorted(found.items())
+    }
+
+
+def describe_sufficiency(figures: Figures) -> str:
+    """Return the sufficiency of the accepted rationales, and the undecided items, in words."""
+    mean, ones, _ = figures["sufficiency"].get("all", (float("nan"),) * 3)
+    return (
+        f"sufficiency {mean:.3f} ({ones:.1%} decide their item; {figures['undecided']} items that "
+        "no relational statement decides)"
+    )
 
 
 def select_accepted(
@@ -112,12 +146,16 @@ def format_figures(figures: Figures) -> str:
     import pandas as pd
 
     f = figures
+    sufficiency = pd.DataFrame.from_dict(
+        f["sufficiency"], orient="index", columns=["mean", "decided", "rationales"]
+    )
     counts = {
         "training items": f["items"],
         "accepted": f["accepted"],
         "of them by the built-in narrator": f["fallback"],
         "set aside": f["set_aside"],
         "prefix too short": f["too_short"],
+        "undecided items": f["undecided"],
     }
     attempts = pd.DataFrame({"responses": f["responses"], "accepted": f["accepted_responses"]})
     attempts.index = pd.RangeIndex(1, len(attempts) + 1, name="attempt")
@@ -140,6 +178,7 @@ def format_figures(figures: Figures) -> str:
         *(_format_table(table) for table in (attempts, rejected)),
         "\n".join(examples),
         _format_words(f) if f["accepted"] else "",
+        _format_table(sufficiency.astype({"rationales": int}).rename_axis("sufficiency")),
         _format_table(claims.rename_axis("claims")),
         _format_cost(f) if f["requests"] else "",
     ]
@@ -180,11 +219,11 @@ def write_report(
     accepted: Sequence[Rationale],
     figures: Figures,
     count: int,
-    seed: int,
+    cfg: TeacherConfig,
     folder: Path,
 ) -> Path:
     """Write report.json, report.txt and report.html, which shows `count` accepted rationales,
-    sampled with `seed`. Return the path of report.html."""
+    sampled with `cfg.seed`. Return the path of report.html."""
     import jinja2
 
     from data.publish.contact_sheets import SheetRows, draw_sheet
@@ -195,11 +234,12 @@ def write_report(
     write_text(folder / "report.txt", text + "\n")
     items = {item.item_id: item for item in store.selection("train")}
     rows, examples = SheetRows(store), []
-    for k in sorted(np.random.default_rng(seed).permutation(len(accepted))[:count].tolist()):
+    for k in sorted(np.random.default_rng(cfg.seed).permutation(len(accepted))[:count].tolist()):
         item = items[accepted[k].item_id]
         write_atomically(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.make(item)]))
-        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
-        examples.append((accepted[k], json.dumps(predicates and asdict(predicates), indent=1)))
+        predicates = describe_item(item, store, cfg)
+        facts = predicates and choose_vocabulary(predicates, cfg)
+        examples.append((accepted[k], json.dumps(facts and format_facts(facts, item), indent=1)))
     template = (files("teacher") / "templates" / "report.html").read_text()
     page = jinja2.Template(template, autoescape=True).render(
         teacher=accepted[0].teacher if accepted else "an unnamed teacher",

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.predicates.extraction import extract_predicates
 from teacher.prompts import build_messages
 from teacher.sections import GRAMMAR
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import Response
 from teacher.servers.server import RequestFields
 from teacher.validation.grader import RationaleGrader
+from teacher.vocabulary import choose_vocabulary, describe_item
 
 if TYPE_CHECKING:
     from data.store import Store
@@ -38,13 +38,14 @@ async def request_rationales(
 
     async def narrate(job: Job) -> None:
         item, attempt = job
-        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
+        predicates = describe_item(item, store, cfg)
         # There are no predicates if the prefix is too short.
         while predicates and attempt < cfg.attempts:
             # Most first responses are accepted, so several are requested only after a rejection.
             n = min(cfg.samples, cfg.attempts - attempt) if attempt else 1
             try:
-                responses = await pool.complete(build_messages(predicates, item, cfg), n)
+                messages = build_messages(choose_vocabulary(predicates, cfg), item, cfg)
+                responses = await pool.complete(messages, n)
             except NoResponseError as error:
                 responses = [Response("", f"unanswered: {error}")]
             rationales = [

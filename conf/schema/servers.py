@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from omegaconf import MISSING
@@ -65,6 +65,42 @@ class ServerConfig(ServersConfig):
 
 
 @dataclass
+class RelationBounds(Settings):
+    """Bounds of the words for relations between objects (`teacher.predicates=relational`)."""
+
+    level: float = setting(0.04, above=0, below=1)
+    """Share of the image's width or height below which two objects are aligned or level, and by
+    which the leftmost object must lie to the left of all others."""
+    against: float = setting(0.15, above=0)
+    """Gap, as a share of an object's width, below which two objects are against each other."""
+    near: float = setting(1.0, above=0)
+    """Gap, as a share of an object's width, below which two objects are near each other."""
+    between_ends: float = setting(0.2, least=0, below=0.5)
+    """An object between two others divides their distance; each part has at least this share."""
+    between_offset: float = setting(0.25, above=0)
+    """Maximum distance of an object between two others from the line through them, as a share of
+    their distance."""
+    nearer: float = setting(1.25, above=1)
+    """An object is nearer to another than to a third if the latter distance is at least as many
+    times the former."""
+    covered: float = setting(0.9, above=0, most=1)
+    """Visible fraction of an object below which one before it is in front of it."""
+    cover_distance: float = setting(0.12, above=0)
+    """Maximum distance in the image of an object from one that it covers, as a share of the
+    width."""
+    edge: float = setting(0.06, above=0, below=0.5)
+    """Distance from the image's edge, as a share of its width or height, below which an object has
+    reached the edge."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        if self.against >= self.near:
+            yield (
+                f"{group}against={self.against:g} and {group}near={self.near:g}: objects against "
+                "each other are nearer than near ones, so against must be less"
+            )
+
+
+@dataclass
 class TeacherConfig(ServersConfig):
     """The teacher: a model on servers or, without a server, the built-in narrator."""
 
@@ -75,6 +111,12 @@ class TeacherConfig(ServersConfig):
     seed: int = setting(0, least=0)
     """Seed of the built-in narrator's choice of phrases. It is not sent to a server, but changing
     it requests every rationale again."""
+    predicates: str = setting("paper", options=("paper", "relational"))
+    """Vocabulary of the facts: that of the paper, or with relations between objects too."""
+    bounds: RelationBounds = field(default_factory=RelationBounds)
+    """Bounds of the words for relations."""
+    sufficient: bool = False
+    """Reject rationales whose prediction fits a distractor as well."""
     min_words: int = 80
     """Minimum length of a rationale (words)."""
     max_words: int = 250

@@ -7,7 +7,7 @@ shortly (see `teacher.predicates.motion.find_cut`). No fact contains a number.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import NamedTuple
 
@@ -190,3 +190,7 @@ class RelationalPredicates(Predicates):
     @property
     def target(self) -> View:
         return next(view for view in self.views if view.letter == self.answer)
+
+    def without_relations(self) -> Predicates:
+        """Return the predicates of the paper's vocabulary."""
+        return Predicates(**{f.name: getattr(self, f.name) for f in fields(Predicates)})

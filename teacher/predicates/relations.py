@@ -21,7 +21,7 @@ in the image; gaps are measured on the ground.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, permutations
 from typing import NamedTuple
 
@@ -98,6 +98,21 @@ def normalize_relation(relation: Relation) -> Relation:
     if kind in ("between", "arrival") and objects[1] > objects[2]:
         return Relation(kind, (objects[0], objects[2], objects[1]), value)
     return relation
+
+
+def find_topic(statement: Relation, relations: Sequence[Relation]) -> Relation | None:
+    """Return the relation between the same objects in the same respect, with the same subject.
+
+    For "a is nearer to b than to c", this may be "a is nearer to c than to b".
+    """
+    kind, objects, _ = wanted = normalize_relation(statement)
+    if kind == "nearer":
+        opposite = Relation(kind, (objects[0], objects[2], objects[1]), wanted.value)
+        return next((r for r in (wanted, opposite) if r in relations), None)
+    for relation in relations:
+        if kind in SYMMETRIC and relation[:2] == (kind, objects):
+            return relation if objects == statement.objects else flip_relation(relation)
+    return None
 
 
 class Places(NamedTuple):

@@ -8,13 +8,16 @@ from collections import Counter
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
+from teacher.deciding import choose_statements
 from teacher.narrator import NARRATOR_VERSION
-from teacher.predicates.facts import Predicates
+from teacher.predicates.facts import RelationalPredicates
 from teacher.prompts import PROMPT_VERSION
 from teacher.reading.grounding import VERDICTS
 from teacher.sections import GRAMMAR_VERSION
 from teacher.servers.responses import Response
+from teacher.sufficiency import measure_sufficiency
 from teacher.validation.validator import VALIDATOR_VERSION, Validation, validate_rationale
+from teacher.vocabulary import choose_vocabulary, name_vocabulary, relation_bounds
 
 MAX_CHARACTERS = 20_000
 """Maximum length of a response. A longer one is rejected, and the record has its beginning only."""
@@ -32,20 +35,37 @@ class RationaleGrader:
             "validator_version": VALIDATOR_VERSION,
             "settings": self._hash_settings(),
             "seed": cfg.seed,
+            "predicates": name_vocabulary(cfg),
         }
         """Fields that every new record has. An earlier record with another value in one of them is
         ignored, and a new response is requested."""
 
     def grade(
-        self, response: Response, predicates: Predicates, item: SelectionItem, attempt: int
+        self,
+        response: Response,
+        predicates: RelationalPredicates,
+        item: SelectionItem,
+        attempt: int,
     ) -> Rationale:
-        """Validate a response, and return its record; it has the reasons if it is rejected."""
+        """Validate a response, and return its record; it has the reasons if it is rejected.
+
+        Args:
+            predicates: All predicates of the item. The response is validated with those of
+                `cfg.predicates`, and its sufficiency is measured with all.
+        """
         if len(response.text) > MAX_CHARACTERS:
             result = Validation(("too long",))
         elif response.flaw is not None:
             result = Validation((response.flaw,))
         else:
-            result = validate_rationale(response.text, predicates, item, self.cfg)
+            vocabulary = choose_vocabulary(predicates, self.cfg)
+            result = validate_rationale(response.text, vocabulary, item, self.cfg)
+        undecided = bool(choose_statements(predicates, item.item_id).rivals)
+        sufficiency = None
+        if result.sections:
+            sufficiency = measure_sufficiency(response.text, result.claims, predicates)
+            if self.cfg.sufficient and sufficiency < 1:
+                result = result.rejected("undecided" if undecided else "insufficient")
         counts = Counter((claim.kind, claim.verdict) for claim in result.claims)
         return Rationale(
             item_id=item.item_id,
@@ -63,6 +83,8 @@ class RationaleGrader:
                 kind: [counts[kind, name] for name in VERDICTS]
                 for kind in sorted({kind for kind, _ in counts})
             },
+            sufficiency=sufficiency,
+            undecided=undecided,
             **self.origin,
         )
 
@@ -74,6 +96,8 @@ class RationaleGrader:
         """Return a short hash of the settings that affect a response or its validation."""
         cfg = self.cfg
         settings = [cfg.min_words, cfg.max_words]
+        if cfg.predicates == "relational" or cfg.sufficient:
+            settings += [cfg.sufficient, *relation_bounds(cfg)]
         if cfg.url is not None:
             settings += [cfg.model, cfg.temperature, cfg.top_p, cfg.top_k, cfg.max_tokens]
         if self.grammar_version is not None:

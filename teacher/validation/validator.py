@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from data.records import LETTERS, SelectionItem
@@ -17,7 +17,7 @@ from teacher.validation.claim_extraction import extract_claims
 if TYPE_CHECKING:
     from conf.schema import TeacherConfig
 
-VALIDATOR_VERSION = "4"
+VALIDATOR_VERSION = "5"
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
 WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")
 """A word; hyphens and apostrophes join words, so "top-left" counts as one."""
@@ -42,6 +42,10 @@ class Validation:
     @property
     def accepted(self) -> bool:
         return not self.reasons
+
+    def rejected(self, reason: str) -> Validation:
+        """Return the same result with one more reason for rejection."""
+        return replace(self, reasons=(*self.reasons, reason))
 
 
 def validate_rationale(

@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from importlib.resources import files
 
 import yaml
 
 from teacher.deciding import Decision
 from teacher.predicates.facts import CandidateFacts, Relation, RelationalPredicates, View
-from teacher.predicates.relations import CHANGES, SYMMETRIC, flip_relation, normalize_relation
+from teacher.predicates.relations import (
+    CHANGES,
+    SYMMETRIC,
+    find_topic,
+    flip_relation,
+    normalize_relation,
+)
 from teacher.writers.paper import Detail, Writer
 
 PHRASES = yaml.safe_load((files("teacher") / "templates" / "relations.yaml").read_text())
-
-
-def find_topic(statement: Relation, relations: Sequence[Relation]) -> Relation | None:
-    """Return the relation between the same objects in the same respect, with the same subject.
-
-    For "a is nearer to b than to c", this may be "a is nearer to c than to b".
-    """
-    kind, objects, _ = wanted = normalize_relation(statement)
-    if kind == "nearer":
-        opposite = Relation(kind, (objects[0], objects[2], objects[1]), wanted.value)
-        return next((r for r in (wanted, opposite) if r in relations), None)
-    for relation in relations:
-        if kind in SYMMETRIC and relation[:2] == (kind, objects):
-            return relation if objects == statement.objects else flip_relation(relation)
-    return None
 
 
 class RelationalWriter(Writer):

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -91,11 +92,13 @@ def test_figures_without_responses():
 
 
 def test_page_shows_random_rationales_beside_their_frames(micro_store, tmp_path):
-    narration = narrate_store(micro_store, TeacherConfig(name="template & co"))
+    cfg = TeacherConfig(name="template & co")
+    narration = narrate_store(micro_store, cfg)
     figures = narration.figures
 
     def write(rationales, seed):
-        return write_report(micro_store, rationales, figures, 4, seed, tmp_path).read_text()
+        shown = replace(cfg, seed=seed)
+        return write_report(micro_store, rationales, figures, 4, shown, tmp_path).read_text()
 
     page = write(narration.rationales, 0)
     assert (tmp_path / "report.txt").read_text() == format_figures(figures) + "\n"

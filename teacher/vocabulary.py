@@ -1,0 +1,41 @@
+"""Vocabularies: the predicates that rationales rest on, and their versions."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from data.records import SelectionItem
+from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.facts import Predicates, RelationalPredicates
+from teacher.predicates.relations import Bounds
+
+if TYPE_CHECKING:
+    from conf.schema import TeacherConfig
+    from data.store import Store
+
+VERSIONS = {"paper": "1", "relational": "1"}
+"""Version of each vocabulary. It changes whenever the same scene gives other predicates."""
+
+
+def name_vocabulary(cfg: TeacherConfig) -> str:
+    """Return the name of the vocabulary and its version, such as "relational 1"."""
+    return f"{cfg.predicates} {VERSIONS[cfg.predicates]}"
+
+
+def relation_bounds(cfg: TeacherConfig) -> Bounds:
+    """Return the bounds of the words for relations."""
+    return Bounds(**asdict(cfg.bounds))
+
+
+def describe_item(
+    item: SelectionItem, store: Store, cfg: TeacherConfig
+) -> RelationalPredicates | None:
+    """Return all predicates of an item; None if its prefix is too short."""
+    scene = store.scene(item.scene_id)
+    return extract_predicates(item, scene, store.scene, relation_bounds(cfg))
+
+
+def choose_vocabulary(predicates: RelationalPredicates, cfg: TeacherConfig) -> Predicates:
+    """Return the predicates of the vocabulary that rationales rest on."""
+    return predicates if cfg.predicates == "relational" else predicates.without_relations()
