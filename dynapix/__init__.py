@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from conf.errors import UserError
     from dynapix.benchmark import Benchmark, Frame, Item, Query, load
-    from dynapix.rationales import RationaleScore, score_rationale
+    from dynapix.rationales import RationaleScore, score_rationale, sufficiency
     from dynapix.retrieval import RetrievalScores, evaluate_retrieval
     from dynapix.selection import Comparison, Failure, Outcome, Result, evaluate
     from evaluation.metrics.ranking import rank_metrics
@@ -45,6 +45,7 @@ _HOMES = {
     "parse_choice": "models.student.answer_parser",
     "rank_metrics": "evaluation.metrics.ranking",
     "score_rationale": "dynapix.rationales",
+    "sufficiency": "dynapix.rationales",
 }
 """The module that defines each public name."""
 
@@ -68,6 +69,7 @@ __all__ = [
     "parse_choice",
     "rank_metrics",
     "score_rationale",
+    "sufficiency",
 ]
 
 

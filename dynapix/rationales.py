@@ -8,7 +8,10 @@ from conf.errors import UserError
 from dynapix.benchmark import Item
 from teacher.numbers.detection import find_numbers
 from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.relations import Bounds
 from teacher.reading.grounding import VERDICTS, Claim
+from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 
 
@@ -61,12 +64,36 @@ def score_rationale(item: Item, text: str) -> RationaleScore:
     Raises:
         UserError: The item has no predicates, because a collision follows its prefix too early.
     """
+    predicates = _extract_predicates(item)
+    numbers = tuple(text[start:stop] for start, stop in find_numbers(text))
+    return RationaleScore(numbers, extract_claims(text, predicates))
+
+
+def sufficiency(item: Item, text: str) -> float:
+    """Return the probability that a reader who knows only the prediction picks the target.
+
+    The reader sees each candidate's true state in the words of the relational vocabulary, leaves
+    out the candidates of which a statement of the prediction is false, and guesses among the
+    others. A text that predicts nothing, or whose prediction fits no candidate, has the
+    sufficiency of a guess, 1/4.
+
+    Args:
+        item: The selection item that the rationale is about.
+        text: The rationale, with the heading "Prediction:".
+
+    Raises:
+        UserError: The item has no predicates, because a collision follows its prefix too early.
+    """
+    predicates = _extract_predicates(item)
+    return measure_sufficiency(text, extract_claims(text, predicates), predicates)
+
+
+def _extract_predicates(item: Item) -> RelationalPredicates:
     store = item._benchmark.store
-    predicates = extract_predicates(item.record, store.scene(item.scene_id), store.scene)
+    predicates = extract_predicates(item.record, store.scene(item.scene_id), store.scene, Bounds())
     if predicates is None:
         raise UserError(
             f"{item.item_id} has no predicates: a collision follows its prefix too early",
             code="no-predicates",
         )
-    numbers = tuple(text[start:stop] for start, stop in find_numbers(text))
-    return RationaleScore(numbers, extract_claims(text, predicates))
+    return predicates

@@ -336,6 +336,23 @@ def test_a_rationale_is_scored_by_the_oracle(micro_store) -> None:
     assert "numbers: two" in str(score)
 
 
+def test_sufficiency_of_a_rationale_is_that_of_its_prediction(micro_store) -> None:
+    from teacher.narrator import write_rationale
+    from teacher.predicates.extraction import extract_predicates
+    from teacher.predicates.relations import Bounds
+
+    found = []
+    for item in dynapix.load(micro_store.folder, split="test").selection[:20]:
+        scene = micro_store.scene(item.scene_id)
+        predicates = extract_predicates(item.record, scene, micro_store.scene, Bounds())
+        if predicates is not None:
+            text = write_rationale(predicates, item.record, 0)
+            found.append(dynapix.sufficiency(item, text))
+            assert dynapix.sufficiency(item, text.replace("Prediction:", "Summary:")) == 0.25
+    assert len(found) > 5
+    assert np.mean(found) > 0.9
+
+
 def test_name_of_a_preset_and_a_world_builds_the_benchmark_in_the_world(
     tmp_path, monkeypatch
 ) -> None:

@@ -310,12 +310,11 @@ def test_the_longest_rationale_fits_and_the_audit_needs_no_weights(
     cfg = student(preset)
     released = released_processor(processor, RELEASED_PIXELS)
     loading.pin_sizes(released, cfg.image_size, cfg.frames)
-    rationales = {
-        r.item_id: r for r in ensure_rationales(micro_store, TeacherConfig(name="template"))
-    }
+    teacher = TeacherConfig(name="template")
+    rationales = {r.item_id: r for r in ensure_rationales(micro_store, teacher)}
     regime = compose("train.sft", SftCommand, [f"student={preset}"]).train.regime
     items = micro_store.selection("train")
-    supervised = supervised_items(micro_store, items, rationales, regime)["reasoning"]
+    supervised = supervised_items(micro_store, items, rationales, regime, teacher)["reasoning"]
     longest = max(supervised, key=lambda s: len(s.text))
     words = longest.rationale.split()
     more = " ".join((words * MAX_SENTENCE_TAGS)[: MAX_SENTENCE_TAGS - len(words)])

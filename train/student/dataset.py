@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 
-from conf.schema import SftCommand
+from conf.schema import SftCommand, TeacherConfig
 from conf.schema.training import WITHOUT_RATIONALES
 from data.records import LETTERS, Rationale, SelectionItem
 from data.render.frame_cache import FrameReader
@@ -21,7 +21,7 @@ from models.student.prompts import (
 )
 from teacher.candidate_letters import relabel_text, reorder_candidates
 from teacher.narrator import write_match_lines
-from teacher.predicates.extraction import extract_predicates
+from teacher.vocabulary import choose_vocabulary, describe_item
 from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
 from train.tiny_base import questions
@@ -73,11 +73,18 @@ class SupervisedItem:
 
 
 def supervised_items(
-    store: Store, items: list[SelectionItem], rationales: dict[str, Rationale], regime: str
+    store: Store,
+    items: list[SelectionItem],
+    rationales: dict[str, Rationale],
+    regime: str,
+    teacher: TeacherConfig,
 ) -> dict[str, list[SupervisedItem]]:
     """Return, by mode, every item in answer mode, and in reasoning mode if `rationales` has its id.
 
     A student that is trained on rationales learns both modes, so that it can be prompted in either.
+
+    Args:
+        teacher: Settings of the rationales; the lines about matches have their vocabulary.
     """
     by_mode: dict[str, list[SupervisedItem]] = {mode: [] for mode in MODES}
     for item in items:
@@ -85,8 +92,8 @@ def supervised_items(
             lines: tuple[str, ...] = ()
             if has_matches(regime):
                 # An item that has a rationale has predicates.
-                predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
-                lines = write_match_lines(predicates, item)
+                predicates = describe_item(item, store, teacher)
+                lines = write_match_lines(choose_vocabulary(predicates, teacher), item)
             by_mode["reasoning"].append(
                 SupervisedItem(item, "reasoning", regime, rationale.text, lines)
             )
@@ -128,7 +135,7 @@ def load_datasets(
         validation_items = shuffled([i for i in items if i.scene_id in held_out], seed)
 
         def samples_of(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
-            by_mode = supervised_items(store, items, by_item, train.regime)
+            by_mode = supervised_items(store, items, by_item, train.regime, cfg.teacher)
             return {
                 mode: [s.lazy_sample(frames, frame_count, seed) for s in supervised]
                 for mode, supervised in by_mode.items()

@@ -26,7 +26,7 @@ COT = [r for r in REGIMES if r not in WITHOUT_RATIONALES]
 
 def items_of(store: Store, regime: str) -> dict[str, list[SupervisedItem]]:
     rationales = {r.item_id: r for r in ensure_rationales(store, TEACHER)}
-    return supervised_items(store, store.selection("train"), rationales, regime)
+    return supervised_items(store, store.selection("train"), rationales, regime, TEACHER)
 
 
 @pytest.mark.parametrize("regime", COT)
