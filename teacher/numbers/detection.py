@@ -1,8 +1,8 @@
 """Finds every number in prose: digits, number words, and disguised spellings of both.
 
-Counts, ordinals, fractions, multiples, quantities and measured times are numbers. "First," at the
-start of a sentence, "both", "pair", "one another", "the other one", "once struck", "no one" and
-"one side" are not.
+Counts, ordinals, fractions, multiples, quantities, measured times and lengths in terms of objects
+are numbers. "First," at the start of a sentence, "both", "pair", "one another", "the other one",
+"once struck", "no one" and "one side" are not. docs/teacher.md has the whole policy.
 
 The text is normalized (see `normalization`) and split into words. Most words are never numbers. For
 each other word, a rule reads the words around it and returns the span of a number, if there is one.
@@ -15,6 +15,7 @@ from collections.abc import Callable, Collection
 from functools import lru_cache
 from itertools import accumulate
 
+from teacher.numbers.lengths import LENGTH
 from teacher.numbers.normalization import (
     LEXICON,
     Spans,
@@ -54,6 +55,8 @@ ARABIC = re.compile(
 UNSPACED = re.compile(_any_of(map(normalize_word, LEXICON.unspaced)))
 MAX_LETTERS = 60
 """Number of letters of a word that the rules read; the rest is ignored."""
+MAX_COUNTERPART = 12
+"""Number of words after "one" among which "the other" makes it a pronoun."""
 ASCII_WORD = re.compile(r"([A-Za-z]+)")
 # To `re`, Indic vowel signs are not letters, although they are parts of words.
 WORD = re.compile(r"((?:[^\W\d_]+|[\u0900-\u0dff]+)+)")
@@ -134,7 +137,7 @@ def _merged(spans: Spans, text: str) -> Spans:
 
 
 def _scan(text: str) -> Spans:
-    spans = [m.span() for m in FIGURES.finditer(text)]
+    spans = [m.span() for pattern in (FIGURES, LENGTH) for m in pattern.finditer(text)]
     if not text.isascii():
         spans += [m.span() for m in UNSPACED.finditer(text)]
     prose = Prose(text)
@@ -233,6 +236,12 @@ def _is_pronoun(prose: Prose, index: int) -> bool:
     previous, following = prose.before(index), prose.after(index)
     if following in ("another", "side", "sided") or previous == "no":
         return True
+    if previous == "only" and prose.before(index, 2) == "the" and following not in COUNTABLE:
+        # "The only one that moves."
+        return True
+    counts = following == "of" or following in COUNTABLE
+    if prose.opens_clause(index) and not counts and _has_counterpart(prose, index):
+        return True
     if following in COUNTABLE or rule_of(previous[:MAX_LETTERS]) is _always:
         return False
     is_adjectival = len(previous) > 4 and previous.endswith(ADJECTIVE_ENDINGS)
@@ -246,10 +255,26 @@ def _is_pronoun(prose: Prose, index: int) -> bool:
     return prose.before(index, 2) in ("the", "a", "an", "each", "every", "its", "their")
 
 
+def _has_counterpart(prose: Prose, index: int) -> bool:
+    """Return whether "the other" follows in the sentence: "One moves quickly, the other rests"."""
+    for k in range(index + 1, min(index + MAX_COUNTERPART, len(prose.words))):
+        if SENTENCE_ENDS & set(prose.gaps[k]):
+            return False
+        if prose.word(k) == "other" and prose.word(k - 1) == "the":
+            return True
+    return False
+
+
 def _first(prose: Prose, index: int) -> tuple[int, int] | None:
-    """A number, except in "First, ..." at the start of a clause, "at first" and "first of all"."""
+    """A number, except in "First, ..." at the start of a clause, "at first", "first of all", "in
+    the first place" and "the first thing to notice"."""
     if prose.before(index) == "at":
         return None
+    if prose.before(index) == "the":
+        if prose.after(index) == "thing" and prose.after(index, 2) == "to":
+            return None
+        if prose.after(index) == "place" and prose.before(index, 2) == "in":
+            return None
     aside = prose.gaps[index + 1].lstrip()[:1] in (",", ":", "—", "–")
     aside = aside or (prose.after(index) == "of" and prose.after(index, 2) == "all")
     opening = index - (prose.before(index) in ("but", "and", "so"))
@@ -355,6 +380,7 @@ RULES: dict[str, Rule] = {
     "minute": _minute,
     "score": _score,
     "secondary": _secondary,
+    "double": _except_before("check", "checks", "checked", "checking"),
     **dict.fromkeys(map(normalize_word, LEXICON.foreign_firsts), _first),
     **dict.fromkeys(("due", "meta"), _italian),
     # Italian: "second", or, before an article, "according to".
