@@ -37,6 +37,8 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
     from data.render.frame_cache import FrameReader
     from evaluation.generators import base, response_log
+    from evaluation.metrics.reasons import measure_reasons
+    from evaluation.metrics.results import variant_name
     from evaluation.metrics.selection import Choices, selection_report
     from evaluation.reporting.selection_report import write_report
 
@@ -68,8 +70,14 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         for variant, responses in answers.items()
     ]
     asked = [(*variant, key) for variant, key in keys.items()]
+    reasons = {
+        variant_name(*variant): summary
+        for variant, responses in answers.items()
+        if variant[0] == "reasoning"
+        and (summary := measure_reasons(items, responses, store, cfg.seed)) is not None
+    }
     report = selection_report(
-        choices, items, store.name, store.identity, cfg.seed, cfg.suite, asked
+        choices, items, store.name, store.identity, cfg.seed, cfg.suite, asked, reasons
     )
     write_report(report, run.folder, items[0].suite)
     return {

@@ -15,7 +15,12 @@ from PIL import Image
 from data.records import FrameRef, SelectionItem
 from data.render.frame_cache import render_frames
 from data.store import Store
-from data.tracks.selection.balance import SCORES, CandidateFrames, rank_shares
+from data.tracks.selection.balance import (
+    SCORES,
+    CandidateFrames,
+    compare_candidates,
+    rank_shares,
+)
 from data.tracks.selection.balanced import IMAGE_SIZE
 
 SIMPLE = tuple(f"{score}, {end}" for score in SCORES for end in ("lowest", "highest"))
@@ -62,16 +67,6 @@ def _target_first(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
     return np.take_along_axis(scores, order[:, None, :], axis=-1)
 
 
-def logistic_features(scores: np.ndarray) -> np.ndarray:
-    """Return features (N, 4, F) of the candidates: the scores relative to those of the other
-    candidates, and whether each is the lowest or the highest."""
-    spread = scores.std(axis=-1, keepdims=True)
-    relative = (scores - scores.mean(axis=-1, keepdims=True)) / np.maximum(spread, 1e-6)
-    is_lowest = scores <= scores.min(axis=-1, keepdims=True)
-    is_highest = scores >= scores.max(axis=-1, keepdims=True)
-    return np.concatenate([relative, is_lowest, is_highest], axis=1).swapaxes(1, 2)
-
-
 def fit_logistic(features: np.ndarray, answers: np.ndarray) -> np.ndarray:
     """Return the coefficients (F,) of a conditional logistic model, by maximum likelihood with a
     small penalty.
@@ -103,7 +98,7 @@ def logistic_accuracies(
     """Return for each item whether the logistic model of its family is right, (N,): NaN for items
     of the training split, on which the models are trained, and of families without such items."""
     right = np.full(len(items), np.nan)
-    features = logistic_features(scores)
+    features = compare_candidates(scores).swapaxes(-2, -1)
     families = np.array([item.family for item in items])
     splits = np.array([item.split for item in items])
     for family in np.unique(families):

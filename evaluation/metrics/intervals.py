@@ -40,6 +40,14 @@ class SceneBootstrap:
         values = np.asarray(values, float)
         return _interval(values.mean(), self._counts @ values / self._counts.sum(1), len(values))
 
+    def ratio(self, parts: Sequence[float], wholes: Sequence[float]) -> Interval:
+        """Return the sum of the parts (items,) divided by the sum of the wholes (items,), of which
+        at least one is positive. Resamples whose wholes are all 0 do not count."""
+        parts, wholes = np.asarray(parts, float), np.asarray(wholes, float)
+        above, below = self._counts @ parts, self._counts @ wholes
+        resampled = np.divide(above, below, out=np.full_like(above, np.nan), where=below > 0)
+        return _interval(parts.sum() / wholes.sum(), resampled, len(parts))
+
     def median(self, values: Sequence[float]) -> Interval:
         """Return the median of the values (items,)."""
         values = np.asarray(values, float)

@@ -12,6 +12,7 @@ from data.records import FAMILIES, RetrievalQuery
 from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval, SceneBootstrap
 from evaluation.metrics.ranking import query_metrics
+from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.significance import PairedComparison
 
 if TYPE_CHECKING:
@@ -119,6 +120,7 @@ class SelectionReport:
         subtypes, readings, positions, calibration: Details by `SelectionResult.key`. `readings`
             has the numbers of parsed responses, of valid records, and of responses that could not
             be parsed for each reason.
+        reasons: What the rationales claim, by `SelectionResult.key`, for reasoning modes.
         asked: The mode and the control of each variant, and the `key` of its lines in
             answers.jsonl; empty for retrievers.
     """
@@ -130,6 +132,7 @@ class SelectionReport:
     readings: dict[str, dict[str, int]]
     positions: dict[str, PositionBias]
     calibration: dict[str, Calibration]
+    reasons: dict[str, ReasonSummary] = field(default_factory=dict)
     asked: list[tuple[str, str | None, str]] = field(default_factory=list)
 
 

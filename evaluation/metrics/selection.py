@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,7 @@ from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.selection.time import CELLS
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
 from evaluation.metrics.intervals import SceneBootstrap
+from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.results import (
     BASELINE,
     SIMILARITY,
@@ -78,12 +80,13 @@ def selection_report(
     seed: int,
     suite: str | None = None,
     asked: Sequence[tuple[str, str | None, str]] = (),
+    reasons: Mapping[str, ReasonSummary] = MappingProxyType({}),
 ) -> SelectionReport:
     """Return the report of the choices of one or several models on the same items.
 
     Args:
         benchmark, suite: As in `SelectionResult`.
-        build, asked: As in `SelectionReport`.
+        build, asked, reasons: As in `SelectionReport`.
         seed: Seed of the resampling of scenes.
     """
     scenes = SceneBootstrap([i.scene_id for i in items], seed)
@@ -99,6 +102,7 @@ def selection_report(
         readings={key: count_readings(c.answers) for key, c in by_key.items() if c.answers},
         positions={key: measure_position_bias(c.letters, letters) for key, c in by_key.items()},
         calibration={key: of for key, of in calibrations.items() if of},
+        reasons={**reasons},
         asked=[*asked],
     )
 

@@ -19,10 +19,13 @@ from data.store import Store, open_store
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.quota import interleave
 from evaluation.metrics.baselines import baseline_results
+from evaluation.metrics.reasons import read_reasons
 from evaluation.metrics.results import SelectionResult
 from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting.measurements import Measurement, compare_models
 from evaluation.reporting.run_responses import ItemResponse, Responses
+from teacher.reading.grounding import Claim
+from teacher.sections import SECTIONS
 
 PREFIX_FRAMES = 6
 """Number of frames of the prefix that are shown, evenly spread."""
@@ -156,7 +159,7 @@ def page_entries(
             "answer": item.letter,
             "truth": describe_truth(item, store),
             "responses": [
-                _response_entry(label, r[item.item_id], item)
+                _response_entry(label, r[item.item_id], item, store)
                 for label, r in responses.items()
                 if item.item_id in r
             ],
@@ -178,13 +181,38 @@ def describe_truth(item: SelectionItem, store: Store) -> list[str]:
     return sentences
 
 
-def _response_entry(label: str, response: ItemResponse, item: SelectionItem) -> dict[str, Any]:
+def _response_entry(
+    label: str, response: ItemResponse, item: SelectionItem, store: Store
+) -> dict[str, Any]:
     letter = response.letter
     verdict = "correct" if letter == item.letter else "wrong" if letter else "unparsed"
     return {
         "model": label, "letter": letter, "verdict": verdict, "reason": response.reason,
         "text": response.text, "truncated": response.truncated,
+        "claims": mark_claims(item, response, store),
     }  # fmt: skip
+
+
+def mark_claims(item: SelectionItem, response: ItemResponse, store: Store) -> list[dict[str, Any]]:
+    """Return the spans of a rationale's claims in text order, each with the verdicts on the claims
+    that it states, and with these claims in words. Spans do not overlap."""
+    if SECTIONS[0] not in response.text:
+        return []
+    reasons = read_reasons(item, response.text, response.letter, store)
+    claims = [c for part in reasons.claims.values() for c in part] if reasons else []
+    by_span: dict[tuple[int, int], list[Claim]] = {}
+    for claim in claims:
+        by_span.setdefault(claim.span, []).append(claim)
+    marks, end = [], 0
+    for (start, stop), stated in sorted(by_span.items()):
+        if start < end:
+            continue
+        verdicts = {c.verdict for c in stated}
+        worst = next(v for v in ("contradicted", "unknown", "supported") if v in verdicts)
+        title = "; ".join(f"{c}: {c.verdict}" for c in stated)
+        marks.append({"start": start, "stop": stop, "verdict": worst, "title": title})
+        end = stop
+    return marks
 
 
 def _prefix(item: SelectionItem) -> list[FrameRef]:

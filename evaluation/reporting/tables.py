@@ -9,6 +9,7 @@ from typing import Any
 from data.records import FAMILIES, LETTERS
 from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval
+from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.results import (
     RECALLS,
     SIMILARITY,
@@ -82,7 +83,8 @@ def detail_tables(reports: Mapping[str, tuple[str, SelectionReport]]) -> list[Ta
         caption = "Selection accuracy by subtype (%)"
         tables.append(Table("subtypes", caption, [*subtypes, "Items"], {"": rows}))
     makers = {
-        "readings": parsing_table, "positions": position_table, "calibration": calibration_table
+        "readings": parsing_table, "reasons": reason_table, "positions": position_table,
+        "calibration": calibration_table,
     }  # fmt: skip
     return [*tables, *(make(found) for name, make in makers.items() if (found := details(name)))]
 
@@ -100,6 +102,38 @@ def parsing_table(counts: Mapping[str, Mapping[str, int]]) -> Table:
     """Return a table of the numbers of parsed responses, and of the others by reason, by label."""
     caption = "Parsed responses, and why others could not be parsed"
     return Table("parsing", caption, [*counts], {"": rows_by_label(counts)})
+
+
+def reason_table(reasons: Mapping[str, ReasonSummary]) -> Table:
+    """Return a table of what rationales claim: for each label, a row for the answers, and a row for
+    the claims about each part."""
+    rows: list[Row] = []
+    for label, summary in reasons.items():
+        rows.append(
+            {
+                "name": label, "Follows": summary.follows, "True reasons": summary.true,
+                "Sufficiency": summary.sufficiency, "Items": summary.follows.n,
+            }
+        )  # fmt: skip
+        for part, of_part in summary.parts.items():
+            rows.append(
+                {
+                    "name": f"{DETAIL}{part}", "Claims": f"{of_part.claims.value:.1f}",
+                    "Supported": of_part.supported, "Contradicted": of_part.contradicted,
+                }
+            )  # fmt: skip
+    columns = [
+        "Claims", "Supported", "Contradicted", "Follows", "True reasons", "Sufficiency", "Items",
+    ]  # fmt: skip
+    notes = (
+        f"{INTERVAL_NOTE} Claims: mean number in a response, and the shares that the oracle "
+        "supports and contradicts; it does not know the others. Follows: the text says of the "
+        "chosen candidate, and of no other, that it agrees. True reasons: the answer is right and "
+        "follows, a claim about what happens is supported, and no claim about it or about a "
+        "candidate is contradicted. Sufficiency: the probability that a reader who knows only the "
+        "prediction picks the target.",
+    )
+    return Table("reasons", "Claims and reasons of rationales (%)", columns, {"": rows}, notes)
 
 
 def position_table(positions: Mapping[str, PositionBias]) -> Table:

@@ -27,7 +27,7 @@ TOUCHING = 0.05
 """Gap (simulator units) below which two objects count as touching."""
 APART = 10.0
 """Gap (simulator units) of a frame in which fewer than two objects are visible."""
-LIMIT, TOLERANCE = 1.75, 0.015
+LIMIT, TOLERANCE = 1.5, 0.01
 """The count of targets of a rank may differ from a quarter of all items by `LIMIT`, and by this
 share of the items. Without the second term, a cell could reach counts that no item improves."""
 START = 0.75
@@ -131,8 +131,24 @@ def rank_shares(scores: np.ndarray) -> np.ndarray:
     return shared / count[..., None]
 
 
+def compare_candidates(scores: np.ndarray) -> np.ndarray:
+    """Return the scores (..., S, 4) of four candidates relative to each other, (..., 3 S, 4): in
+    standard deviations from their mean, and whether each is the lowest or the highest."""
+    spread = scores.std(axis=-1, keepdims=True)
+    relative = (scores - scores.mean(axis=-1, keepdims=True)) / np.maximum(spread, 1e-6)
+    is_lowest = scores <= scores.min(axis=-1, keepdims=True)
+    is_highest = scores >= scores.max(axis=-1, keepdims=True)
+    return np.concatenate([relative, is_lowest, is_highest], axis=-2)
+
+
 class Balance:
-    """Counts how often the targets of a cell have each rank in each score.
+    """Counts how often the targets of a cell have each rank in each score, and sums by how much the
+    targets' relative scores differ from the means of their candidates.
+
+    Even ranks do not suffice: if a target that has the highest score has it by less than a
+    distractor would, a combination of scores reveals it. If the sums are zero, the best logistic
+    model of the relative scores is the one that ignores them, since the gradient of its likelihood
+    is zero there.
 
     The counts start at random values near 0, so that the few items of many small cells do not all
     begin with the same ranks.
@@ -140,6 +156,7 @@ class Balance:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.items = 0
+        self.sums = np.zeros(3 * len(SCORES))
         start = rng.uniform(-START, START, (len(SCORES), 4))
         self.counts = start - start.mean(axis=-1, keepdims=True)
 
@@ -148,7 +165,7 @@ class Balance:
         return int(self.counts[SCORES.index(score)].argmin())
 
     def choose(self, scores: np.ndarray) -> int | None:
-        """Return the choice of candidates that keeps the ranks most even, and count it.
+        """Return the choice of candidates that keeps ranks and sums most even, and count it.
 
         Args:
             scores: (S, T, 4) scores of T choices; the first of four candidates is the target.
@@ -162,7 +179,11 @@ class Balance:
         allowed = np.abs(excess).max(axis=(1, 2)) <= LIMIT + TOLERANCE * self.items
         if not allowed.any():
             return None
-        best = int(np.where(allowed, (excess**2).sum(axis=(1, 2)), np.inf).argmin())
+        relative = compare_candidates(scores.swapaxes(0, 1))
+        sums = self.sums + relative[..., 0] - relative.mean(axis=-1)
+        uneven = (excess**2).sum(axis=(1, 2)) + (sums**2).sum(axis=-1)
+        best = int(np.where(allowed, uneven, np.inf).argmin())
         self.counts = self.counts + shares[best]
+        self.sums = sums[best]
         self.items += 1
         return best

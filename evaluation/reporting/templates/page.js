@@ -70,6 +70,23 @@ function frameFigure(name, caption, className) {
   return figure;
 }
 
+// The text of a response, with a mark around the words of each claim.
+function markedText(response) {
+  const text = element("pre");
+  // Positions count characters, of which some have two code units.
+  const characters = Array.from(response.text);
+  const between = (start, stop) => characters.slice(start, stop).join("");
+  let end = 0;
+  for (const { start, stop, verdict, title } of response.claims) {
+    const mark = element("mark", verdict, between(start, stop));
+    mark.title = title;
+    text.append(between(end, start), mark);
+    end = stop;
+  }
+  text.append(between(end, characters.length));
+  return text;
+}
+
 function responseBlock(response) {
   const { letter, verdict, reason } = response;
   const block = element("div", "answer");
@@ -79,7 +96,7 @@ function responseBlock(response) {
     element("span", `verdict ${verdict}`, letter ? `${letter}, ${verdict}` : `no letter (${reason})`),
   );
   if (response.truncated) head.append(element("span", "", " (truncated)"));
-  block.append(head, element("pre", "", response.text));
+  block.append(head, markedText(response));
   return block;
 }
 

@@ -16,7 +16,14 @@ from data.parallel import Workers
 from data.records import ALTERNATIVE, Scene, SelectionItem, original_scene_id
 from data.store import Store, built_files
 from data.tracks.selection import balanced
-from data.tracks.selection.balance import LIMIT, SCORES, TOLERANCE, Balance, rank_shares
+from data.tracks.selection.balance import (
+    LIMIT,
+    SCORES,
+    TOLERANCE,
+    Balance,
+    compare_candidates,
+    rank_shares,
+)
 from data.tracks.selection.futures import (
     MOVING,
     alternative_scene,
@@ -29,7 +36,6 @@ from data.tracks.shortcuts import (
     fit_logistic,
     item_scores,
     logistic_accuracies,
-    logistic_features,
     simple_accuracies,
 )
 from data.tracks.shortfalls import summarize_store
@@ -304,6 +310,7 @@ def test_balance_keeps_every_count_within_the_limit() -> None:
         refused += balance.choose(scores) is None
         assert np.abs(balance.counts - balance.items / 4).max() <= LIMIT + TOLERANCE * balance.items
     assert balance.items > 150
+    assert np.abs(balance.sums).max() < 0.05 * balance.items
     only_lowest = np.tile([0.0, 1.0, 2.0, 3.0], (len(SCORES), 1, 1))
     assert [balance.choose(only_lowest) is None for _ in range(4)][-1]
 
@@ -320,7 +327,7 @@ def test_logistic_model_finds_a_shortcut_and_nothing_without_one() -> None:
     random = rng()
     answers = random.integers(4, size=1200)
     scores = random.normal(size=(1200, len(SCORES), 4))
-    nothing = fit_logistic(logistic_features(scores), answers)
+    nothing = fit_logistic(compare_candidates(scores).swapaxes(1, 2), answers)
     assert np.abs(nothing).max() < 0.2
     # The target is slightly high or low in six scores: none alone is decisive.
     rows = np.arange(1200)
