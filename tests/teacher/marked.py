@@ -1,0 +1,56 @@
+"""Rationales whose claims were marked by hand, and the items that they are about."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from data.records import Scene, SelectionItem
+from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.relations import Bounds
+from tests.data.simulated import simulate_scene
+from tests.teacher import synthetic
+
+FILE = Path(__file__).parent / "sentences" / "marked.jsonl"
+"""One rationale a line: its item, its text, and its claims with their quotes and their truth."""
+SCENES = 20
+STOPS = (24, 40, 56)
+"""Last frames of the prefixes; each scene has an item for each."""
+
+
+@cache
+def marked_scene(index: int) -> Scene:
+    return simulate_scene(0, index)
+
+
+def marked_items() -> Iterator[tuple[SelectionItem, RelationalPredicates]]:
+    """Yield items of simulated scenes: the target 20 frames after the prefix, and distractors
+    before and after it."""
+    for index in range(SCENES):
+        for k, stop in enumerate(STOPS):
+            answer = (index + k) % 4
+            frames = [stop + 6, stop + 34, stop + 48]
+            frames.insert(answer, stop + 20)
+            item = synthetic.item(
+                tuple(frames),
+                start=stop - 20,
+                stop=stop,
+                answer=answer,
+                item_id=f"marked-{index}-{k}",
+                scene_id=f"marked-{index}",
+                framing=(None, "future", "contact")[k],
+            )
+            scene = marked_scene(index)
+            predicates = extract_predicates(item, scene, lambda _, scene=scene: scene, Bounds())
+            if predicates is not None:
+                yield item, predicates
+
+
+def read_marked() -> list[dict[str, Any]]:
+    """Return the rationales, each with `item`, `text` and `claims`. A claim has the words that
+    state it (`quote`), what it is about (`part`), and whether it is true (`truth`)."""
+    return [json.loads(line) for line in FILE.read_text(encoding="utf-8").splitlines()]
