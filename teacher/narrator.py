@@ -53,6 +53,11 @@ def make_writer(
     return Writer(predicates, *args, padded=padded)
 
 
+def list_clauses(predicates: Predicates, item: SelectionItem) -> dict[str, list[str]]:
+    """Return the clauses from which a rationale can be made, by section, in full detail."""
+    return make_writer(predicates, item, FULL, item.item_id, "clauses").sections()
+
+
 def write_description(scene: Scene, start: int, stop: int, target: int, seed: int) -> str | None:
     """Describe what happens from the end of the prefix [start, stop] to the target frame.
 

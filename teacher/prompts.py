@@ -13,6 +13,7 @@ from typing import Any
 
 from conf.schema import TeacherConfig
 from data.records import SelectionItem
+from teacher.cited import list_facts
 from teacher.deciding import choose_statements
 from teacher.predicates.facts import Predicates, Relation, RelationalPredicates
 from teacher.predicates.relations import find_topic
@@ -21,6 +22,7 @@ from teacher.sections import SECTIONS
 PROMPT_VERSION = "3"
 
 SYSTEM = (files("teacher") / "templates" / "system_prompt.txt").read_text().rstrip()
+CITED = (files("teacher") / "templates" / "cited_prompt.txt").read_text().rstrip()
 RELATIONAL = (files("teacher") / "templates" / "relational_prompt.txt").read_text().rstrip() + "\n"
 """The part of the instructions that explains relational predicates."""
 
@@ -29,12 +31,23 @@ def build_messages(
     predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
 ) -> list[dict[str, str]]:
     """Return the chat messages that request an item's rationale."""
+    if cfg.form == "cited":
+        return _build_cited_messages(predicates, item, cfg)
     relational = RELATIONAL if isinstance(predicates, RelationalPredicates) else ""
     system = SYSTEM.format(
         sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words, relations=relational
     )
     facts = json.dumps(format_facts(predicates, item), separators=(",", ":"))
     user = f"Question: {item.question}\nFacts: {facts}\nAnswer to reach: {item.letter}"
+    return [{"role": "system", "content": system}, {"role": "user", "content": user}]
+
+
+def _build_cited_messages(
+    predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
+) -> list[dict[str, str]]:
+    system = CITED.format(sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words)
+    facts = "\n".join(f"{key}: {clause}" for key, clause in list_facts(predicates, item).items())
+    user = f"Question: {item.question}\nFacts:\n{facts}\nAnswer to reach: {item.letter}"
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
+from teacher.cited import CitationError, cited_schema, compose_rationale, list_facts
 from teacher.prompts import build_messages
 from teacher.sections import GRAMMAR
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
@@ -44,8 +46,11 @@ async def request_rationales(
             # Most first responses are accepted, so several are requested only after a rejection.
             n = min(cfg.samples, cfg.attempts - attempt) if attempt else 1
             try:
-                messages = build_messages(choose_vocabulary(predicates, cfg), item, cfg)
-                responses = await pool.complete(messages, n)
+                vocabulary = choose_vocabulary(predicates, cfg)
+                responses = await pool.complete(build_messages(vocabulary, item, cfg), n)
+                if cfg.form == "cited":
+                    facts = list_facts(vocabulary, item)
+                    responses = [fill_slots(r, facts, item.letter) for r in responses]
             except NoResponseError as error:
                 responses = [Response("", f"unanswered: {error}")]
             rationales = [
@@ -62,12 +67,25 @@ async def request_rationales(
         await run_limited(jobs, cfg.concurrency, narrate)
 
 
+def fill_slots(response: Response, facts: Mapping[str, str], answer: str) -> Response:
+    """Return the response with the text of its cited rationale, or with the reason why it has none
+    as its flaw."""
+    if response.flaw is not None:
+        return response
+    try:
+        return replace(response, text=compose_rationale(response.text, facts, answer))
+    except CitationError as error:
+        return replace(response, flaw=f"cited: {error}")
+
+
 def request_fields(cfg: TeacherConfig) -> RequestFields:
     """Return the fields of every request for a rationale."""
     # There is no seed: with seeds, vLLM on a CPU crashed when 32 requests were in flight.
     extra = {"top_k": cfg.top_k, "chat_template_kwargs": {"enable_thinking": False}}
     if cfg.grammar:
         extra["structured_outputs"] = {"grammar": GRAMMAR}
+    elif cfg.form == "cited":
+        extra["structured_outputs"] = {"json": cited_schema()}
     return {
         "temperature": cfg.temperature,
         "top_p": cfg.top_p,

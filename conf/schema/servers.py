@@ -138,6 +138,9 @@ class TeacherConfig(ServersConfig):
     """Maximum length of a response (tokens)."""
     grammar: bool = False
     """Constrain the server's decoding to the form of a rationale."""
+    form: str = setting("free", options=("free", "cited"))
+    """Form of a server's responses: free text, or sentences with slots that code fills with the
+    facts that they cite."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
@@ -151,3 +154,10 @@ class TeacherConfig(ServersConfig):
         for name in ("grammar", "fallback"):
             if getattr(self, name) and self.url is None:
                 yield f"{group}{name}=true needs a server: give {group}url=..."
+        if self.form == "cited" and self.url is None:
+            yield f"{group}form=cited needs a server: give {group}url=..."
+        if self.form == "cited" and self.grammar:
+            yield (
+                f"{group}form=cited and {group}grammar=true: cited responses have a JSON schema of "
+                "their own; leave out grammar"
+            )

@@ -8,6 +8,7 @@ from collections import Counter
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
+from teacher.cited import CITED_VERSION
 from teacher.deciding import choose_statements
 from teacher.narrator import NARRATOR_VERSION
 from teacher.predicates.facts import RelationalPredicates
@@ -102,4 +103,6 @@ class RationaleGrader:
             settings += [cfg.model, cfg.temperature, cfg.top_p, cfg.top_k, cfg.max_tokens]
         if self.grammar_version is not None:
             settings.append(self.grammar_version)
+        if cfg.form == "cited":
+            settings += ["cited", CITED_VERSION]
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:8]

@@ -107,6 +107,13 @@ class Writer:
 
     def text(self) -> str:
         """Return a rationale from predicates, or a description from facts without candidates."""
+        lines = [f"{name}: {join_sentences(parts)}" for name, parts in self.sections().items()]
+        if isinstance(self.facts, Predicates):
+            lines.append(f"Answer: {self.facts.answer}")
+        return "\n".join(lines)
+
+    def sections(self) -> dict[str, list[str]]:
+        """Return the clauses of each section; the candidate analysis needs predicates."""
         facts, answer = self.facts, None
         sections = {
             "Scene parse": self.scene_parse(),
@@ -119,8 +126,7 @@ class Writer:
                 f"candidate {c.letter} {self.judgement(c)}" for c in facts.candidates
             ]
         sections["Outcome"] = self.outcome(answer)
-        lines = [f"{name}: {join_sentences(parts)}" for name, parts in sections.items()]
-        return "\n".join([*lines, f"Answer: {answer}"] if answer else lines)
+        return sections
 
     def scene_parse(self) -> list[str]:
         parts = [self.observed(o) for o in self.ranked[: self.detail.parsed]]

@@ -1,0 +1,163 @@
+"""Cited rationales: sentences of a server's teacher with slots that code fills with facts.
+
+The teacher gets the facts as clauses with ids, such as `s1`: "the red metal cube rests near the
+left". It returns JSON: for each section, sentences such as
+
+    {"text": "Since {}, it is clear that {}", "facts": ["s1", "s3"]}
+
+Code fills the slots in order, so that the stated facts hold by construction. The words around the
+slots may state no fact and no number of their own.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from jsonschema import Draft202012Validator
+
+from data.records import LETTERS, SelectionItem
+from teacher.narrator import list_clauses
+from teacher.numbers.detection import find_numbers
+from teacher.predicates.facts import Predicates
+from teacher.reading.tagging import (
+    COLOR_WORDS,
+    COLUMNS,
+    MATERIAL_WORDS,
+    MIDDLE,
+    PLURALS,
+    ROWS,
+    SHAPE_WORDS,
+    find_tags,
+)
+from teacher.sections import SECTIONS
+
+CITED_VERSION = "1"
+"""Changes with the form of cited rationales and the rules for the words around slots."""
+SLOT = "{}"
+ANALYSIS = "Candidate analysis"
+PREFIXES = {"Scene parse": "s", "Motion analysis": "m", "Prediction": "p", "Outcome": "r"}
+"""First letter of the ids of the facts of each section; the id of a candidate's fact is its letter,
+in the candidate analysis."""
+MAX_SENTENCES, MAX_FACTS, MAX_CHARACTERS = 8, 3, 160
+"""Maximum numbers of sentences in a section, of facts in a sentence, and of the characters around
+its slots."""
+PLAIN_TAGS = {
+    *("word", "comma", "semicolon", "and", "break", "be", "which", "pronoun", "ignore"),
+}
+"""Tags of the reader that state nothing, so that they may stand around slots."""
+PREPOSITIONS = {"to", "for", "like", "from", "of", "on", "at", "in", "after", "before", "about"}
+"""Prepositions that may stand around slots; others state places."""
+FACT_WORDS = {
+    *(*ROWS, *COLUMNS, *MIDDLE, *COLOR_WORDS, *MATERIAL_WORDS, *SHAPE_WORDS, *PLURALS),
+    *("candidate", "candidates", "image", "images", "answer"),
+}
+"""Words that state a part of a fact."""
+CONNECTING = {"finally", "follows", "hence"}
+"""Words that state nothing here, although the reader gives them a tag."""
+DENYING = {
+    *("no", "not", "never", "hardly", "unless", "if", "false", "untrue", "wrong", "deny", "denies"),
+    *("doubt", "doubtful", "unlikely", "impossible", "without", "instead", "except", "only", "all"),
+    *("refuses", "fails", "opposite", "contrary", "rather", "least", "most", "every", "none"),
+}
+"""Words that could deny or limit the fact in a slot."""
+
+
+class CitationError(ValueError):
+    """A response does not have the form of a cited rationale; the message is the reason."""
+
+
+def cited_schema() -> dict[str, Any]:
+    """Return the JSON schema of a cited rationale. It is the same for every item, so that a server
+    compiles it once."""
+
+    def sentence(pattern: str) -> dict[str, Any]:
+        fact = {"type": "string", "pattern": f"^{pattern}$"}
+        facts = {"type": "array", "items": fact, "minItems": 1, "maxItems": MAX_FACTS}
+        text = {"type": "string", "maxLength": MAX_CHARACTERS}
+        return _object({"text": text, "facts": facts})
+
+    def sentences(pattern: str, least: int = 1, most: int = MAX_SENTENCES) -> dict[str, Any]:
+        return {
+            "type": "array", "items": sentence(pattern), "minItems": least, "maxItems": most
+        }  # fmt: skip
+
+    sections = {
+        name: sentences(f"{PREFIXES[name]}[1-9][0-9]?")
+        if name != ANALYSIS
+        else sentences(f"[{LETTERS}]", len(LETTERS), len(LETTERS))
+        for name in SECTIONS
+    }
+    return _object(sections)
+
+
+def _object(properties: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "type": "object", "properties": properties, "required": [*properties],
+        "additionalProperties": False,
+    }  # fmt: skip
+
+
+def list_facts(predicates: Predicates, item: SelectionItem) -> dict[str, str]:
+    """Return the facts of an item as clauses, by id."""
+    facts: dict[str, str] = {}
+    for name, clauses in list_clauses(predicates, item).items():
+        if name == ANALYSIS:
+            facts |= dict(zip(LETTERS, clauses, strict=True))
+        else:
+            facts |= {f"{PREFIXES[name]}{k}": clause for k, clause in enumerate(clauses, 1)}
+    return facts
+
+
+def compose_rationale(response: str, facts: Mapping[str, str], answer: str) -> str:
+    """Return the text of a cited rationale, with its slots filled.
+
+    Raises:
+        CitationError: The response does not follow the schema, cites an unknown fact, has another
+            number of slots than of facts, or states a fact or a number around its slots.
+    """
+    try:
+        cited = json.loads(response)
+    except ValueError as error:
+        raise CitationError("not JSON") from error
+    problem = next(iter(Draft202012Validator(cited_schema()).iter_errors(cited)), None)
+    if problem is not None:
+        raise CitationError(f"not a cited rationale: {problem.message[:80]}")
+    lines = []
+    for name in SECTIONS:
+        sentences = [_fill(sentence, facts) for sentence in cited[name]]
+        if name == ANALYSIS and [s["facts"][:1] for s in cited[name]] != [[x] for x in LETTERS]:
+            raise CitationError("candidates out of order")
+        lines.append(f"{name}: {' '.join(s[0].upper() + s[1:] + '.' for s in sentences)}")
+    return "\n".join([*lines, f"Answer: {answer}"])
+
+
+def _fill(sentence: Mapping[str, Any], facts: Mapping[str, str]) -> str:
+    """Return a sentence with its slots filled."""
+    text, cited = sentence["text"].strip().rstrip("."), sentence["facts"]
+    unknown = [fact for fact in cited if fact not in facts]
+    if unknown:
+        raise CitationError(f"unknown fact: {unknown[0]}")
+    literals = text.split(SLOT)
+    if len(literals) != len(cited) + 1:
+        raise CitationError(f"{len(literals) - 1} slots for {len(cited)} facts")
+    for literal in literals:
+        if stated := next(_find_statements(literal), None):
+            raise CitationError(f"states a fact outside a slot: {stated!r}")
+    filled = literals[0]
+    for fact, literal in zip(cited, literals[1:], strict=True):
+        filled += facts[fact] + literal
+    return filled
+
+
+def _find_statements(literal: str) -> Iterator[str]:
+    """Yield the words around slots that state a fact or a number, or that could deny a fact."""
+    yield from (literal[start:stop] for start, stop in find_numbers(literal))
+    yield from sorted(set(re.findall(r"[a-z]+", literal.lower())) & (FACT_WORDS | DENYING))
+    for tag in find_tags(literal, 0, len(literal)):
+        if tag.name not in PLAIN_TAGS and tag.words not in PREPOSITIONS | CONNECTING:
+            yield tag.words
+    if "{" in literal or "}" in literal or "\n" in literal:
+        yield literal
