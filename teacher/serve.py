@@ -146,11 +146,11 @@ def vllm_arguments(
     arguments += ["--max-model-len", str(context), "--dtype", cfg.dtype]
     # All prompts begin with the same instructions.
     arguments += ["--enable-prefix-caching", "--disable-uvicorn-access-log"]
+    # Otherwise, a model may write white space without end under a JSON schema.
+    arguments += ["--structured-outputs-config", STRICT_JSON]
     if cfg.frames:
-        # Without STRICT_JSON, a model may write white space without end under a JSON schema.
-        # Without the last flag, clips are normalized like single images.
-        arguments += ["--trust-request-mm-kwargs", "--structured-outputs-config", STRICT_JSON]
-        arguments += ["--no-mm-device-do-normalize"]
+        # Without the second flag, clips are normalized like single images.
+        arguments += ["--trust-request-mm-kwargs", "--no-mm-device-do-normalize"]
     if cfg.adapter is not None:
         rank = read_adapter_rank(cfg.adapter)
         max_rank = next((r for r in LORA_RANKS if r >= rank), LORA_RANKS[-1])

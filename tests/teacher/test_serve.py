@@ -185,6 +185,19 @@ def test_vllm_enforces_the_grammar_of_rationales(server, tmp_path):
 
 
 @pytest.mark.slow
+def test_vllm_enforces_the_schema_of_cited_rationales(server, tmp_path):
+    cfg = TeacherConfig(
+        name="tiny", url=server.url, model="tiny", attempts=1, max_tokens=64, form="cited"
+    )
+    narrate_store(make_store(tmp_path, 5), cfg)
+    rationales = read_rationales(tmp_path / "rationales.jsonl")
+    assert len(rationales) == 4
+    begin = '{"Scene parse":[{"text":"'
+    assert [r.text for r in rationales if not r.text.startswith(begin)] == []
+    assert {r.reasons for r in rationales} == {("cut off",)}
+
+
+@pytest.mark.slow
 def test_killing_the_server_or_client_neither_loses_nor_repeats_a_response(server, tmp_path):
     store = make_store(tmp_path, ITEMS + 2)
     path = tmp_path / "rationales.jsonl"
