@@ -1,6 +1,7 @@
 """Measures which false words in rationales the validator detects, and which true claims it rejects.
 
     python -m benchmarks.experiments.mutations store/small
+    python -m benchmarks.experiments.mutations store/small --predicates relational
     python -m benchmarks.experiments.mutations tests/teacher/prose.jsonl
 
 The built-in narrator writes rationales for the training items of a built benchmark, or they are
@@ -17,7 +18,7 @@ import argparse
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from random import Random
@@ -30,6 +31,7 @@ from data.store import open_store
 from teacher.narrator import write_rationale
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import COMPASS, REGIONS, SPEEDS, VERY_FAST, Predicates
+from teacher.predicates.relations import Bounds
 from teacher.validation.claim_extraction import extract_claims
 
 ALL_REGIONS = [region for row in REGIONS for region in row]
@@ -43,12 +45,16 @@ Mutation = tuple[str, tuple[int, int]]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("source", type=Path, help="a built benchmark or a file of rationales")
+    parser.add_argument(
+        "--predicates", choices=("paper", "relational"), default="paper", help="of the narrator"
+    )
     parser.add_argument("--limit", type=int, help="maximum number of rationales")
     args = parser.parse_args()
     results: dict[str, list[bool]] = defaultdict(list)
     misses: dict[str, list[str]] = defaultdict(list)
     claims: Counter[tuple[str, str]] = Counter()
-    for number, (item_id, text, predicates) in enumerate(read_rationales(args.source)):
+    bounds = Bounds() if args.predicates == "relational" else None
+    for number, (item_id, text, predicates) in enumerate(read_rationales(args.source, bounds)):
         if number == args.limit:
             break
         claims.update((claim.kind, claim.verdict) for claim in extract_claims(text, predicates))
@@ -73,8 +79,11 @@ def main() -> None:
         print(f"{kind:14}" + "".join(f"{claims[kind, verdict]:14}" for verdict in verdicts))
 
 
-def read_rationales(source: Path) -> Iterator[tuple[str, str, Predicates]]:
-    """Yield the item id, text and predicates of each rationale."""
+def read_rationales(
+    source: Path, bounds: Bounds | None = None
+) -> Iterator[tuple[str, str, Predicates]]:
+    """Yield the item id, text and predicates of each rationale. With `bounds`, the narrator of a
+    benchmark's rationales uses relations."""
     if source.is_file():
         for line in source.read_text().splitlines():
             record = json.loads(line)
@@ -82,7 +91,7 @@ def read_rationales(source: Path) -> Iterator[tuple[str, str, Predicates]]:
         return
     store = open_store(source)
     for item in store.selection("train"):
-        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
+        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene, bounds)
         if predicates is not None:
             yield item.item_id, write_rationale(predicates, item, 0), predicates
 
@@ -149,6 +158,70 @@ def replace_partners(text: str, predicates: Predicates, rng: Random) -> Iterator
                 yield replace_match(text, inside[1], rng.choice(free))
 
 
+def replace_relations(
+    text: str, phrases: Mapping[str, Sequence[str]], rng: Random
+) -> Iterator[Mutation]:
+    """Yield one text for each relation of these phrases, with another value that excludes it.
+    Relations that are denied are left as they are.
+
+    Args:
+        phrases: For each phrase, those that are false if it is true.
+    """
+    pattern = "|".join(map(re.escape, sorted(phrases, key=len, reverse=True)))
+    for match in re.finditer(rf"(?<!not )\b({pattern}) (?=the |it\b)", text):
+        if _names_object(text, match.end()):
+            yield replace_match(text, match, rng.choice(phrases[match[1]]) + " ")
+
+
+def _names_object(text: str, position: int) -> bool:
+    """Return whether "the red metal cube" follows, and not "the left"."""
+    return bool(re.match(rf"the (?:{'|'.join(COLORS)}) ", text[position : position + 20]))
+
+
+SIDES = {
+    "left of": ["right of", "vertically aligned with"],
+    "to the left of": ["right of", "to the right of"],
+    "right of": ["left of", "vertically aligned with"],
+    "to the right of": ["left of", "to the left of"],
+    "vertically aligned with": ["left of", "right of"],
+}
+HEIGHTS = {
+    "above": ["below", "level with"],
+    "below": ["above", "level with"],
+    "level with": ["above", "below"],
+}
+GAPS = {
+    "right against": ["near", "well apart from"],
+    "in touch with": ["near", "well apart from"],
+    "near": ["right against", "well apart from"],
+    "well apart from": ["near", "in touch with"],
+}
+COVERS = {"in front of": ["behind"], "behind": ["in front of"]}
+EXTREMES = {
+    "leftmost": "rightmost", "rightmost": "leftmost", "topmost": "lowest", "lowest": "topmost"
+}  # fmt: skip
+OBJECT = rf"the (?:{'|'.join(COLORS)}) (?:metal|rubber) \w+"
+
+
+def replace_extremes(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    for match in re.finditer(rf"(?<!not )\b(?:{'|'.join(EXTREMES)})\b", text):
+        yield replace_match(text, match, EXTREMES[match[0]])
+
+
+def swap_subjects(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    """In "a is between b and c", exchange a and b: then b lies at an end."""
+    pattern = rf"({OBJECT})( (?:is |will be )?between )({OBJECT})(?= and )"
+    for match in re.finditer(pattern, text, re.IGNORECASE):
+        yield replace_match(text, match, f"{match[3]}{match[2]}{match[1]}")
+
+
+def swap_distances(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    """In "nearer to b than to c", exchange b and c."""
+    pattern = rf"(?<!not )((?:nearer|closer) to )({OBJECT})( than to )({OBJECT})"
+    for match in re.finditer(pattern, text):
+        yield replace_match(text, match, f"{match[1]}{match[4]}{match[3]}{match[2]}")
+
+
 def replace_answer(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
     for match in re.finditer(r"(?<=^Answer: )[A-D]", text, re.MULTILINE):
         yield replace_match(text, match, rng.choice([c for c in LETTERS if c != match[0]]))
@@ -175,6 +248,13 @@ MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = 
     "pair": replace_partners,
     "answer": replace_answer,
     "candidate": swap_candidates,
+    "side": lambda text, p, rng: replace_relations(text, SIDES, rng),
+    "height": lambda text, p, rng: replace_relations(text, HEIGHTS, rng),
+    "gap": lambda text, p, rng: replace_relations(text, GAPS, rng),
+    "cover": lambda text, p, rng: replace_relations(text, COVERS, rng),
+    "between": swap_subjects,
+    "nearer": swap_distances,
+    "extreme": replace_extremes,
 }
 """For each kind of word, a function that yields texts in which one such word is false."""
 

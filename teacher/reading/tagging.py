@@ -221,6 +221,9 @@ def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
         return found
     for phrase, name, value in VOCABULARY.get(word, ()):
         if tuple(words[i : i + len(phrase)]) == phrase:
+            if phrase[-1] == "right" and words[i + len(phrase)] in ("of", "against"):
+                # "Is right of the red cube" does not say that something is right.
+                continue
             if name != "relation":
                 return name, value, i + len(phrase)
             if found := _find_relation(words, i, i + len(phrase), value):

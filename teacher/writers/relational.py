@@ -79,14 +79,16 @@ class RelationalWriter(Writer):
 
     def all_shown(self) -> str:
         """Return all deciding statements as the object of "shows"."""
+        # "No red cube and the blue sphere near the top" would deny both.
+        ordered = sorted(self.statements, key=lambda s: s.kind == "sight")
         parts: list[str] = []
-        for k, s in enumerate(self.statements):
+        subject = None
+        for s in ordered:
             if s.kind == "sight":
                 parts.append(f"no {s.objects[0]}")
-            elif k and self.statements[k - 1].objects[0] == s.objects[0]:
-                parts.append(self.place(s))
             else:
-                parts.append(self.shown(s))
+                parts.append(self.place(s) if s.objects[0] == subject else self.shown(s))
+                subject = s.objects[0]
         return " and ".join(parts)
 
     # Sections.
