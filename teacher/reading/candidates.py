@@ -9,6 +9,8 @@ from teacher.reading.tagging import BOUNDARIES, RelationPhrase, Tag
 from teacher.reading.topics import TopicReader
 
 ERRORS = {"error", "errors", "mistake", "mistakes", "fault", "faults", "flaw", "flaws"}
+TOUCHING = {"touching", "touches", "touch", "in contact"}
+"""Words for a contact that a frame shows."""
 
 
 class CandidateReader(TopicReader):
@@ -70,6 +72,16 @@ class CandidateReader(TopicReader):
         else:
             denied = self.negated or self.contrasted
             self.add_claim(kind, phrase.value, not denied, tag, partners)
+
+    def on_meet(self, tag: Tag) -> None:
+        """Read "A shows the cube touching the sphere"; a frame does not show other meetings."""
+        if tag.words not in TOUCHING or not self.objects or self.skipped or self.expected:
+            return
+        if self.near(1).name == "object" or self.near(2).name == "object":
+            self.cursor += 1 if self.near(1).name == "object" else 2
+            partners = self.read_list(1)
+            if None not in partners:
+                self.add_claim("gap", "against", not self.negated, tag, tuple(partners))
 
     def on_direction(self, tag: Tag) -> None:
         if self.near(-1).words != "from" and not self.expected and not self.negated:

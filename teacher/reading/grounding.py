@@ -87,6 +87,11 @@ class IndexedPredicates:
             if d.kind == "extra" and name not in self.objects
         }
 
+    def is_observed(self, kind: str, objects: tuple[str, ...], value: str) -> bool:
+        """Return whether a relation is known to hold at the cut."""
+        found = self.observed or ()
+        return len(objects) > 1 and normalize_relation(Relation(kind, objects, value)) in found
+
     def verdict(self, claim: Claim) -> str:
         """Return one of `VERDICTS`; "unknown" if the predicates do not tell, if they contradict a
         claim that is not certain, or if several objects have the name that the claim uses."""
@@ -264,6 +269,9 @@ def _course(predicates: IndexedPredicates, claim: Claim) -> bool | None:
 
 
 def _meeting(predicates: IndexedPredicates, claim: Claim) -> bool | None:
+    if claim.when == CUT and predicates.is_observed("gap", claim.subjects, "against"):
+        # "The red cube touches the sphere" at the end of the observation.
+        return True
     if not claim.affirmed and claim.when != BETWEEN:
         # "They have not met yet" does not exclude later meetings.
         return None if claim.when == CUT else _has_pair(predicates.contacts, claim)

@@ -112,6 +112,8 @@ class SceneReader(SubjectReader):
     def on_speed(self, tag: Tag) -> None:
         following = self.near(1).name
         moving = self.mentions_motion or following in ("moves", "moving", "across")
+        # "The red cube is quick."
+        moving |= self.near(-1).name == "be" and following in BOUNDARIES
         if not moving or self.relation or following in RELATIONS:
             return
         self.add_claim("speed", str(tag.value), not self.negated, CUT, tag)

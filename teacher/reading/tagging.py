@@ -71,7 +71,9 @@ PLACED = {
     *("is", "are", "be", "was", "were", "been", "not", "as", "stays", "remains", "lies", "sits"),
     *("rests", "stands", "stay", "remain", "lie", "sit", "rest", "stand"),
 }
-"""Words before "between" that make it a relation."""
+"""Words before an ambiguous phrase that make it a relation."""
+AMBIGUOUS = {"between", "in", "comes", "come", "coming", "moves", "against"}
+"""First words of phrases that state a relation only after an object or a verb of `PLACED`."""
 JOINTS = {
     "between": ("and",), "arrival": ("and",), "nearer": ("than to", "than"),
 }  # fmt: skip
@@ -262,7 +264,7 @@ def _find_noun(words: list[str], i: int) -> Found | None:
 def _find_relation(words: list[str], begin: int, i: int, value: str) -> Found | None:
     """Return the relation at word `begin` whose objects begin at word i, if they are there."""
     kind = KINDS[value]
-    if kind in ("between", "arrival") and words[begin - 1] not in PLACED | LOOKS:
+    if words[begin] in AMBIGUOUS and words[begin - 1] not in PLACED | LOOKS:
         # "A contact between the red cube and the blue sphere" is not a relation.
         return None
     nouns: list[Noun | None] = []
@@ -293,6 +295,9 @@ def _find_region(words: list[str], i: int) -> Found | None:
     begin = i
     while words[i] in REGION_FILLERS:
         i += 1
+    if "its" in words[begin:i] and words[i] in COLUMNS and words[i + 1] not in PLACE_NOUNS:
+        # "On its right" is not a region.
+        return None
     definite = "the" in words[begin:i] or "its" in words[begin:i]
     row = column = None
     middle = False

@@ -27,9 +27,13 @@ TOUCHING = 0.05
 """Gap (simulator units) below which two objects count as touching."""
 APART = 10.0
 """Gap (simulator units) of a frame in which fewer than two objects are visible."""
-LIMIT, TOLERANCE = 1.5, 0.01
+LIMIT, TOLERANCE = 1.75, 0.015
 """The count of targets of a rank may differ from a quarter of all items by `LIMIT`, and by this
 share of the items. Without the second term, a cell could reach counts that no item improves."""
+RANK_WEIGHT = 4.0
+"""Weight of the squared deviations of the counts, relative to those of the sums."""
+RIDGE = 0.01
+"""Added to the variances of the relative scores: some of them are constant, or depend on others."""
 START = 0.75
 """Maximum distance from 0 of the counts at the start."""
 
@@ -148,15 +152,18 @@ class Balance:
     Even ranks do not suffice: if a target that has the highest score has it by less than a
     distractor would, a combination of scores reveals it. If the sums are zero, the best logistic
     model of the relative scores is the one that ignores them, since the gradient of its likelihood
-    is zero there.
+    is zero there. The sums are measured in standard deviations (as in a score test), because scores
+    that nearly agree, such as the displacement of one object and of all objects, have a difference
+    that varies little and can reveal much.
 
     The counts start at random values near 0, so that the few items of many small cells do not all
     begin with the same ranks.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self.items = 0
+        self.items = self.offered = 0
         self.sums = np.zeros(3 * len(SCORES))
+        self.scatter = np.zeros((3 * len(SCORES), 3 * len(SCORES)))
         start = rng.uniform(-START, START, (len(SCORES), 4))
         self.counts = start - start.mean(axis=-1, keepdims=True)
 
@@ -180,8 +187,13 @@ class Balance:
         if not allowed.any():
             return None
         relative = compare_candidates(scores.swapaxes(0, 1))
-        sums = self.sums + relative[..., 0] - relative.mean(axis=-1)
-        uneven = (excess**2).sum(axis=(1, 2)) + (sums**2).sum(axis=-1)
+        relative = relative - relative.mean(axis=-1, keepdims=True)
+        self.offered += 1
+        self.scatter += np.einsum("tfc,tgc->fg", relative, relative) / relative[:, 0].size
+        covariance = self.scatter / self.offered + RIDGE * np.eye(len(self.scatter))
+        sums = self.sums + relative[..., 0]
+        deviation = np.einsum("tf,tf->t", sums, np.linalg.solve(covariance, sums.T).T)
+        uneven = RANK_WEIGHT * (excess**2).sum(axis=(1, 2)) + deviation
         best = int(np.where(allowed, uneven, np.inf).argmin())
         self.counts = self.counts + shares[best]
         self.sums = sums[best]
