@@ -1,5 +1,4 @@
-"""Claims that were marked by hand in 60 rationales, which people wrote who did not know the rules of
-the reader."""
+"""Claims of 60 rationales, marked by hand by writers who did not know the rules of the reader."""
 
 from __future__ import annotations
 
