@@ -3,16 +3,19 @@
 import threading
 from dataclasses import replace
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from conf.schema import TeacherConfig
+from conf.schema.servers import RelationBounds
 from data.records import Rationale
 from teacher.narrate import ensure_rationales, narrate_store
 from teacher.rationale_log import Journal, read_rationales
 from teacher.sections import GRAMMAR, GRAMMAR_VERSION
 from tests.teacher import synthetic
 from tests.teacher.faulty_server import teacher_at
+from tests.teacher.memory_store import make_store
 from tests.user_errors import raises_user_error
 from tests.waiting import wait_until
 
@@ -257,3 +260,65 @@ def test_fallback_is_marked_and_optional(store, start_server):
     again = narrate_store(store, replace(cfg, fallback=True))
     assert again.rationales == narration.rationales
     assert narrate_store(store, cfg).rationales == []
+
+
+def still_store(folder):
+    """A store whose first item has candidates that look alike, since nothing moves. In the others,
+    an object crosses the image."""
+    store = make_store(folder, 4)
+    start, stop = (synthetic.on_ground(pixel)[:2] for pixel in ((60, 60), (420, 260)))
+    for k, velocity in enumerate([np.zeros(2), *[(stop - start) / 127 * synthetic.FPS] * 2]):
+        scene = synthetic.scene([start, (0.5, -0.5)], [velocity, (0, 0)], scene_id=f"s{k}")
+        store.scenes[f"s{k}"] = scene
+    return store
+
+
+def test_undecided_item_is_narrated_marked_and_counted(tmp_path):
+    narration = narrate_store(still_store(tmp_path), replace(TEMPLATE, predicates="relational"))
+    by_item = {r.item_id: r for r in narration.rationales}
+    assert by_item["item-0"].undecided
+    assert by_item["item-0"].sufficiency == 0.25
+    assert not by_item["item-1"].undecided
+    assert by_item["item-1"].sufficiency == 1
+    assert narration.figures["undecided"] == 1
+    assert "1 items that no relational statement decides" in str(narration)
+
+
+def test_insufficient_rationales_are_set_aside_with_the_reason(tmp_path):
+    store = still_store(tmp_path)
+    narration = narrate_store(store, replace(TEMPLATE, predicates="relational", sufficient=True))
+    assert {r.item_id for r in narration.rationales} == {"item-1", "item-2"}
+    rejected = [r for r in read_rationales(tmp_path / "rationales.jsonl") if not r.accepted]
+    assert {(r.item_id, r.reasons) for r in rejected} == {("item-0", ("undecided",))}
+    assert narration.figures["set_aside"] == 1
+
+
+def test_rationales_of_another_vocabulary_are_named_and_not_used(tmp_path, caplog):
+    store = make_store(tmp_path, 4)
+    relational = replace(TEMPLATE, predicates="relational")
+    first = narrate_store(store, TEMPLATE)
+    path = tmp_path / "rationales.jsonl"
+    kept = path.read_bytes()
+    with caplog.at_level("INFO"):
+        second = narrate_store(store, relational)
+    assert "3 responses of the vocabulary paper 1; they are not used" in caplog.text
+    assert path.read_bytes().startswith(kept)
+    assert {r.predicates for r in second.rationales} == {"relational 1"}
+    assert narrate_store(store, TEMPLATE).rationales == first.rationales
+    with Journal(path) as journal:
+        journal.append([replace(second.rationales[0], predicates="relational 0")])
+    caplog.clear()
+    with caplog.at_level("INFO"):
+        assert narrate_store(store, relational).rationales == second.rationales
+    assert "1 responses of the vocabulary relational 0" in caplog.text
+
+
+def test_bounds_of_relations_belong_to_the_settings_of_a_rationale(tmp_path):
+    store = make_store(tmp_path, 3)
+    relational = replace(TEMPLATE, predicates="relational")
+    wide = replace(relational, bounds=RelationBounds(level=0.3))
+    first = narrate_store(store, relational).rationales
+    assert narrate_store(store, relational).rationales == first
+    assert {r.settings for r in narrate_store(store, wide).rationales} != {
+        r.settings for r in first
+    }

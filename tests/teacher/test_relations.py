@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import combinations, permutations
 
 import numpy as np
 import pytest
 
 from conf.schema import TeacherConfig
+from conf.schema.servers import RelationBounds
 from data.records import Scene
 from teacher.deciding import LEVELS, choose_statements
 from teacher.narrator import write_match_lines, write_rationale
@@ -315,3 +316,10 @@ def test_interchangeable_objects_state_the_same(order: tuple[int, int]) -> None:
     names = [(A, B)[k] for k in order]
     value = "left of" if order == (0, 1) else "right of"
     assert normalize_relation(Relation("side", tuple(names), value)) in relations
+
+
+def test_bounds_of_the_settings_are_those_of_the_predicates() -> None:
+    """The schema cannot import the teacher, so that it repeats the bounds."""
+    assert Bounds(**asdict(RelationBounds())) == Bounds()
+    [problem] = TeacherConfig(name="t", bounds=RelationBounds(against=2.0)).check("teacher.")
+    assert "teacher.bounds.against=2" in problem
