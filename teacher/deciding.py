@@ -39,8 +39,9 @@ def choose_statements(predicates: RelationalPredicates, seed: int | str) -> Deci
 
     Statements are added one by one; each excludes as many of the remaining distractors as possible.
     With three distractors, no smaller set exists: either a statement excludes all, or two do, or
-    each excludes one. Of equally good statements that are clear, one of the simplest kind is chosen
-    at random.
+    each excludes one. Of equally good statements, those about objects that are visible at the cut
+    are preferred, because others can hardly be predicted; of these the clear ones; and of these one
+    of the simplest kind is chosen at random.
     """
     rng = Random(seed)
     views = [view for view in predicates.views if view.letter != predicates.answer]
@@ -49,19 +50,21 @@ def choose_statements(predicates: RelationalPredicates, seed: int | str) -> Deci
         for statement in sorted(predicates.target.statements)
         if statement.kind in LEVELS
     }
+    seen = {o.object for o in predicates.objects if o.sight == "shown"}
     left, chosen = {view.letter for view in views}, []
     while left:
         most = max((len(excluded & left) for excluded in excluded_by.values()), default=0)
         if not most:
             break
+        best = [s for s, excluded in excluded_by.items() if len(excluded & left) == most]
+        best = [s for s in best if seen.issuperset(s.objects)] or best
         clearness = {
             statement: min(
                 max(view.offsets[name] for name in statement.objects)
                 for view in views
-                if view.letter in excluded & left
+                if view.letter in excluded_by[statement] & left
             )
-            for statement, excluded in excluded_by.items()
-            if len(excluded & left) == most
+            for statement in best
         }
         least = CLEARNESS * max(clearness.values())
         clear = [statement for statement, value in clearness.items() if value >= least]
