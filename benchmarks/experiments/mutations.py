@@ -59,8 +59,8 @@ def main() -> None:
             break
         claims.update((claim.kind, claim.verdict) for claim in extract_claims(text, predicates))
         rng = Random(item_id)
-        for kind in MUTATIONS:
-            options = list(MUTATIONS[kind](text, predicates, rng))
+        for kind, mutate in {**MUTATIONS, **RELATION_MUTATIONS}.items():
+            options = list(mutate(text, predicates, rng))
             if not options:
                 continue
             false_text, (start, stop) = rng.choice(options)
@@ -248,6 +248,9 @@ MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = 
     "pair": replace_partners,
     "answer": replace_answer,
     "candidate": swap_candidates,
+}
+"""For each kind of word, a function that yields texts in which one such word is false."""
+RELATION_MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = {
     "side": lambda text, p, rng: replace_relations(text, SIDES, rng),
     "height": lambda text, p, rng: replace_relations(text, HEIGHTS, rng),
     "gap": lambda text, p, rng: replace_relations(text, GAPS, rng),
@@ -256,7 +259,7 @@ MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = 
     "nearer": swap_distances,
     "extreme": replace_extremes,
 }
-"""For each kind of word, a function that yields texts in which one such word is false."""
+"""The same for words of relations, which only relational rationales have."""
 
 
 if __name__ == "__main__":

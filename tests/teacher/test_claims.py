@@ -17,12 +17,14 @@ import pytest
 
 from benchmarks.experiments.mutations import (
     MUTATIONS,
+    RELATION_MUTATIONS,
     is_contradicted,
     parse_predicates,
     read_rationales,
 )
 from conf.schema import TeacherConfig
 from teacher.narrator import write_rationale
+from teacher.predicates.relations import Bounds
 from teacher.reading.phrases import VOCABULARY
 from teacher.sections import SECTIONS
 from teacher.validation.claim_extraction import extract_claims
@@ -114,11 +116,16 @@ def test_spans_are_the_words_of_claims():
 @pytest.fixture(scope="module")
 def rationales(benchmark_store):
     """The item id, text and predicates of each rationale, by who wrote it."""
-    return {"narrator": list(read_rationales(benchmark_store.folder)), "prose": PROSE}
+    folder = benchmark_store.folder
+    return {
+        "narrator": list(read_rationales(folder)),
+        "relational": list(read_rationales(folder, Bounds())),
+        "prose": PROSE,
+    }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("source", ["narrator", "prose"])
+@pytest.mark.parametrize("source", ["narrator", "relational", "prose"])
 def test_no_true_claim_is_contradicted(rationales, source):
     assert len(rationales[source]) > 30
     for _, text, predicates in rationales[source]:
@@ -141,6 +148,17 @@ def test_false_word_is_contradicted(rationales, source, kind):
         for false, _ in MUTATIONS[kind](text, predicates, Random(item_id))
     ]
     assert sum(detected) >= 0.97 * len(detected) > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", RELATION_MUTATIONS)
+def test_false_relation_is_contradicted(rationales, kind):
+    detected = [
+        is_contradicted(false, predicates)
+        for item_id, text, predicates in rationales["relational"]
+        for false, _ in RELATION_MUTATIONS[kind](text, predicates, Random(item_id))
+    ]
+    assert sum(detected) >= 0.97 * len(detected) > 5
 
 
 @pytest.mark.slow
