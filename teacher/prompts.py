@@ -86,7 +86,7 @@ def format_facts(predicates: Predicates, item: SelectionItem) -> dict[str, Any]:
 def format_statement(statement: Relation) -> str:
     """Return a statement in words, such as "red metal cube: left of blue rubber sphere"."""
     subject, *others = statement.objects
-    joint = " than to " if statement.kind == "nearer" else " and "
+    joint = {"nearer to": " than to ", "as near to": " as to "}.get(statement.value, " and ")
     return f"{subject}: {' '.join(filter(None, (statement.value, joint.join(others))))}"
 
 

@@ -9,7 +9,7 @@ A relation has a kind, objects and a value:
 | gap | a, b | against, near, apart from |
 | cover | a, b | in front of, behind |
 | between | a, b, c | between: a is between b and c |
-| nearer | a, b, c | nearer to: a is nearer to b than to c |
+| nearer | a, b, c | nearer to: a is nearer to b than to c; as near to: as near to b as to c |
 | extreme | a | leftmost, rightmost, topmost, lowest |
 | passing | a, b | moves past, crosses in front of, crosses behind |
 | arrival | a, b, c | comes between |
@@ -40,7 +40,7 @@ VALUES = {
     "gap": ("against", "near", "apart from"),
     "cover": ("in front of", "behind"),
     "between": ("between",),
-    "nearer": ("nearer to",),
+    "nearer": ("nearer to", "as near to"),
     "extreme": ("leftmost", "rightmost", "topmost", "lowest"),
     "passing": ("moves past", "crosses in front of", "crosses behind"),
     "arrival": ("comes between",),
@@ -95,7 +95,7 @@ def normalize_relation(relation: Relation) -> Relation:
     kind, objects, value = relation
     if kind in SYMMETRIC and objects[0] > objects[1]:
         return flip_relation(relation)
-    if kind in ("between", "arrival") and objects[1] > objects[2]:
+    if (kind in ("between", "arrival") or value == "as near to") and objects[1] > objects[2]:
         return Relation(kind, (objects[0], objects[2], objects[1]), value)
     return relation
 
@@ -103,12 +103,14 @@ def normalize_relation(relation: Relation) -> Relation:
 def find_topic(statement: Relation, relations: Sequence[Relation]) -> Relation | None:
     """Return the relation between the same objects in the same respect, with the same subject.
 
-    For "a is nearer to b than to c", this may be "a is nearer to c than to b".
+    For "a is nearer to b than to c", this may be "a is nearer to c than to b" or "a is as near to b
+    as to c".
     """
-    kind, objects, _ = wanted = normalize_relation(statement)
+    kind, objects, _ = normalize_relation(statement)
     if kind == "nearer":
-        opposite = Relation(kind, (objects[0], objects[2], objects[1]), wanted.value)
-        return next((r for r in (wanted, opposite) if r in relations), None)
+        subject, *others = objects
+        same = (r for r in relations if r.kind == kind and r.objects[0] == subject)
+        return next((r for r in same if {*r.objects[1:]} == {*others}), None)
     for relation in relations:
         if kind in SYMMETRIC and relation[:2] == (kind, objects):
             return relation if objects == statement.objects else flip_relation(relation)
@@ -172,9 +174,13 @@ def find_relations(places: Places, bounds: Bounds) -> set[Relation]:
         for b, c in combinations(others, 2):
             if _is_between(places.image[a], places.image[b], places.image[c], bounds):
                 found.add(Relation("between", (a, b, c), "between"))
-        for b, c in permutations(others, 2):
-            if distance[a, c] >= bounds.nearer * distance[a, b]:
+            one, other = distance[a, b], distance[a, c]
+            if other >= bounds.nearer * one:
                 found.add(Relation("nearer", (a, b, c), "nearer to"))
+            elif one >= bounds.nearer * other:
+                found.add(Relation("nearer", (a, c, b), "nearer to"))
+            else:
+                found.add(Relation("nearer", (a, b, c), "as near to"))
     found.update(_find_extremes(places.image, bounds))
     return found
 

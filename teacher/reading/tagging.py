@@ -75,8 +75,10 @@ PLACED = {
 AMBIGUOUS = {"between", "in", "comes", "come", "coming", "moves", "against"}
 """First words of phrases that state a relation only after an object or a verb of `PLACED`."""
 JOINTS = {
-    "between": ("and",), "arrival": ("and",), "nearer": ("than to", "than"),
-}  # fmt: skip
+    "between": ("and",),
+    "arrival": ("and",),
+    "nearer": ("than to", "than", "as to", "as", "and to", "and"),
+}
 """Words between the two other objects of a relation. Other kinds have one object or none."""
 ALONE = {"extreme", "edge"}
 """Kinds of relations without other objects."""
