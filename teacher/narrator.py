@@ -20,7 +20,7 @@ SHORT, LONG = 110, 250
 """A rationale with more than LONG words is written again with less detail, one of fewer than SHORT
 words with more. SHORT is well above the minimum, 80 words (paper, Rationale construction)."""
 BRIEF, SPARSE, FULL = Detail(3, 1, 1, 1), Detail(4, 1, 2, 1), Detail(6, 4, 6, 2)
-RELATIONAL_BRIEF, RELATIONAL_SPARSE = Detail(1, 1, 0, 1), Detail(3, 2, 1, 1)
+RELATIONAL_BRIEF, RELATIONAL_SPARSE = Detail(1, 1, 0, 1, 0), Detail(3, 2, 1, 1)
 """Relational rationales state fewer facts besides those that decide the item."""
 
 

@@ -33,6 +33,8 @@ class Detail(NamedTuple):
     """Objects in the prediction."""
     pairs: int
     """Pairs of objects in each section."""
+    relations: int = 1
+    """Relations in the scene parse, and changes of relations in the motion analysis."""
 
 
 def most_discriminative_object(predicates: Predicates) -> ObjectFacts:

@@ -96,7 +96,7 @@ class RelationalWriter(Writer):
     def scene_parse(self) -> list[str]:
         parts = super().scene_parse()
         now = [find_topic(s, self.facts.observed) for s in self.statements]
-        parts += [self.statement(s, "is") for s in now if s is not None][: self.detail.pairs]
+        parts += [self.statement(s, "is") for s in now if s is not None][: self.detail.relations]
         return parts
 
     def motion_analysis(self) -> list[str]:
@@ -107,7 +107,7 @@ class RelationalWriter(Writer):
             for r in self.facts.target.relations
             if r.kind in CHANGES and r.objects[0] in named and set(r.objects) <= named
         ]
-        for change in changes[: self.detail.pairs]:
+        for change in changes[: self.detail.relations]:
             parts.append(f"the {change.objects[0]} {self.place(change)}")
         return parts
 
@@ -161,7 +161,7 @@ class RelationalWriter(Writer):
         return super().match(candidate)
 
     def outcome(self, answer: str | None) -> list[str]:
-        parts = [self.statement(s, "is") for s in self.statements[:1]]
-        if not parts:
+        if not self.statements:
             return super().outcome(answer)
-        return [*parts, self.say("answer", answer=answer)]
+        shortest = min(self.statements, key=lambda s: len(s.objects))
+        return [self.statement(shortest, "is"), self.say("answer", answer=answer)]
