@@ -51,8 +51,6 @@ TARGET = 1
 """Index of the target among the frames from which candidates are chosen."""
 LARGEST_SHARE = 0.9
 """Maximum time to the earlier of two moments, as a share of the time to the later one."""
-JOINT = 0.75
-"""Share of event and window items in which objects that collide change by one velocity."""
 
 
 @dataclass
@@ -158,10 +156,9 @@ class BalancedPicker:
     ) -> list[Group]:
         """Return the groups of objects whose other velocities may give an item.
 
-        Their objects move at the end of the prefix, and visibly until the target. Where a collision
-        determines the target, most items change objects that collide by one velocity: otherwise
-        the target would often be the only candidate in which objects touch. Return none after
-        `TRIES` timings of a scene.
+        Their objects move at the end of the prefix, and visibly until the target. In event and
+        window items, objects that collide change by one velocity: otherwise the target would often
+        be the only candidate in which objects touch. Return none after `TRIES` timings of a scene.
         """
         shift = frame_displacements(scene, about)[timing.stop, timing.target]
         moving = moving_objects(scene, timing.stop, about)
@@ -171,7 +168,7 @@ class BalancedPicker:
         self._tries = scene.scene_id, tries + 1 if tried == scene.scene_id else 1
         if self._tries[1] > TRIES:
             return []
-        if family != "time" and self.rng.random() < JOINT:
+        if family != "time":
             return joint_groups(scene, timing.stop, timing.target, moving)
         return [(k,) for k in moving]
 
