@@ -134,7 +134,8 @@ def check_same_journals(one: Path, two: Path, step: int = -1) -> None:
         for f in (one, two)
     ]
     for first, second in zip(*journals, strict=True):
-        assert first == pytest.approx(second, rel=1e-5)
+        # The ranks sum gradients in another order; on some processors, norms differ by 1.1e-5.
+        assert first == pytest.approx(second, rel=1e-4)
 
 
 def check_same_weights(
