@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 PARTS = ("prefix", "prediction", "candidates")
 """What claims are about: the observed prefix, what follows it, or the candidates."""
 SUPPORTED, CONTRADICTED = "supported", "contradicted"
+NOWHERE = (0, 0)
+"""Span of a section that a text lacks."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +107,10 @@ def read_reasons(
     if predicates is None:
         return None
     claims = extract_claims(text, predicates)
-    by_part = _divide(text, claims)
-    agreeing = [c for c in claims if c.kind == "agrees" and not _is_answer(text, c)]
+    spans = {name: (start, stop) for name, start, stop in split_sections(text)}
+    by_part = _divide(claims, spans.get("Scene parse", NOWHERE))
+    first, last = spans.get("Answer", NOWHERE)
+    agreeing = [c for c in claims if c.kind == "agrees" and not first <= c.span[0] < last]
     affirmed = {c.candidate for c in agreeing if c.affirmed}
     denied = {c.candidate for c in agreeing if not c.affirmed}
     follows = letter is not None and affirmed == {letter} and letter not in denied
@@ -117,27 +121,20 @@ def read_reasons(
     return ResponseReasons(by_part, follows, measure_sufficiency(text, claims, predicates), true)
 
 
-def _divide(text: str, claims: Sequence[Claim]) -> dict[str, tuple[Claim, ...]]:
-    """Return the claims about each part, in text order."""
-    scene_parse = [
-        (start, stop) for name, start, stop in split_sections(text) if name == "Scene parse"
-    ]
+def _divide(claims: Sequence[Claim], scene_parse: tuple[int, int]) -> dict[str, tuple[Claim, ...]]:
+    """Return the claims about each part, in text order.
+
+    Args:
+        scene_parse: Span of the section that describes the prefix.
+    """
+    start, stop = scene_parse
     parts: dict[str, list[Claim]] = {part: [] for part in PARTS}
     for claim in claims:
         if claim.kind == "agrees" or (claim.kind == "mention" and claim.verdict != CONTRADICTED):
             continue
-        observed = any(start <= claim.span[0] < stop for start, stop in scene_parse)
-        part = "prefix" if observed else "prediction"
+        part = "prefix" if start <= claim.span[0] < stop else "prediction"
         parts["candidates" if claim.candidate is not None else part].append(claim)
     return {part: tuple(found) for part, found in parts.items()}
-
-
-def _is_answer(text: str, claim: Claim) -> bool:
-    """Return whether a claim is the line "Answer: X"."""
-    return any(
-        name == "Answer" and start <= claim.span[0] < stop
-        for name, start, stop in split_sections(text)
-    )
 
 
 def _summarize_part(claims: Sequence[Sequence[Claim]], scenes: SceneBootstrap) -> PartSummary:
