@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, astuple, replace
 from functools import lru_cache, partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from conf.schema import BenchmarkConfig, Quota
 from data.parallel import Workers
@@ -31,10 +34,11 @@ from data.store import (
     write_atomically,
 )
 from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
-from data.tracks.quota import CellInputs, fill_quota
+from data.tracks.quota import CellInputs, fill_quota, named_rng, shuffle_candidates
 from data.tracks.retrieval import counterfactual, future
 from data.tracks.selection import event, time, window
 from data.tracks.selection.distractors import BUILDERS_VERSION, Family, Timing
+from data.tracks.selection.pooling import add_reserve, choose_items
 from data.world.physics import GENERATOR_VERSION
 
 DYNAPIX_FAMILIES = {"event": event.FAMILY, "time": time.FAMILY, "window": window.FAMILY}
@@ -58,10 +62,7 @@ def make_items_and_queries(
         The items; the queries, up to `QUERY_RESERVE` times their quotas; and the numbers of items
         and queries that were dropped because too few other frames differ enough from their targets.
     """
-    quotas = cell_quotas(cfg)
-    for name in filter(_is_query_cell, quotas):
-        train, test = (math.ceil(QUERY_RESERVE * n) for n in astuple(quotas[name]))
-        quotas[name] = Quota(train, test)
+    quotas = {name: _with_reserve(cfg, name, quota) for name, quota in cell_quotas(cfg).items()}
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
     recipe = cfg.distractors, cfg.selection.observation
     inputs = [GENERATOR_VERSION, BUILDERS_VERSION, scene_ids, *recipe, *settings]
@@ -77,6 +78,7 @@ def make_items_and_queries(
         remove_other_parts(folder, paths.values())
     workers.write_files(jobs, "making items and queries", "cell")
     items: list[SelectionItem] = []
+    scores: dict[str, list[list[list[float]]]] = {}
     queries: list[RetrievalQuery] = []
     dropped: Counter[str] = Counter()
     for name in quotas:
@@ -85,10 +87,45 @@ def make_items_and_queries(
             queries += map(RetrievalQuery.from_row, part["rows"])
             dropped["queries dropped, too alike"] += part["dropped"]
         else:
-            items += map(SelectionItem.from_row, part["rows"])
+            made = [SelectionItem.from_row(row) for row in part["rows"]]
+            items += made
+            scores |= zip((i.item_id for i in made), part.get("scores", []), strict=False)
             reason = "no suitable distractors" if cfg.distractors == "balanced" else "too alike"
             dropped[f"items dropped, {reason}/{name.partition('/')[0]}"] += part["dropped"]
+    if cfg.distractors == "balanced":
+        items = _choose_balanced(cfg, items, scores)
     return items, queries, dict(dropped)
+
+
+def _choose_balanced(
+    cfg: BenchmarkConfig, items: list[SelectionItem], scores: Mapping[str, Any]
+) -> list[SelectionItem]:
+    """Return the items up to their quotas, chosen so that their scores are even in each family,
+    difficulty and split.
+
+    Args:
+        scores: Scores of the candidates, the target first, by item id. Items without scores, such
+            as matched pairs, are kept.
+    """
+    pools: dict[tuple[str, ...], list[SelectionItem]] = defaultdict(list)
+    for item in items:
+        if item.item_id in scores:
+            pools[item.split, item.family, item.difficulty or ""].append(item)
+    chosen: dict[str, SelectionItem] = {}
+    quotas = family_quotas(cfg)
+    for (split, family, difficulty), pool in pools.items():
+        rng = named_rng(cfg.seed, "pool", split, family, difficulty)
+        kept = choose_items(
+            np.array([scores[item.item_id] for item in pool]),
+            [item.subtype for item in pool],
+            {subtype: getattr(quota, split) for subtype, quota in quotas[family].items()},
+            rng,
+        )
+        for _, cell in groupby((pool[k] for k in kept), key=lambda item: item.subtype):
+            chosen |= {item.item_id: item for item in shuffle_candidates([*cell], rng)}
+    return [
+        chosen.get(i.item_id, i) for i in items if i.item_id in chosen or i.item_id not in scores
+    ]
 
 
 def item_families(cfg: BenchmarkConfig) -> Mapping[str, Family]:
@@ -135,6 +172,14 @@ def builder_name(builder: int | None) -> str:
     return COUNTERFACTUAL if builder is None else f"builder {builder}"
 
 
+def _with_reserve(cfg: BenchmarkConfig, name: str, quota: Quota) -> Quota:
+    """Return how many items or queries a job makes, of which those of the quota are chosen."""
+    if _is_query_cell(name):
+        return Quota(*(math.ceil(QUERY_RESERVE * n) for n in astuple(quota)))
+    is_balanced = cfg.distractors == "balanced" and name != MATCHED_ANCHOR
+    return add_reserve(quota) if is_balanced else quota
+
+
 def _is_query_cell(name: str) -> bool:
     return name == COUNTERFACTUAL or name.startswith("builder ")
 
@@ -169,6 +214,7 @@ def remove_other_parts(folder: Path, kept: Iterable[Path]) -> None:
 
 def _run_job(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> None:
     group, _, subtype = name.partition("/")
+    part: dict[str, Any] = {}
     if group == MATCHED_ANCHOR:
         made, dropped = fill_pairs(cell)
     elif group == COUNTERFACTUAL:
@@ -178,6 +224,8 @@ def _run_job(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> N
     else:
         if cfg.distractors == "balanced":
             cell = replace(cell, world=cfg.world, save=partial(_save, path.parents[1]))
-        made, dropped = fill_quota(subtype, item_families(cfg)[group], cell)
-    part: dict[str, Any] = {"rows": [row.to_row() for row in made], "dropped": dropped}
+        made, dropped, scores = fill_quota(subtype, item_families(cfg)[group], cell)
+        if cfg.distractors == "balanced":
+            part["scores"] = np.array(scores).tolist()
+    part |= {"rows": [row.to_row() for row in made], "dropped": dropped}
     write_atomically(path, json.dumps(part).encode())

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count, islice
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -50,16 +50,27 @@ class CellInputs:
         return DistractorPicker(self.min_displacement, self.scene_ids[split], self.scene_of)
 
 
-def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[SelectionItem], int]:
+class Filled(NamedTuple):
+    """The items of one cell.
+
+    Attributes:
+        items: The items of both splits, up to their quotas.
+        dropped: Number of timings that were dropped because no three distractors are suitable.
+        scores: (S, 4) scores of the candidates of each item, the target first; only for balanced
+            items (see `data.tracks.selection.balance.SCORES`).
+    """
+
+    items: list[SelectionItem]
+    dropped: int
+    scores: list[np.ndarray]
+
+
+def fill_quota(subtype: str, family: Family, cell: CellInputs) -> Filled:
     """Make the items of one cell, at most one per scene, from scenes in a seeded order.
 
     The timings of a scene are tried in a random order.
-
-    Returns:
-        The items of each split up to its quota, and the number of timings that were dropped because
-        no three distractors are suitable.
     """
-    items, dropped = [], 0
+    filled = Filled([], 0, [])
     for split in SPLITS:
         scene_ids = cell.scene_ids[split]
         rng = named_rng(cell.seed, subtype, split)
@@ -73,16 +84,28 @@ def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[Sel
             order = rng.permutation(len(timings))
             attempts = (family.make_item(subtype, scene, timings[k], rng, picker) for k in order)
             made += islice(filter(None, attempts), 1)
-        # Each letter is the answer equally often. Where the number of items is not divisible by 4,
-        # a random first letter decides which letters are the answer once more.
-        positions = rng.permutation((np.arange(len(made)) + rng.integers(4)) % 4)
-        for item, position in zip(made, positions.tolist(), strict=True):
-            target, *distractors = item.candidates
-            candidates = [distractors[k] for k in rng.permutation(3)]
-            candidates.insert(position, target)
-            items.append(replace(item, candidates=tuple(candidates), answer=position))
-        dropped += picker.dropped
-    return items, dropped
+        filled = Filled(
+            filled.items + shuffle_candidates(made, rng),
+            filled.dropped + picker.dropped,
+            filled.scores + picker.scores,
+        )
+    return filled
+
+
+def shuffle_candidates(
+    items: Sequence[SelectionItem], rng: np.random.Generator
+) -> list[SelectionItem]:
+    """Return items with their candidates in a random order, each letter being the answer equally
+    often. Where the number of items is not divisible by 4, a random first letter decides which
+    letters are the answer once more."""
+    positions = rng.permutation((np.arange(len(items)) + rng.integers(4)) % 4)
+    shuffled = []
+    for item, position in zip(items, positions.tolist(), strict=True):
+        distractors = [c for k, c in enumerate(item.candidates) if k != item.answer]
+        candidates = [distractors[k] for k in rng.permutation(3)]
+        candidates.insert(position, item.candidates[item.answer])
+        shuffled.append(replace(item, candidates=tuple(candidates), answer=position))
+    return shuffled
 
 
 def named_rng(seed: int, *names: str) -> np.random.Generator:

@@ -30,10 +30,6 @@ APART = 10.0
 LIMIT, TOLERANCE = 1.75, 0.015
 """The count of targets of a rank may differ from a quarter of all items by `LIMIT`, and by this
 share of the items. Without the second term, a cell could reach counts that no item improves."""
-RANK_WEIGHT = 4.0
-"""Weight of the squared deviations of the counts, relative to those of the sums."""
-RIDGE = 0.01
-"""Added to the variances of the relative scores: some of them are constant, or depend on others."""
 START = 0.75
 """Maximum distance from 0 of the counts at the start."""
 
@@ -146,24 +142,14 @@ def compare_candidates(scores: np.ndarray) -> np.ndarray:
 
 
 class Balance:
-    """Counts how often the targets of a cell have each rank in each score, and sums by how much the
-    targets' relative scores differ from the means of their candidates.
-
-    Even ranks do not suffice: if a target that has the highest score has it by less than a
-    distractor would, a combination of scores reveals it. If the sums are zero, the best logistic
-    model of the relative scores is the one that ignores them, since the gradient of its likelihood
-    is zero there. The sums are measured in standard deviations (as in a score test), because scores
-    that nearly agree, such as the displacement of one object and of all objects, have a difference
-    that varies little and can reveal much.
+    """Counts how often the targets of a cell have each rank in each score.
 
     The counts start at random values near 0, so that the few items of many small cells do not all
     begin with the same ranks.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self.items = self.offered = 0
-        self.sums = np.zeros(3 * len(SCORES))
-        self.scatter = np.zeros((3 * len(SCORES), 3 * len(SCORES)))
+        self.items = 0
         start = rng.uniform(-START, START, (len(SCORES), 4))
         self.counts = start - start.mean(axis=-1, keepdims=True)
 
@@ -172,7 +158,7 @@ class Balance:
         return int(self.counts[SCORES.index(score)].argmin())
 
     def choose(self, scores: np.ndarray) -> int | None:
-        """Return the choice of candidates that keeps ranks and sums most even, and count it.
+        """Return the choice of candidates that keeps the counts of ranks most even, and count it.
 
         Args:
             scores: (S, T, 4) scores of T choices; the first of four candidates is the target.
@@ -186,16 +172,7 @@ class Balance:
         allowed = np.abs(excess).max(axis=(1, 2)) <= LIMIT + TOLERANCE * self.items
         if not allowed.any():
             return None
-        relative = compare_candidates(scores.swapaxes(0, 1))
-        relative = relative - relative.mean(axis=-1, keepdims=True)
-        self.offered += 1
-        self.scatter += np.einsum("tfc,tgc->fg", relative, relative) / relative[:, 0].size
-        covariance = self.scatter / self.offered + RIDGE * np.eye(len(self.scatter))
-        sums = self.sums + relative[..., 0]
-        deviation = np.einsum("tf,tf->t", sums, np.linalg.solve(covariance, sums.T).T)
-        uneven = RANK_WEIGHT * (excess**2).sum(axis=(1, 2)) + deviation
-        best = int(np.where(allowed, uneven, np.inf).argmin())
+        best = int(np.where(allowed, (excess**2).sum(axis=(1, 2)), np.inf).argmin())
         self.counts = self.counts + shares[best]
-        self.sums = sums[best]
         self.items += 1
         return best

