@@ -115,6 +115,11 @@ def _gap(scene: Scene, frame: int) -> float:
     return max(float(min(gaps, default=APART)), TOUCHING)
 
 
+def nearly_equal(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Whether scores differ by less than the precision of the stored positions."""
+    return np.isclose(one, other, rtol=1e-4, atol=1e-3)
+
+
 def rank_shares(scores: np.ndarray) -> np.ndarray:
     """Return the distribution (..., 4) of the rank of the first of four candidates (..., 4).
 
@@ -122,8 +127,7 @@ def rank_shares(scores: np.ndarray) -> np.ndarray:
     ranks.
     """
     target, others = scores[..., :1], scores[..., 1:]
-    # Differences below the precision of the stored positions count as none.
-    close = np.isclose(others, target, rtol=1e-4, atol=1e-3)
+    close = nearly_equal(others, target)
     lower = (others < target) & ~close
     first, count = lower.sum(axis=-1), close.sum(axis=-1) + 1
     ranks = np.arange(4)
@@ -136,8 +140,8 @@ def compare_candidates(scores: np.ndarray) -> np.ndarray:
     standard deviations from their mean, and whether each is the lowest or the highest."""
     spread = scores.std(axis=-1, keepdims=True)
     relative = (scores - scores.mean(axis=-1, keepdims=True)) / np.maximum(spread, 1e-6)
-    is_lowest = scores <= scores.min(axis=-1, keepdims=True)
-    is_highest = scores >= scores.max(axis=-1, keepdims=True)
+    is_lowest = nearly_equal(scores, scores.min(axis=-1, keepdims=True))
+    is_highest = nearly_equal(scores, scores.max(axis=-1, keepdims=True))
     return np.concatenate([relative, is_lowest, is_highest], axis=-2)
 
 

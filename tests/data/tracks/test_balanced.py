@@ -303,6 +303,14 @@ def test_shares_of_ranks_are_a_distribution_that_splits_ties() -> None:
     np.testing.assert_allclose(shares, [[0, 1, 0, 0], [1 / 3, 1 / 3, 1 / 3, 0], [1 / 4] * 4])
 
 
+def test_nearly_equal_scores_are_lowest_together() -> None:
+    """The precision of stored scenes does not decide which candidate is lowest or highest."""
+    scores = np.array([[10.0, 10.0004, 12.0, 15.0]])
+    _, lowest, highest = compare_candidates(scores)
+    assert lowest.tolist() == [1, 1, 0, 0]
+    assert highest.tolist() == [0, 0, 0, 1]
+
+
 def test_balance_keeps_every_count_within_the_limit() -> None:
     random = rng()
     balance, refused = Balance(random), 0
