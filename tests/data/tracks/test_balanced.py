@@ -343,7 +343,7 @@ def test_choice_from_a_pool_fills_quotas_and_removes_a_joint_shortcut() -> None:
     assert deviation(kept) < 0.7 * deviation(first)
     fair = random.normal(size=(600, len(SCORES), 4))
     even = item_deviations(fair)[choose_items(fair, ["a"] * 600, {"a": 500}, random)]
-    assert np.abs(even.mean(axis=0)).max() < 0.01
+    assert np.abs(even.mean(axis=0)).max() < 0.02
 
 
 @pytest.mark.slow
