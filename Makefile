@@ -131,12 +131,11 @@ format: setup ## Format the code and fix its style
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-base: setup ## Train the tiny base from random weights into checkpoints/bases/tiny
-	$(BIN)/python -m train.sft +exp=base
+base: setup ## Train the tiny base from random weights into checkpoints/bases/tiny (hours)
+	$(BIN)/python -m train.base run=tiny
 	rm -rf checkpoints/bases/tiny && mkdir -p checkpoints/bases/tiny
-	cp -r checkpoints/sft/exp-base/student/. checkpoints/bases/tiny/
-	cp checkpoints/sft/exp-base/config.yaml checkpoints/sft/exp-base/run.json \
-	   checkpoints/sft/exp-base/metrics.jsonl checkpoints/sft/exp-base/curves.png checkpoints/bases/tiny/
+	cp -r checkpoints/base/tiny/student/. checkpoints/bases/tiny/
+	cp $(addprefix checkpoints/base/tiny/,config.yaml run.json metrics.json metrics.jsonl curves.png) checkpoints/bases/tiny/
 
 constraints: setup ## Write constraints.txt from the versions in .venv
 	$(BIN)/uv pip freeze --quiet --python $(BIN)/python --exclude-editable > constraints.txt

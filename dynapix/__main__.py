@@ -14,6 +14,7 @@ COMMANDS = {
     "teacher.serve": "serve a model with vLLM",
     "train.sft": "train a student",
     "train.contrastive": "train a retriever",
+    "train.base": "train the tiny base from random weights",
     "train.export": "export a trained model",
     "evaluation.select": "evaluate a student or a base on selection items",
     "evaluation.similarity": "evaluate a retriever on selection items",

@@ -60,9 +60,10 @@ def load_base(
             downloaded, it has no vision tower, or its processor belongs to another model.
     """
     if cfg.architecture is not None:
-        processor = build_processor(corpus(), cfg.architecture.vocabulary, cfg.image_size)
+        sizes = cfg.architecture
+        processor = build_processor(corpus(), sizes.vocabulary, cfg.image_size, sizes.patch)
         pin_sizes(processor, cfg.image_size, cfg.frames)
-        model = build_model(cfg.architecture, len(processor.tokenizer))
+        model = build_model(sizes, len(processor.tokenizer))
         choose_attention(model, precision, cfg.max_length)
         return model, processor
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}

@@ -32,7 +32,7 @@ SPECIAL_TOKENS = (
     "<|video_pad|>",
 )
 CHAT_TEMPLATE = Path(__file__).with_name("tiny_chat_template.jinja").read_text()
-PATCH, MERGE, TEMPORAL = 16, 2, 2
+MERGE, TEMPORAL = 2, 2
 
 
 def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditionalGeneration:
@@ -71,7 +71,7 @@ def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditi
             "intermediate_size": sizes.vision_feed_forward,
             "num_heads": sizes.vision_heads,
             "out_hidden_size": sizes.hidden,
-            "patch_size": PATCH,
+            "patch_size": sizes.patch,
             "spatial_merge_size": MERGE,
             "temporal_patch_size": TEMPORAL,
             "num_position_embeddings": 12 * 12,
@@ -90,12 +90,17 @@ def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditi
     return model
 
 
-def build_processor(corpus: Iterable[str], vocabulary: int, image_size: int) -> Qwen3VLProcessor:
+def build_processor(
+    corpus: Iterable[str], vocabulary: int, image_size: int, patch: int = 16
+) -> Qwen3VLProcessor:
     """Return a processor with a byte-level BPE tokenizer that is trained on `corpus`.
 
     The same texts in the same order give the same tokenizer.
 
-    `vocabulary` is the maximum number of tokens, including the special ones.
+    Args:
+        vocabulary: Maximum number of tokens, including the special ones.
+        image_size: Width and height (px) of images.
+        patch: Width and height (px) of a patch; a visual token covers 2 x 2 patches.
     """
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
@@ -116,7 +121,7 @@ def build_processor(corpus: Iterable[str], vocabulary: int, image_size: int) -> 
         extra_special_tokens=list(SPECIAL_TOKENS[1:]),
     )
     pixels = image_size * image_size
-    shared = {"patch_size": PATCH, "merge_size": MERGE, "temporal_patch_size": TEMPORAL}
+    shared = {"patch_size": patch, "merge_size": MERGE, "temporal_patch_size": TEMPORAL}
     return Qwen3VLProcessor(
         image_processor=Qwen2VLImageProcessor(
             size={"shortest_edge": 32 * 32, "longest_edge": pixels}, **shared

@@ -193,22 +193,16 @@ def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) 
 
 def modes_of_regime(regime: str) -> list[str]:
     """Return the modes (reasoning, answer) in which a regime trains students to answer items."""
-    return {"describe": [], "answer_only": ["answer"]}.get(regime, ["reasoning", "answer"])
+    return ["answer"] if regime == "answer_only" else ["reasoning", "answer"]
 
 
 def check_modes(folder: Path, regime: str, modes: Sequence[str]) -> None:
     """Raise UserError if a student is evaluated in a mode that it was not trained in."""
     trained = modes_of_regime(regime)
-    if set(modes) <= set(trained):
-        return
-    if trained:
-        problem = (
-            f"in {' and '.join(trained)} mode only (train.regime={regime}), not in "
-            f"{' and '.join(modes)} mode: set modes=[{','.join(trained)}]"
+    if not set(modes) <= set(trained):
+        raise UserError(
+            f"model={folder} was trained in {' and '.join(trained)} mode only "
+            f"(train.regime={regime}), not in {' and '.join(modes)} mode: "
+            f"set modes=[{','.join(trained)}]",
+            code="untrained-mode",
         )
-    else:
-        problem = (
-            "to describe, not to choose: evaluate it as a base with "
-            f"student.model={product_folder(folder, 'student')}"
-        )
-    raise UserError(f"model={folder} was trained {problem}", code="untrained-mode")

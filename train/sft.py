@@ -1,7 +1,4 @@
-"""Train a student on rationales or answers, by default with LoRA over a frozen 4-bit base.
-
-With `+exp=base`, it trains all weights of the tiny base on descriptions instead.
-"""
+"""Train a student on rationales or answers, by default with LoRA over a frozen 4-bit base."""
 
 from __future__ import annotations
 
@@ -14,7 +11,6 @@ from conf.entry import Run, command
 from conf.gpus import restrict_to_one_gpu
 from conf.runs import finished_metrics, rank
 from conf.schema import SftCommand
-from conf.schema.training import WITHOUT_RATIONALES
 from conf.trackers import check_trackers
 
 log = logging.getLogger(__name__)
@@ -50,8 +46,9 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     with distributed.main_first():
         checkpoint = newest_checkpoint(run.folder)
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-        without = cfg.train.regime in WITHOUT_RATIONALES
-        rationales = [] if without else ensure_rationales(store, cfg.teacher)
+        rationales = (
+            [] if cfg.train.regime == "answer_only" else ensure_rationales(store, cfg.teacher)
+        )
     training, validation = load_datasets(cfg, store, rationales)
 
     data = data_digest(store.identity, training.texts)
@@ -77,9 +74,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
 
     weights = training_loop.gather_weights(trainer)
     if rank() == 0:
-        # A base is saved in bf16, as released bases are, whatever its precision in training.
-        saved_precision = "bf16" if cfg.train.regime == "describe" else precision
-        loading.save_student(model, processor, run.folder / "student", saved_precision, weights)
+        loading.save_student(model, processor, run.folder / "student", precision, weights)
     log.info("the student is in %s", run.folder / "student")
     return run_metrics(run.folder, best_step)
 

@@ -8,6 +8,7 @@ each invalid value or combination of values; a message names keys as the user ty
 from conf.schema.benchmark import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from conf.schema.commands import (
     PARALLEL_BACKENDS,
+    BaseCommand,
     BuildCommand,
     CommandConfig,
     ContrastiveCommand,
@@ -37,5 +38,11 @@ from conf.schema.models import (
     StudentConfig,
 )
 from conf.schema.servers import ServerConfig, ServersConfig, TeacherConfig
-from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig, TrainConfig
+from conf.schema.training import (
+    BaseTrainConfig,
+    ContrastiveTrainConfig,
+    SftTrainConfig,
+    StageConfig,
+    TrainConfig,
+)
 from conf.schema.world import CameraConfig, PartConfig, PhysicsConfig, WorldConfig

@@ -12,9 +12,12 @@ from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import TeacherConfig
 from conf.schema.settings import Settings, check_run, setting
-from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
+from conf.schema.training import BaseTrainConfig, ContrastiveTrainConfig, SftTrainConfig
 
 PARALLEL_BACKENDS = ("loky", "ray")
+BASE_LAYERS, BASE_HEADS = 5, 5
+"""Minimum numbers of language layers and of attention heads of a base that `train.base` trains: its
+targets refer to the first four layers, and to one head for the clip and one for each candidate."""
 
 
 @dataclass
@@ -128,6 +131,29 @@ class SftCommand(CommandConfig):
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
     seed: int = setting(0, least=0)
     """Seed of the order of the samples and of the initial adapter weights."""
+
+
+@dataclass
+class BaseCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    student: StudentConfig = MISSING
+    train: BaseTrainConfig = field(default_factory=BaseTrainConfig)
+    seed: int = setting(0, least=0)
+    """Seed of the order of the items, of the questions and of the heads."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        sizes = self.student.architecture
+        if sizes is None:
+            yield (
+                f"student.model={self.student.model}: a base is trained from random weights; "
+                "choose student=tiny_scratch or set student.architecture"
+            )
+        elif sizes.layers < BASE_LAYERS or min(sizes.heads, sizes.kv_heads) < BASE_HEADS:
+            yield (
+                f"student.architecture.layers={sizes.layers}, heads={sizes.heads} and kv_heads="
+                f"{sizes.kv_heads}: the training of a base needs {BASE_LAYERS} layers with "
+                f"{BASE_HEADS} heads or more"
+            )
 
 
 @dataclass

@@ -34,6 +34,8 @@ class ArchitectureConfig(Settings):
     are divided among time, height and width."""
     feed_forward: int = 512
     """Feed-forward size of the language tower."""
+    patch: int = setting(16, least=4)
+    """Width and height (px) of a patch; a visual token covers 2 x 2 patches."""
     vision_hidden: int = 128
     """Hidden size of the vision tower."""
     vision_layers: int = 3

@@ -7,9 +7,7 @@ from dataclasses import dataclass, field
 
 from conf.schema.settings import Settings, setting
 
-REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout", "answer_only", "describe")
-WITHOUT_RATIONALES = ("answer_only", "describe")
-"""Regimes whose responses contain no rationale."""
+REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout", "answer_only")
 
 
 @dataclass
@@ -68,8 +66,7 @@ class SftTrainConfig(TrainConfig):
     """Content of the responses that the student is trained on: cot (the rationale; one line per
     candidate that says whether it matches; the answer), cot_no_candidate_analysis (cot, but the
     rationale has no candidate analysis), cot_no_match_layout (cot without the lines per candidate),
-    answer_only (the answer), or describe (descriptions instead of answers, for training the tiny
-    base)."""
+    or answer_only (the answer)."""
     batch: int = setting(16, least=1)
     """Number of samples per optimizer step, over all micro-batches and ranks."""
     micro_batch: int = setting(1, least=1)
@@ -89,11 +86,6 @@ class SftTrainConfig(TrainConfig):
         yield from super().find_problems(group)
         if self.micro_batch > 0 and self.batch % self.micro_batch:
             yield f"{group}micro_batch={self.micro_batch} must divide {group}batch={self.batch}"
-        if self.permute_candidates and self.regime == "describe":
-            yield (
-                f"{group}permute_candidates=true with {group}regime=describe: descriptions have no "
-                f"candidates; set {group}permute_candidates=false"
-            )
 
 
 @dataclass
@@ -125,3 +117,44 @@ class ContrastiveTrainConfig(TrainConfig):
             )
         if not 1 <= self.mini_batch <= self.batch:
             yield f"{group}mini_batch={self.mini_batch} must be from 1 to {group}batch={self.batch}"
+
+
+@dataclass
+class StageConfig(Settings):
+    """A stage of the training of the tiny base (see `train.tiny_base.stages`)."""
+
+    steps: int = setting(1000, least=1)
+    """Number of optimizer steps."""
+    batch: int = setting(8, least=1)
+    """Number of samples per step."""
+    lr: float = setting(1e-3, above=0)
+    """Peak learning rate; a cosine lowers it to a twentieth."""
+
+
+def stage(steps: int, batch: int, lr: float) -> StageConfig:
+    """Return the field of a stage with its defaults."""
+    return field(default_factory=lambda: StageConfig(steps, batch, lr))
+
+
+@dataclass
+class BaseTrainConfig(Settings):
+    eyes: StageConfig = stage(3000, 8, 2e-3)
+    """The vision tower learns to see objects in single pictures."""
+    motion: StageConfig = stage(3000, 8, 1e-3)
+    """The whole model learns where objects are and where they go."""
+    words: StageConfig = stage(6000, 8, 1e-3)
+    """The model learns to answer questions in words."""
+    weight_decay: float = setting(0.05, least=0)
+    """Weight decay of AdamW."""
+    adam_beta2: float = setting(0.98, least=0, below=1)
+    """Decay rate of AdamW's second moment."""
+    max_grad_norm: float = setting(1.0, above=0)
+    """Maximum norm of the gradient, to which it is clipped."""
+    precision: str = setting("auto", ("auto", "bf16", "fp32"))
+    """Precision of the forward and backward pass, as in `train.sft`."""
+    evaluations: int = setting(10, least=1)
+    """Number of evaluations and checkpoints of each stage."""
+    validation_items: int = setting(160, least=1)
+    """Number of items, from held-out scenes, of an evaluation."""
+    log_steps: int = setting(20, least=1)
+    """Number of steps between two losses in the journal."""

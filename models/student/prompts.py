@@ -69,22 +69,6 @@ class Clip:
 
 
 @dataclass(frozen=True)
-class ObjectLabel:
-    """A visible object in a picture of a sample: in an image, or in a pair of a clip's frames,
-    which the vision tower encodes together.
-
-    Attributes:
-        picture: Index of the picture; the pictures of the clip precede the images.
-        place: Column and row of the object as shares of the picture's width and height.
-        words: The words that name the object.
-    """
-
-    picture: int
-    place: tuple[float, float]
-    words: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Sample:
     """A conversation with its media, before tokenization.
 
@@ -94,7 +78,6 @@ class Sample:
         images: (S, S, 3) uint8 pixels of the images, such as the candidates, in order.
         response: The assistant's text, or None if it is to be generated.
         supervised: Whether the response is trained on; if not, the sample only fills a batch.
-        object_labels: Visible objects, for the training of the tiny base.
     """
 
     sample_id: str
@@ -103,7 +86,6 @@ class Sample:
     images: list[np.ndarray]
     response: str | None = None
     supervised: bool = True
-    object_labels: tuple[ObjectLabel, ...] = ()
 
     @property
     def pictures(self) -> int:
@@ -209,7 +191,6 @@ def conversation(
     parts: Sequence[str | np.ndarray],
     response: str | None,
     clip: Clip | None = None,
-    object_labels: Sequence[ObjectLabel] = (),
 ) -> Sample:
     """Return a sample whose user message is the clip, if any, and then `parts`, which are texts and
     (S, S, 3) uint8 images."""
@@ -219,4 +200,4 @@ def conversation(
         for part in parts
     ]
     images = [part for part in parts if not isinstance(part, str)]
-    return Sample(sample_id, content, clip, images, response, object_labels=tuple(object_labels))
+    return Sample(sample_id, content, clip, images, response)

@@ -23,6 +23,7 @@ SCHEMAS = {
     "data.gallery": schema.GalleryCommand,
     "teacher.narrate": schema.NarrateCommand,
     "teacher.serve": schema.ServeCommand,
+    "train.base": schema.BaseCommand,
     "train.sft": schema.SftCommand,
     "train.contrastive": schema.ContrastiveCommand,
     "train.export": schema.ExportModelCommand,
@@ -109,11 +110,12 @@ def test_teacher_takes_one_server_or_several():
 
 def test_overrides_and_overlays_replace_the_recipe():
     assert compose_line("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
-    base = compose_line("python -m train.sft +exp=base")
+    base = compose_line("python -m train.base train.words.lr=3e-4")
     assert base.student.name == "tiny_scratch"
     assert base.student.architecture.vision_layers == 4
     assert base.benchmark.name == "tiny_base"
-    assert base.train.regime == "describe"
+    assert base.benchmark.world.name == "above"
+    assert (base.train.words.lr, base.train.words.batch) == (3e-4, 8)
 
 
 def test_retriever_preset_sets_its_training_recipe():

@@ -287,6 +287,6 @@ def test_presets_compose_around_the_papers_values(preset, command, schema, model
     assert (paper.train.lr, lora) in zip([job.train.lr for job in jobs], loras, strict=True)
     assert {other.alpha / other.rank for other in loras} == {lora.alpha / lora.rank}
     if preset == "+sweep=regimes":
-        assert {job.train.regime for job in jobs} == set(REGIMES) - {"describe"}
+        assert {job.train.regime for job in jobs} == set(REGIMES)
     else:
         assert len({other.rank for other in loras}) == 3

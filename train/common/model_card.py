@@ -11,7 +11,6 @@ from huggingface_hub import ModelCard, ModelCardData
 
 from conf.multirun.table import AT_START_SUFFIX
 from conf.schema import ContrastiveCommand, SftCommand
-from conf.schema.training import WITHOUT_RATIONALES
 from models.fingerprints import is_hub_model
 from models.resolved import read_resolved
 from train.common.journal import BEST_STEP
@@ -36,7 +35,7 @@ def model_card(
     student = isinstance(settings, SftCommand)
     product = "student" if student else "retriever"
     preset, train = getattr(settings, product), settings.train
-    narrated = student and train.regime not in WITHOUT_RATIONALES
+    narrated = student and train.regime != "answer_only"
     on_hub = is_hub_model(preset.model)
     metrics = json.loads((folder / "metrics.json").read_text())
     merged_library = "transformers" if student else "sentence-transformers"

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from conf.schema import SftCommand, TeacherConfig
-from conf.schema.training import WITHOUT_RATIONALES
 from data.records import LETTERS, Rationale, SelectionItem
 from data.render.frame_cache import FrameReader
 from data.store import Store
@@ -24,7 +23,6 @@ from teacher.narrator import write_match_lines
 from teacher.vocabulary import choose_vocabulary, describe_item
 from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
-from train.tiny_base import questions
 
 
 @dataclass(frozen=True)
@@ -112,37 +110,26 @@ def load_datasets(
     """
     train, frame_count, seed = cfg.train, cfg.student.frames, cfg.seed
     frames = FrameReader(store, cfg.student.image_size)
-    if train.regime not in WITHOUT_RATIONALES:
+    if train.regime != "answer_only":
         check_not_empty(len(rationales), "accepted rationales")
     held_out = held_out_scenes(store)
     training_scenes = set(store.scene_ids("train")) - held_out
     items = store.selection("train")
     # No frame of a held-out scene is visible in training, not even as a distractor.
     training_items = [item for item in items if uses_only(item, training_scenes)]
-    if train.regime == "describe":
-        validation_items = [item for item in items if uses_only(item, held_out)]
-        training, validation = (
-            questions.build_questions(store, part, frame_count, frames, seed)
-            for part in (training_items, validation_items)
-        )
-        validation = {
-            kind: shuffled(samples, seed)[: train.validation_items]
-            for kind, samples in validation.items()
+    by_item = {r.item_id: r for r in rationales}
+    # The items are sorted by family; a part of them has all families only if they are shuffled.
+    validation_items = shuffled([i for i in items if i.scene_id in held_out], seed)
+
+    def samples_of(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
+        by_mode = supervised_items(store, items, by_item, train.regime, cfg.teacher)
+        return {
+            mode: [s.lazy_sample(frames, frame_count, seed) for s in supervised]
+            for mode, supervised in by_mode.items()
         }
-    else:
-        by_item = {r.item_id: r for r in rationales}
-        # The items are sorted by family; a part of them has all families only if they are shuffled.
-        validation_items = shuffled([i for i in items if i.scene_id in held_out], seed)
 
-        def samples_of(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
-            by_mode = supervised_items(store, items, by_item, train.regime, cfg.teacher)
-            return {
-                mode: [s.lazy_sample(frames, frame_count, seed) for s in supervised]
-                for mode, supervised in by_mode.items()
-            }
-
-        training = samples_of(training_items, seed if train.permute_candidates else None)
-        validation = samples_of(validation_items[: train.validation_items], None)
+    training = samples_of(training_items, seed if train.permute_candidates else None)
+    validation = samples_of(validation_items[: train.validation_items], None)
     samples = [sample for part in training.values() for sample in part]
     check_not_empty(len(samples), f"samples for train.regime={train.regime}")
     check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
@@ -165,6 +152,6 @@ def tokenizer_corpus(store: Store, rationales: list[Rationale]) -> list[str]:
     # Timestamps as prompts have them, with every digit.
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     instructions = [instruction(mode, "cot") for mode in MODES]
-    roles = ["user", "assistant", "Later: "]
-    prompts = [*item_questions, *letters, *instructions, *questions.QUESTIONS, *roles]
+    roles = ["user", "assistant"]
+    prompts = [*item_questions, *letters, *instructions, *roles]
     return [*prompts * 20, *clock, *(r.text for r in rationales)]

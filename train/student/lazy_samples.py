@@ -26,7 +26,7 @@ class LazySample:
         media: Number of images plus number of frame pairs of the clip. With `text`, it determines
             the estimated length in tokens.
         render: Returns the sample in a given epoch.
-        family: Family of the selection item; None for samples of the regime describe.
+        family: Family of the selection item.
     """
 
     text: str

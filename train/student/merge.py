@@ -10,7 +10,6 @@ from transformers import ProcessorMixin
 
 from conf.errors import UserError
 from conf.schema import SftCommand
-from conf.schema.training import WITHOUT_RATIONALES
 from models import compat, loading
 from models.student.collator import Collator, letter_ids
 from teacher.narrate import JOURNAL_FILE, ensure_rationales
@@ -46,7 +45,7 @@ class StudentMerge:
         """Return the run's validation samples, from a benchmark and rationales that must exist."""
         settings = self.settings
         store = open_benchmark(settings.benchmark, root, workers)
-        if settings.train.regime in WITHOUT_RATIONALES:
+        if settings.train.regime == "answer_only":
             return load_datasets(settings, store, [])[1]
         if not (journal := store.folder / JOURNAL_FILE).exists():
             raise UserError(
@@ -79,8 +78,7 @@ class StudentMerge:
     def _outputs(
         self, model: torch.nn.Module, processor: ProcessorMixin, items: Items, autocast: bool
     ) -> ModelOutputs:
-        describes = self.settings.train.regime == "describe"
-        letters = None if describes else LetterAccuracy(letter_ids(processor))
+        letters = LetterAccuracy(letter_ids(processor))
         collator = Collator(processor, self.settings.student.max_length)
         device = next(model.parameters()).device
         outputs = ModelOutputs({})
@@ -92,7 +90,6 @@ class StudentMerge:
                 with torch.autocast(device.type, torch.bfloat16, enabled=autocast):
                     predicted = model(**batch).logits.float()
                 logits.append(predicted[0, :-1].cpu())
-                if letters:
-                    choices = outputs.choices.setdefault(f"{mode}_letter", [])
-                    choices.append(int(letters.reduce(predicted, labels)[0, 0]))
+                choices = outputs.choices.setdefault(f"{mode}_letter", [])
+                choices.append(int(letters.reduce(predicted, labels)[0, 0]))
         return outputs

@@ -10,36 +10,6 @@ from models.student.collator import IGNORED
 from train.student.lazy_samples import StudentDataset
 
 
-class TokenAccuracy:
-    """Share of supervised tokens that have the highest logit, given all correct tokens before them.
-
-    Args:
-        words: Token ids by kind of word. Each kind also has an accuracy of its own, because the
-            words that describe a frame are few among all tokens.
-    """
-
-    def __init__(self, words: dict[str, list[int]]) -> None:
-        self._words = {kind: torch.tensor(ids) for kind, ids in words.items()}
-
-    def reduce(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
-        """Return (B, 2 * (1 + kinds)): counts of correct tokens and of all tokens, kind by kind."""
-        chosen, following = logits[:, :-1].argmax(dim=-1), labels[:, 1:]
-        right = chosen == following
-        counted = [following != IGNORED]
-        counted += [torch.isin(following, ids.to(labels.device)) for ids in self._words.values()]
-        counts = [torch.stack([(right & c).sum(dim=-1), c.sum(dim=-1)], dim=-1) for c in counted]
-        return torch.cat(counts, dim=1)
-
-    def measure(self, prediction: EvalPrediction, samples: StudentDataset) -> dict[str, float]:
-        """Return the accuracy over all tokens and for each kind of word that occurs."""
-        counts = prediction.predictions.sum(axis=0).reshape(-1, 2)
-        return {
-            f"{kind}_accuracy": float(right / counted)
-            for kind, (right, counted) in zip(("token", *self._words), counts, strict=True)
-            if counted
-        }
-
-
 class LetterAccuracy:
     """Share of samples whose correct letter has the highest logit of all letters.
 

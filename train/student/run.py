@@ -20,10 +20,9 @@ from train.common.callbacks import EpochCallback
 from train.student.held_out_answers import HeldOutAnswers
 from train.student.lazy_samples import StudentDataset
 from train.student.length_sampler import LengthSampler
-from train.student.metrics import LetterAccuracy, TokenAccuracy
+from train.student.metrics import LetterAccuracy
 from train.student.trainer import StudentTrainer, TrainerCollator, token_mean
 from train.student.vision_cache import VisionCache
-from train.tiny_base.object_tokens import ObjectTokenCollator, ObjectTokenTrainer, scene_word_tokens
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +45,7 @@ def build_trainer(
     validation: dict[str, StudentDataset],
     checkpoint: Path | None,
 ) -> StudentTrainer:
-    """Audit the model and the longest sample, and return a trainer for the regime.
+    """Audit the model and the longest sample, and return a trainer.
 
     Args:
         cfg: Settings whose train.precision is bf16 or fp32, not auto.
@@ -57,14 +56,7 @@ def build_trainer(
             train.reuse_features is set and the vision tower is trained or sharded.
     """
     train, student = cfg.train, cfg.student
-    if train.regime == "describe":
-        trainer_type = ObjectTokenTrainer
-        collator = ObjectTokenCollator(processor, student.max_length)
-        # Descriptions have no answer letter.
-        accuracy = TokenAccuracy(scene_word_tokens(processor))
-    else:
-        trainer_type, collator = StudentTrainer, Collator(processor, student.max_length)
-        accuracy = LetterAccuracy(letter_ids(processor))
+    collator = Collator(processor, student.max_length)
     lengths = training.lengths(processor.tokenizer, student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit_student(model, processor, student, longest, collator))
@@ -88,7 +80,7 @@ def build_trainer(
         # those of the vision tower unused.
         ddp_find_unused_parameters=not student.lora.rank,
     )
-    return trainer_type(
+    return StudentTrainer(
         model=model,
         args=arguments,
         data_collator=TrainerCollator(collator, digests=cache is not None),
@@ -97,7 +89,7 @@ def build_trainer(
         compute_loss_func=token_mean,
         callbacks=[EpochCallback(training, sampler)],
         sampler=sampler,
-        accuracy=accuracy,
+        accuracy=LetterAccuracy(letter_ids(processor)),
         answers=answers,
         vision_cache=cache,
     )

@@ -26,7 +26,7 @@ from conf.runs import rank
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
 from train.student.held_out_answers import HeldOutAnswers
-from train.student.metrics import LetterAccuracy, TokenAccuracy
+from train.student.metrics import LetterAccuracy
 from train.student.vision_cache import PAIRS, VisionCache, pair_digests
 
 STOPPED = "stopped.json"
@@ -89,7 +89,7 @@ class StudentTrainer(Trainer):
         self,
         *args: Any,
         sampler: Sampler[int],
-        accuracy: TokenAccuracy | LetterAccuracy,
+        accuracy: LetterAccuracy,
         answers: HeldOutAnswers | None = None,
         vision_cache: VisionCache | None = None,
         **settings: Any,

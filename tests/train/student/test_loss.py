@@ -19,7 +19,7 @@ from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train.student.lazy_samples import LazySample, StudentDataset
 from train.student.length_sampler import LengthSampler
-from train.student.metrics import LetterAccuracy, TokenAccuracy
+from train.student.metrics import LetterAccuracy
 from train.student.trainer import token_mean
 
 # The attention of the language tower and of the vision tower.
@@ -170,15 +170,3 @@ def test_each_step_is_sorted_by_length(count) -> None:
     # The samples of a single step have one order.
     assert first != second or count <= 16
     assert second != list(LengthSampler(lengths.tolist(), 16, seed=1)) or count <= 16
-
-
-def test_correct_tokens_are_counted() -> None:
-    labels = torch.tensor([[5, 6, 7, 8], [IGNORED, IGNORED, 7, 8]])
-    logits = torch.nn.functional.one_hot(torch.tensor([[6, 7, 0, 0], [3, 7, 8, 0]]), 10).float()
-    accuracy = TokenAccuracy({"color": [6, 9], "shape": [8], "place": [9]})
-    counts = accuracy.reduce(logits, labels)
-    # The logits of a position predict the next token; unsupervised tokens are not counted.
-    assert counts[:, :2].tolist() == [[2, 3], [2, 2]]
-    metrics = accuracy.measure(EvalPrediction(counts.numpy(), None), StudentDataset([]))
-    # No label is a word of the last kind.
-    assert metrics == {"token_accuracy": 4 / 5, "color_accuracy": 1, "shape_accuracy": 1 / 2}

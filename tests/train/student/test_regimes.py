@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from conf.schema import TeacherConfig
-from conf.schema.training import REGIMES, WITHOUT_RATIONALES
+from conf.schema.training import REGIMES
 from data.records import LETTERS
 from data.store import Store
 from models.student.answer_parser import parse_choice
@@ -21,7 +21,7 @@ from train.student.dataset import SupervisedItem, supervised_items
 from train.student.lazy_samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
-COT = [r for r in REGIMES if r not in WITHOUT_RATIONALES]
+COT = [r for r in REGIMES if r != "answer_only"]
 
 
 def items_of(store: Store, regime: str) -> dict[str, list[SupervisedItem]]:

@@ -1,0 +1,226 @@
+"""Targets of the tiny base: they agree with the oracle, and refer to the right tokens."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from data.records import SelectionItem, sample_prefix_frames
+from data.render.frame_cache import FrameReader
+from data.store import Store
+from train.tiny_base.data import ItemSampler
+from train.tiny_base.heads import PICTURES, OracleHeads, distance, octant, pointing_losses
+from train.tiny_base.oracle_targets import (
+    AHEAD,
+    RATE,
+    ObjectTarget,
+    clip_targets,
+    image_targets,
+    largest_per_token,
+)
+from train.tiny_base.questions import KINDS
+from train.tiny_base.samples import OracleCollator, OracleSample
+from train.tiny_base.trace import NAMING, TRACKING, see, select_tokens, trace_forward
+from train.tiny_base.training import first_tokens, motion_losses, words_losses
+
+GRID = 3
+"""Visual tokens along the side of an image of 96 px."""
+
+
+@pytest.fixture(scope="module")
+def items(micro_store: Store) -> list[SelectionItem]:
+    return [i for i in micro_store.selection("train") if i.prefix_stop - i.prefix_start >= 8]
+
+
+@pytest.fixture(scope="module")
+def sampler(items: list[SelectionItem], frames: FrameReader) -> ItemSampler:
+    return ItemSampler(items, frames, 6, seed=0)
+
+
+@pytest.fixture(scope="module")
+def samples(sampler: ItemSampler) -> list[OracleSample]:
+    return [sampler.sample(item, "compare", "test") for item in sampler.items[:3]]
+
+
+@pytest.fixture
+def collate(processor) -> OracleCollator:
+    return OracleCollator(processor, 1500)
+
+
+@pytest.fixture
+def deep_model(model):
+    """A model with enough layers for all targets."""
+    from models.tiny_qwen3_vl import build_model
+    from tests.tiny_models import SMALL
+
+    model = build_model(
+        replace(SMALL, layers=NAMING + 2, heads=PICTURES, kv_heads=PICTURES),
+        model.config.text_config.vocab_size,
+    )
+    return model.eval()
+
+
+@pytest.fixture
+def heads(deep_model, processor) -> OracleHeads:
+    words = first_tokens(processor)
+    kinds = {kind: words[kind] for kind in ("color", "material", "shape")}
+    return OracleHeads(deep_model.get_input_embeddings(), kinds)
+
+
+def test_clip_targets_are_those_of_the_oracle(micro_store: Store, items) -> None:
+    seen = 0
+    for item in items:
+        scene = micro_store.scene(item.scene_id)
+        shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, 6)
+        names = [o.noun_phrase for o in scene.objects]
+        places = scene.image_positions / scene.image_size
+        for t in clip_targets(scene, shown):
+            earlier, later = shown[2 * t.picture], shown[2 * t.picture + 1]
+            k = names.index(t.name)
+            assert t.place == pytest.approx(places[later, k])
+            moved = np.multiply(t.velocity, (later - earlier) / RATE)
+            assert places[earlier, k] + moved == pytest.approx(places[later, k], nan_ok=True)
+            for h, ahead in zip(AHEAD, t.ahead, strict=True):
+                if not np.isnan(ahead).any():
+                    assert np.add(t.place, ahead) == pytest.approx(places[later + h, k])
+            assert np.isnan(t.since).all()
+            seen += 1
+    assert seen > 3 * len(items)
+
+
+def test_image_targets_refer_to_the_end_of_the_clip(micro_store: Store, items) -> None:
+    scene = micro_store.scene(items[0].scene_id)
+    stop, later = items[0].prefix_stop, items[0].target_frame
+    after = {t.name: t for t in image_targets(scene, later, 3, (scene, stop))}
+    before = {t.name: t for t in image_targets(scene, stop, 3, None)}
+    assert after.keys() & before.keys()
+    for name in after.keys() & before.keys():
+        moved = np.subtract(after[name].place, before[name].place)
+        assert after[name].since == pytest.approx(moved)
+        assert np.isnan([*after[name].velocity, *before[name].since]).all()
+
+
+def test_a_token_has_the_target_of_which_most_is_visible() -> None:
+    one = ObjectTarget("red metal cube", 0, (0.1, 0.1), visible=0.6)
+    other = replace(one, name="blue metal cube", place=(0.2, 0.3), visible=0.9)
+    elsewhere = replace(one, name="gray metal cube", place=(0.2, 0.4))
+    assert [t.cell(GRID) for t in (one, other, elsewhere)] == [0, 0, 3]
+    assert largest_per_token([one, other, elsewhere], GRID) == [other, elsewhere]
+    assert replace(one, place=(1.2, -0.1)).cell(GRID) == GRID - 1
+
+
+def test_names_end_where_the_text_names_objects(samples, collate, processor) -> None:
+    batch, targets = collate(samples)
+    rows = targets.names[:, 0].tolist()
+    assert {*rows} == {0, 1, 2}
+    for row, position in targets.names.tolist():
+        text = processor.decode(batch["input_ids"][row, : position + 1])
+        assert text.endswith(("cube", "sphere", "cylinder"))
+    for (row, position), found, places in zip(
+        targets.names.tolist(), targets.found.tolist(), targets.places, strict=True
+    ):
+        text = processor.decode(batch["input_ids"][row, : position + 1])
+        for k, token in enumerate(found):
+            place = places[2 * k : 2 * k + 2] + 0.5
+            assert (token == -1) == bool(place.isnan().all())
+            if token >= 0:
+                (t,) = (
+                    t
+                    for t in samples[row].targets
+                    if t.picture == samples[row].last + k and text.endswith(t.name)
+                )
+                assert token == t.picture * GRID**2 + t.cell(GRID)
+                assert place.tolist() == pytest.approx(t.place, abs=1e-6)
+
+
+def test_vision_tower_alone_gives_what_the_whole_model_embeds(samples, collate, deep_model) -> None:
+    batch, targets = collate(samples)
+    inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
+    with torch.no_grad():
+        with trace_forward(deep_model.model.language_model, batch["attention_mask"]) as trace:
+            deep_model.model(**inputs)
+        alone = see(deep_model, batch)
+    torch.testing.assert_close(alone, select_tokens(trace.embedded, targets.visual))
+
+
+@pytest.mark.parametrize("layer", [TRACKING, NAMING])
+def test_traced_attention_is_that_of_the_model(samples, collate, deep_model, layer: int) -> None:
+    batch, targets = collate(samples)
+    inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
+    deep_model.set_attn_implementation("eager")
+    with torch.no_grad():
+        with trace_forward(deep_model.model.language_model, batch["attention_mask"]) as trace:
+            attention = deep_model(**inputs, output_attentions=True).attentions[layer]
+        row = torch.tensor([0, 1, 2, 2])
+        query = torch.tensor([-1, -5, -1, -2]) + attention.shape[-1]
+        key = targets.visual[row, torch.tensor([0, 4, 8, 9])]
+        logarithms = trace.log_attention(layer, 1, row, query, key)
+    torch.testing.assert_close(logarithms.exp(), attention[row, 1, query, key])
+
+
+def test_losses_train_the_layers_that_they_refer_to(samples, collate, deep_model, heads) -> None:
+    batch, targets = collate(samples)
+    losses = motion_losses(deep_model, heads, batch, targets)
+    losses["place"].backward(retain_graph=True)
+    layers = deep_model.model.language_model.layers
+    weights = [layer.mlp.down_proj.weight.grad for layer in layers]
+    assert [w is not None for w in weights] == [True, True, True, False, False]
+    deep_model.zero_grad(set_to_none=True)
+    losses["color"].backward()
+    assert layers[0].mlp.down_proj.weight.grad is None
+    assert deep_model.model.visual.blocks[0].attn.qkv.weight.grad is not None
+
+
+def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, heads) -> None:
+    batch, targets = collate(samples)
+    optimizer = torch.optim.Adam([*deep_model.parameters(), *heads.parameters()], lr=3e-3)
+    totals = []
+    for _ in range(8):
+        losses = words_losses(deep_model, heads, batch, targets)
+        assert {"words", "track", "find 0", "named places", "color", "since"} <= losses.keys()
+        total = sum(losses.values())
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+        totals.append(total.item())
+    assert totals[-1] < 0.8 * totals[0]
+
+
+def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate) -> None:
+    class Certain:
+        def log_attention(self, layer, head, row, query, key):
+            return torch.zeros(len(row))
+
+    _, targets = collate(samples)
+    losses = pointing_losses(Certain(), targets)
+    assert len(losses) == 6
+    assert not any(loss.item() for loss in losses.values())
+
+
+def test_unknown_values_do_not_count() -> None:
+    true = torch.tensor([[0.2, 0.1], [float("nan")] * 2])
+    predicted = torch.tensor([[0.6, 0.3], [9.0, 9.0]])
+    assert distance(predicted, true, 3.0).item() == pytest.approx(0, abs=1e-12)
+    assert distance(predicted, true * float("nan"), 3.0).item() == 0
+    assert distance(predicted + 0.2, true, 3.0).item() == pytest.approx(2 * (0.2 - 0.05))
+
+
+def test_headings_are_eighths_of_the_circle() -> None:
+    angles = torch.arange(0, 360, 45) * torch.pi / 180
+    vectors = torch.stack([angles.cos(), angles.sin()], dim=1)
+    assert len(octant(vectors).unique()) == 8
+    assert octant(vectors * 3 + 0.01).equal(octant(vectors))
+
+
+def test_samples_depend_on_seed_and_step_only(sampler: ItemSampler) -> None:
+    first, again, later = (sampler.batch("words", step, 4) for step in (1, 1, 5))
+    assert [s.sample.response for s in first] == [s.sample.response for s in again]
+    assert [s.sample.response for s in first] != [s.sample.response for s in later]
+    epoch = [
+        s.sample.sample_id for k in range(len(sampler.items)) for s in sampler.batch("motion", k, 1)
+    ]
+    assert sorted(epoch) == sorted(item.item_id for item in sampler.items)
+    assert len(KINDS) == 4

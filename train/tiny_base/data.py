@@ -1,0 +1,114 @@
+"""The items of the tiny base: those it is trained on, and those of held-out scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from data.records import LETTERS, SelectionItem
+from data.render.frame_cache import FrameReader
+from data.store import Store
+from models.student.prompts import MODES, answer_line, instruction
+from teacher.candidate_letters import reorder_candidates
+from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.relations import Bounds
+from train.common.held_out import check_not_empty, held_out_scenes
+from train.student.dataset import uses_only
+from train.student.lazy_samples import seeded_rng
+from train.tiny_base.questions import KINDS, QUESTIONS, Question
+from train.tiny_base.samples import OracleSample, make_sample
+
+SILENT = Question("", "")
+"""The question of the stages without words."""
+CORPUS_ITEMS = 800
+"""Number of items whose texts the tokenizer is trained on."""
+
+
+def split_items(
+    store: Store, frames: FrameReader
+) -> tuple[list[SelectionItem], list[SelectionItem]]:
+    """Return the training items, and the items of held-out scenes. Items with too short a prefix to
+    describe are left out."""
+    held_out = held_out_scenes(store)
+    training_scenes = set(store.scene_ids("train")) - held_out
+    items = [
+        item
+        for item in store.selection("train")
+        if extract_predicates(item, frames.scene(item.scene_id), frames.scene) is not None
+    ]
+    training = [item for item in items if uses_only(item, training_scenes)]
+    validation = [item for item in items if item.scene_id in held_out]
+    check_not_empty(len(training), "training items")
+    check_not_empty(len(validation), "items of held-out training scenes")
+    return training, validation
+
+
+@dataclass(frozen=True)
+class ItemSampler:
+    """Makes the samples of each stage and step."""
+
+    items: Sequence[SelectionItem]
+    frames: FrameReader
+    frame_count: int
+    seed: int
+
+    def batch(self, stage: str, step: int, size: int) -> list[OracleSample]:
+        """Return the samples of a step. All ask the same kind of question, so that they show the
+        same number of pictures."""
+        samples = []
+        for position in range(step * size, (step + 1) * size):
+            epoch, index = divmod(position, len(self.items))
+            order = seeded_rng(self.seed, stage, epoch).permutation(len(self.items))
+            kind = [*KINDS][step % len(KINDS)] if stage == "words" else None
+            samples.append(self.sample(self.items[order[index]], kind, f"{stage} {epoch}"))
+        return samples
+
+    def sample(self, item: SelectionItem, kind: str | None, key: str) -> OracleSample:
+        """Return a sample of an item, with its candidates in random order.
+
+        Args:
+            kind: The kind of question; None asks none.
+            key: Seed of the order and of the question, with the run's seed and the item.
+        """
+        item, question = ask(item, kind, self.frames, self.seed, key)
+        return make_sample(item, question, self.frames, self.frame_count)
+
+
+def ask(
+    item: SelectionItem, kind: str | None, frames: FrameReader, *keys: int | str
+) -> tuple[SelectionItem, Question]:
+    """Return an item with its candidates in random order, and a question of a kind about it."""
+    rng = seeded_rng(*keys, item.item_id)
+    item = reorder_candidates(item, rng.permutation(len(LETTERS)).tolist())
+    if kind is None:
+        return item, SILENT
+    scene = frames.scene(item.scene_id)
+    predicates = extract_predicates(item, scene, frames.scene, Bounds())
+    return item, KINDS[kind](predicates, item, rng)
+
+
+def tokenizer_corpus(items: Sequence[SelectionItem], frames: FrameReader, seed: int) -> list[str]:
+    """Return texts to train the tokenizer on: the answers of the base, and prompts of students."""
+    step = max(1, len(items) // CORPUS_ITEMS)
+    answers = [
+        ask(item, kind, frames, seed, "tokenizer")[1].answer
+        for item in items[::step]
+        for kind in KINDS
+    ]
+    letters = [
+        f"\nCandidate {x}: \nCandidate {x} matches: every object is where it should be.\n"
+        f"Candidate {x} does not match: it shows other objects and lacks\n{answer_line(x)}"
+        for x in LETTERS
+    ]
+    # Timestamps as prompts have them, with every digit.
+    clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
+    instructions = [instruction(mode, "cot") for mode in MODES]
+    outcome = [
+        "Outcome: This layout is that of candidate",
+        "shows this layout.",
+        "user",
+        "assistant",
+    ]
+    asked = sorted({item.question for item in items})
+    prompts = [*asked, *letters, *instructions, *QUESTIONS, *outcome]
+    return [*prompts * 20, *clock, *answers]

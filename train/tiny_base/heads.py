@@ -1,0 +1,223 @@
+"""Throw-away heads that train the tiny base on what the oracle knows, and their losses.
+
+Words are a thin signal: a text names a few objects, while the oracle knows every object in every
+picture. The heads are linear, so the base itself has to represent what they predict. They read
+
+    "seen"   visual tokens, as the vision tower gives them: colour, material, shape, whether the
+             centre of an object is in the token, where in the token, and velocity
+    "known"  visual tokens after the layer `MIDDLE`: place, whether the object moves, velocity,
+             displacements ahead, and displacement since the end of the clip
+    "named"  names of objects in a text after the layer `NAMING`: in which pictures the object is
+             visible and where, and its displacements ahead
+
+A text attends to what earlier layers stored at the visual tokens, so static properties are trained
+at the tower's output and motion in the middle layers. Two further losses teach attention heads to
+find an object: at a visual token of a candidate, the same object at the end of the clip (layer
+`TRACKING`); at an object's name in a text, the object in each picture (layer `NAMING`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
+
+from data.records import COLORS, LETTERS, MATERIALS, SHAPES
+from train.tiny_base.oracle_targets import AHEAD
+from train.tiny_base.trace import NAMING, TRACKING, Trace
+
+WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
+PICTURES = 1 + len(LETTERS)
+"""Pictures in which a named object is found: the last one of the clip, and the candidates."""
+AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
+DISPLACEMENTS = ("velocity", *AHEADS, "since")
+SCALES = {"place": 3.0, "inside": 1.0} | dict.fromkeys(DISPLACEMENTS, 5.0)
+"""Factors on places and displacements, so that their losses are of similar size."""
+BEND = 0.1
+"""Scaled error above which the loss of a place or displacement is linear."""
+MOVING = 0.012
+"""An object moves if its velocity, as a share of the image in 10 frames, is above this."""
+
+
+@dataclass(frozen=True)
+class OracleTargets:
+    """Targets of a batch of B samples with T visual tokens each, N objects at visual tokens, K
+    pairs of tokens to track, and M names in texts. Tokens are indices into `visual`.
+
+    Attributes:
+        visual: (B, T) positions of the visual tokens in the sequence.
+        presence: (B, T) 1 where the centre of an object is in the token, otherwise 0.
+        objects: (N, 2) row of the batch and token.
+        truth: Properties of the N objects, see `oracle_targets.stack_targets`.
+        inside: (N, 2) place in the token, from -0.5 to 0.5.
+        tracked: (K, 3) row, token of a candidate, and token of the same object in the clip.
+        names: (M, 2) row and position of a name's last token.
+        found: (M, PICTURES) token of the named object in each picture, or -1.
+        places: (M, 2 * PICTURES) its places, NaN where it is not visible.
+        ahead: (M, 2 * len(AHEAD)) its displacements ahead, or NaN.
+    """
+
+    visual: Tensor
+    presence: Tensor
+    objects: Tensor
+    truth: dict[str, Tensor]
+    inside: Tensor
+    tracked: Tensor
+    names: Tensor
+    found: Tensor
+    places: Tensor
+    ahead: Tensor
+
+
+class OracleHeads(nn.Module):
+    """The linear heads.
+
+    Colours, materials and shapes have no heads of their own: the logit of a word is the product of
+    the visual token and the word's embedding. A name in a text thus resembles the visual tokens of
+    its object, and attention finds these.
+
+    Args:
+        embedding: The embedding of the language model's tokens. The vision tower's output has the
+            same width.
+        word_ids: Tokens of the words of each kind of `WORDS`.
+    """
+
+    def __init__(self, embedding: nn.Embedding, word_ids: Mapping[str, list[int]]) -> None:
+        super().__init__()
+        # In a tuple, the embedding is no submodule: the heads do not own it.
+        self._embedding = (embedding,)
+        self._word_ids = {kind: torch.tensor(ids) for kind, ids in word_ids.items()}
+        hidden = embedding.embedding_dim
+
+        def heads(widths: Mapping[str, int]) -> nn.ModuleDict:
+            return nn.ModuleDict({name: nn.Linear(hidden, n) for name, n in widths.items()})
+
+        self.seen = heads({"presence": 1, "inside": 2, "velocity": 2})
+        self.known = heads({"place": 2, "moving": 1} | dict.fromkeys(DISPLACEMENTS, 2))
+        self.named = heads({"shown": PICTURES, "places": 2 * PICTURES, "ahead": 2 * len(AHEAD)})
+        self.norms = nn.ModuleDict({n: nn.LayerNorm(hidden) for n in ("seen", "known", "named")})
+
+    def seen_losses(self, tokens: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+        """Return the losses of the vision tower's output at all visual tokens, (B, T, H)."""
+        tokens = self.norms["seen"](tokens)
+        row, token = targets.objects.T
+        seen = tokens[row, token]
+        presence = self.seen["presence"](tokens)[..., 0]
+        losses = {"presence": 2 * binary_cross_entropy_with_logits(presence, targets.presence)}
+        for kind, logits in self.word_logits(seen).items():
+            losses[kind] = cross_entropy(logits, targets.truth[kind])
+        truth = targets.truth | {"inside": targets.inside}
+        for name in ("inside", "velocity"):
+            losses[f"seen {name}"] = distance(self.seen[name](seen), truth[name], SCALES[name])
+        return losses
+
+    def word_logits(self, seen: Tensor) -> dict[str, Tensor]:
+        """Return the logits of the words of each kind for normalised visual tokens, (N, H)."""
+        weight = self._embedding[0].weight
+        return {kind: seen @ weight[ids].T for kind, ids in self._word_ids.items()}
+
+    def known_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+        """Return the losses at all visual tokens after the layer `MIDDLE`, (B, T, H)."""
+        known = self.norms["known"](hidden[targets.objects[:, 0], targets.objects[:, 1]])
+        truth = targets.truth | {"place": targets.truth["place"] - 0.5}
+        losses = {
+            name: distance(self.known[name](known), truth[name], SCALES[name])
+            for name in ("place", *DISPLACEMENTS)
+        }
+        observed = ~truth["velocity"][:, 0].isnan()
+        if observed.any():
+            moves = (truth["velocity"][observed].norm(dim=1) > MOVING).float()
+            moving = self.known["moving"](known[observed])[:, 0]
+            losses["moving"] = binary_cross_entropy_with_logits(moving, moves)
+        return losses
+
+    def measures(
+        self, tokens: Tensor, hidden: Tensor | None, targets: OracleTargets
+    ) -> dict[str, Tensor]:
+        """Return what the heads read correctly, as in `seen_losses` and `known_losses`.
+
+        Args:
+            hidden: None leaves out what is read in the middle layers.
+
+        Returns:
+            `color`, `material` and `shape` (N,), whether the word is right; `moving` and, for
+            moving objects, `heading` (one of eight), likewise; and errors as shares of the image:
+            `place_error`, and `<displacement>_error` beside `<displacement>_still`, the error of
+            staying put, of objects that are displaced.
+        """
+        truth = targets.truth
+        row, token = targets.objects.T
+        seen = self.norms["seen"](tokens)[row, token]
+        words = self.word_logits(seen)
+        found = {kind: logits.argmax(dim=-1) == truth[kind] for kind, logits in words.items()}
+        moves = truth["velocity"].norm(dim=1) > MOVING
+        if hidden is None:
+            velocity = self.seen["velocity"](seen)
+            found["heading"] = (octant(velocity) == octant(truth["velocity"]))[moves]
+            return found
+        known = self.norms["known"](hidden[row, token])
+        read = {
+            name: self.known[name](known).float() / SCALES[name]
+            for name in SCALES
+            if name in self.known
+        }
+        observed = ~truth["velocity"][:, 0].isnan()
+        found["moving"] = ((self.known["moving"](known)[:, 0] > 0) == moves)[observed]
+        found["heading"] = (octant(read["velocity"]) == octant(truth["velocity"]))[moves]
+        found["place_error"] = (read["place"] - (truth["place"] - 0.5)).norm(dim=1)
+        for name in (*AHEADS, "since"):
+            distances = truth[name].norm(dim=1)
+            # An image has no velocity; an object may have moved since the clip.
+            displaced = moves & ~distances.isnan() if name != "since" else distances > MOVING
+            found[f"{name}_error"] = (read[name] - truth[name]).norm(dim=1)[displaced]
+            found[f"{name}_still"] = distances[displaced]
+        return found
+
+    def named_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+        """Return the losses at names in texts, from the output of the layer `NAMING`, (B, L, H)."""
+        row, at = targets.names.T
+        named = self.norms["named"](hidden[row, at])
+        shown = (targets.found >= 0).float()
+        return {
+            "shown": binary_cross_entropy_with_logits(self.named["shown"](named), shown),
+            "places": distance(self.named["places"](named), targets.places, SCALES["place"]),
+            "ahead": distance(self.named["ahead"](named), targets.ahead, SCALES["since"]),
+        }
+
+
+def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
+    """Return the losses of the attention heads that find objects: the negative logarithm of the
+    attention weight on the object's token.
+
+    At a visual token, head 0 of layer `TRACKING` finds the object at the end of the clip. At a
+    name, head k of layer `NAMING` finds the object in picture k.
+    """
+    losses = {}
+    row, start, end = targets.tracked.T
+    if len(row):
+        query, key = targets.visual[row, start], targets.visual[row, end]
+        losses["track"] = -trace.log_attention(TRACKING, 0, row, query, key).mean()
+    for head in range(PICTURES):
+        found = targets.found[:, head]
+        row, query = targets.names[found >= 0].T
+        if len(row):
+            key = targets.visual[row, found[found >= 0]]
+            losses[f"find {head}"] = -trace.log_attention(NAMING, head, row, query, key).mean()
+    return losses
+
+
+def distance(predicted: Tensor, true: Tensor, scale: float) -> Tensor:
+    """Return the mean smooth absolute error of the elements of `true` that are not NaN."""
+    known = ~true.isnan()
+    if not known.any():
+        return predicted.sum() * 0
+    return 2 * smooth_l1_loss(predicted[known], true[known] * scale, beta=BEND)
+
+
+def octant(vectors: Tensor) -> Tensor:
+    """Return which of eight headings vectors (N, 2) have."""
+    return torch.round(torch.atan2(vectors[:, 1], vectors[:, 0]) / (math.pi / 4)) % 8

@@ -1,0 +1,151 @@
+"""What the oracle knows of the objects in a sample's pictures, as targets of dense training.
+
+A picture is a pair of a clip's frames, which the vision tower encodes together, or an image. Its
+visual tokens are the cells of a square grid. Every clearly visible object gives a target at the
+token that contains its centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from data.records import COLORS, MATERIALS, SHAPES, Scene
+
+CLEARLY_VISIBLE = 0.3
+"""An object has a target if its visible fraction is above this."""
+HIDDEN = 0.05
+"""A text may name an object if its visible fraction is above this."""
+AHEAD = (10, 25)
+"""Frames ahead for which displacements are predicted."""
+RATE = 10
+"""A velocity is the displacement during this many frames."""
+FARTHEST = 1.0
+"""Displacements above this share of the image are left out: the object is far outside of it."""
+UNKNOWN = (float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class ObjectTarget:
+    """A visible object in a picture. Places and displacements are shares of the picture's width and
+    height; NaN where the picture does not determine them.
+
+    Attributes:
+        name: Noun phrase of the object.
+        picture: Index of the picture; the pictures of the clip precede the images.
+        place: Column and row of the object's centre, from 0 to 1.
+        visible: Visible fraction.
+        velocity: Displacement during `RATE` frames; NaN in images.
+        ahead: Displacement during each number of frames of `AHEAD`; NaN in images.
+        since: Displacement from the object's place at the end of the clip; NaN in the clip and in
+            images of other scenes.
+    """
+
+    name: str
+    picture: int
+    place: tuple[float, float]
+    visible: float = 1.0
+    velocity: tuple[float, float] = UNKNOWN
+    ahead: tuple[tuple[float, float], ...] = (UNKNOWN,) * len(AHEAD)
+    since: tuple[float, float] = UNKNOWN
+
+    def cell(self, grid: int) -> int:
+        """Return the index of the object's token in its picture, which has grid x grid tokens."""
+        column, row = (min(max(int(share * grid), 0), grid - 1) for share in self.place)
+        return row * grid + column
+
+
+def clip_targets(scene: Scene, frames: Sequence[int]) -> Iterator[ObjectTarget]:
+    """Yield the targets of a clip. Their places are those in the later frame of each pair."""
+    pairs = zip(frames[::2], [*frames[1::2], frames[-1]], strict=False)
+    for picture, (earlier, later) in enumerate(pairs):
+        for k in visible_objects(scene, later):
+            yield ObjectTarget(
+                scene.objects[k].noun_phrase,
+                picture,
+                _place(scene, later, k),
+                _fraction(scene, later, k),
+                _displacement(scene, k, earlier, later, RATE / max(later - earlier, 1)),
+                tuple(_displacement(scene, k, later, later + h) for h in AHEAD),
+            )
+
+
+def image_targets(
+    scene: Scene, frame: int, picture: int, clip: tuple[Scene, int] | None
+) -> Iterator[ObjectTarget]:
+    """Yield the targets of an image.
+
+    Args:
+        clip: The scene and the last frame of the clip before the image, if the image shows what
+            becomes of this scene.
+    """
+    for k in visible_objects(scene, frame):
+        since = UNKNOWN
+        if clip is not None and k in visible_objects(*clip):
+            moved = np.subtract(_place(scene, frame, k), _place(*clip, k))
+            since = tuple(moved.tolist())
+        place, visible = _place(scene, frame, k), _fraction(scene, frame, k)
+        name = scene.objects[k].noun_phrase
+        yield ObjectTarget(name, picture, place, visible, since=since)
+
+
+def visible_objects(scene: Scene, frame: int, least: float = CLEARLY_VISIBLE) -> list[int]:
+    """Return the indices of the objects whose visible fraction in a frame is above `least`."""
+    # A fraction that the simulator does not record is NaN.
+    shown = scene.in_view[frame] & ~(scene.visible_fraction[frame] <= least)
+    return np.flatnonzero(shown).tolist()
+
+
+def _place(scene: Scene, frame: int, k: int) -> tuple[float, float]:
+    return tuple((scene.image_positions[frame, k] / scene.image_size).tolist())
+
+
+def _fraction(scene: Scene, frame: int, k: int) -> float:
+    fraction = float(scene.visible_fraction[frame, k])
+    return 1.0 if np.isnan(fraction) else fraction
+
+
+def _displacement(
+    scene: Scene, k: int, frame: int, later: int, factor: float = 1.0
+) -> tuple[float, float]:
+    if later >= scene.frames:
+        return UNKNOWN
+    moved = np.subtract(_place(scene, later, k), _place(scene, frame, k)) * factor
+    return tuple(moved.tolist()) if np.abs(moved).max() <= FARTHEST else UNKNOWN
+
+
+def largest_per_token(targets: Sequence[ObjectTarget], grid: int) -> list[ObjectTarget]:
+    """Keep one target per token: that of the object of which most is visible."""
+    best: dict[tuple[int, int], ObjectTarget] = {}
+    for target in targets:
+        key = target.picture, target.cell(grid)
+        if key not in best or best[key].visible < target.visible:
+            best[key] = target
+    return list(best.values())
+
+
+def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, torch.Tensor]:
+    """Return the properties of N targets as tensors.
+
+    Returns:
+        `color`, `material` and `shape` (N,) indices; `place`, `velocity`, `since` and `ahead_<h>`
+        (N, 2) for each h of `AHEAD`.
+    """
+    words = np.array([t.name.split() for t in targets]).reshape(-1, 3)
+    kinds = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
+    stacked = {
+        kind: torch.tensor([names.index(word) for word in words[:, k].tolist()], dtype=torch.long)
+        for k, (kind, names) in enumerate(kinds.items())
+    }
+
+    def pairs(values: list[tuple[float, float]]) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float32).reshape(-1, 2)
+
+    for name in ("place", "velocity", "since"):
+        stacked[name] = pairs([getattr(t, name) for t in targets])
+    for k, h in enumerate(AHEAD):
+        stacked[f"ahead_{h}"] = pairs([t.ahead[k] for t in targets])
+    return stacked

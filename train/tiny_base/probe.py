@@ -1,0 +1,83 @@
+"""Measure what the tiny base knows of held-out scenes: read by linear heads, and in its words."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from transformers import PreTrainedModel
+
+from train.tiny_base.heads import OracleHeads
+from train.tiny_base.trace import MIDDLE, see, select_tokens, trace_forward
+
+if TYPE_CHECKING:
+    from train.tiny_base.samples import OracleCollator, OracleSample
+
+BATCH = 16
+
+
+class Probe:
+    """Measures a model and its heads on held-out samples.
+
+    Args:
+        samples: Held-out samples without words by stage.
+    """
+
+    def __init__(
+        self,
+        model: PreTrainedModel,
+        heads: OracleHeads,
+        collate: OracleCollator,
+        samples: Sequence[OracleSample],
+        worded: dict[str, Sequence[OracleSample]],
+        word_ids: dict[str, list[int]],
+        bf16: bool,
+    ) -> None:
+        self.model, self.heads, self.collate = model, heads, collate
+        self.samples, self.worded, self.bf16 = samples, worded, bf16
+        self.word_ids = {kind: torch.tensor(ids) for kind, ids in word_ids.items()}
+
+    @torch.no_grad()
+    def measure(self, stage: str) -> dict[str, float]:
+        """Return the measures of a stage by name."""
+        self.model.eval()
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
+            measures = self._read_heads(with_motion=stage != "eyes")
+            if stage == "words":
+                measures |= self._follow_words()
+        return measures
+
+    def _read_heads(self, with_motion: bool) -> dict[str, float]:
+        found: dict[str, list[Tensor]] = defaultdict(list)
+        for k in range(0, len(self.samples), BATCH):
+            batch, targets = self.collate(self.samples[k : k + BATCH])
+            if not with_motion:
+                tokens, hidden = see(self.model, batch), None
+            else:
+                inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
+                language, mask = self.model.model.language_model, batch["attention_mask"]
+                with trace_forward(language, mask) as trace:
+                    self.model.model(**inputs, use_cache=False)
+                tokens = select_tokens(trace.embedded, targets.visual)
+                hidden = select_tokens(trace.outputs[MIDDLE], targets.visual)
+            for name, values in self.heads.measures(tokens, hidden, targets).items():
+                found[name].append(values.float())
+        return {name: torch.cat(values).mean().item() for name, values in found.items()}
+
+    def _follow_words(self) -> dict[str, float]:
+        """Return the share of words of each kind that the model predicts, given the correct words
+        before them."""
+        right: dict[str, list[Tensor]] = defaultdict(list)
+        for kind, samples in self.worded.items():
+            for k in range(0, len(samples), BATCH):
+                batch, _ = self.collate(samples[k : k + BATCH])
+                labels = batch.pop("labels")[:, 1:]
+                predicted = self.model(**batch, use_cache=False).logits[:, :-1].argmax(dim=-1)
+                for words, ids in self.word_ids.items():
+                    of_kind = torch.isin(labels, ids)
+                    right[f"words_{words}/{kind}"].append((predicted == labels)[of_kind].float())
+        joined = {name: torch.cat(values) for name, values in right.items()}
+        return {name: values.mean().item() for name, values in joined.items() if len(values)}

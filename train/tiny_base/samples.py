@@ -1,0 +1,155 @@
+"""Samples of the tiny base: prompts as students read them, with what the oracle knows of them.
+
+A sample shows a clip and four candidates, as a selection prompt does, and asks one of the questions
+of `train.tiny_base.questions`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from transformers import ProcessorMixin
+
+from data.records import (
+    COLORS,
+    LETTERS,
+    MATERIALS,
+    SHAPES,
+    SelectionItem,
+    original_scene_id,
+    sample_prefix_frames,
+)
+from data.render.frame_cache import FrameReader
+from models.student.collator import Collator
+from models.student.prompts import Sample, conversation, load_clip
+from train.tiny_base.heads import PICTURES, OracleTargets
+from train.tiny_base.oracle_targets import (
+    AHEAD,
+    ObjectTarget,
+    clip_targets,
+    image_targets,
+    largest_per_token,
+    stack_targets,
+)
+from train.tiny_base.questions import Question
+
+NAME = re.compile(" ".join(f"(?:{'|'.join(words)})" for words in (COLORS, MATERIALS, SHAPES)))
+"""Matches the noun phrase of an object."""
+
+
+@dataclass(frozen=True)
+class OracleSample:
+    """A sample, and the visible objects in its pictures.
+
+    Attributes:
+        last: Index of the last picture of the clip, which the candidates follow; -1 without clip.
+    """
+
+    sample: Sample
+    targets: tuple[ObjectTarget, ...]
+    last: int
+
+
+def make_sample(
+    item: SelectionItem, question: Question, frames: FrameReader, frame_count: int
+) -> OracleSample:
+    """Return the sample of a question about an item."""
+    scene = frames.scene(item.scene_id)
+    targets: list[ObjectTarget] = []
+    parts: list[str | np.ndarray] = [item.question]
+    clip, last = None, -1
+    if question.clip:
+        shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, frame_count)
+        clip, last = load_clip(item.scene_id, shown, frames), (len(shown) + 1) // 2 - 1
+        targets += clip_targets(scene, shown)
+    if question.candidates:
+        for picture, (letter, c) in enumerate(zip(LETTERS, item.candidates, strict=True), last + 1):
+            follows = original_scene_id(c.scene_id) == original_scene_id(item.scene_id)
+            before = (scene, item.prefix_stop) if follows and clip else None
+            targets += image_targets(frames.scene(c.scene_id), c.frame, picture, before)
+            parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
+    parts.append(f"\n{question.text}")
+    sample = conversation(item.item_id, parts, question.answer, clip)
+    return OracleSample(sample, tuple(targets), last)
+
+
+class OracleCollator:
+    """Makes batches of `OracleSample`s: the tensors of `Collator`, and `OracleTargets`."""
+
+    def __init__(self, processor: ProcessorMixin, max_length: int) -> None:
+        self._processor = processor
+        self._collate = Collator(processor, max_length)
+
+    def __call__(self, samples: Sequence[OracleSample]) -> tuple[dict[str, Any], OracleTargets]:
+        batch = self._collate([s.sample for s in samples])
+        ids = batch["input_ids"]
+        media = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
+        visual = torch.isin(ids, media).nonzero()[:, 1].reshape(len(samples), -1)
+        tokens = visual.shape[1] // samples[0].sample.pictures
+        return batch, self._stack(samples, visual, round(tokens**0.5), ids.shape[1])
+
+    def _stack(
+        self, samples: Sequence[OracleSample], visual: Tensor, grid: int, length: int
+    ) -> OracleTargets:
+        presence = torch.zeros(visual.shape)
+        kept: list[ObjectTarget] = []
+        objects: list[tuple[int, int]] = []
+        tracked: list[tuple[int, int, int]] = []
+        names: list[tuple[int, int]] = []
+        found: list[list[int]] = []
+        places: list[list[float]] = []
+        ahead: list[list[float]] = []
+        for row, s in enumerate(samples):
+            largest = largest_per_token(s.targets, grid)
+            at = {id(t): t.picture * grid**2 + t.cell(grid) for t in s.targets}
+            kept += largest
+            objects += [(row, at[id(t)]) for t in largest]
+            presence[row, [at[id(t)] for t in largest]] = 1
+            where = {(t.picture, t.name): t for t in s.targets}
+            for t in largest:
+                if t.picture > s.last and (s.last, t.name) in where and not np.isnan(t.since[0]):
+                    tracked.append((row, at[id(t)], at[id(where[s.last, t.name])]))
+            for name, position in self._names(s.sample.response or ""):
+                names.append((row, length + position))
+                pictures = [where.get((s.last + k, name)) for k in range(PICTURES)]
+                found.append([at[id(t)] if t else -1 for t in pictures])
+                nowhere = (float("nan"),) * 2
+                places.append([x for t in pictures for x in (t.place if t else nowhere)])
+                unknown = (nowhere,) * len(AHEAD)
+                ahead.append(
+                    [x for d in (pictures[0].ahead if pictures[0] else unknown) for x in d]
+                )
+        truth = stack_targets(kept)
+        return OracleTargets(
+            visual=visual,
+            presence=presence,
+            objects=torch.tensor(objects, dtype=torch.long).reshape(-1, 2),
+            truth=truth,
+            inside=truth["place"] * grid % 1 - 0.5,
+            tracked=torch.tensor(tracked, dtype=torch.long).reshape(-1, 3),
+            names=torch.tensor(names, dtype=torch.long).reshape(-1, 2),
+            found=torch.tensor(found, dtype=torch.long).reshape(-1, PICTURES),
+            places=torch.tensor(places).reshape(-1, 2 * PICTURES) - 0.5,
+            ahead=torch.tensor(ahead).reshape(-1, 2 * len(AHEAD)),
+        )
+
+    def _names(self, response: str) -> list[tuple[str, int]]:
+        """Return the names of objects in a response, and the positions of their last tokens counted
+        from the end of the sequence, as negative numbers."""
+        tokens = self._processor.tokenizer(
+            response, add_special_tokens=False, return_offsets_mapping=True
+        )
+        offsets = tokens["offset_mapping"]
+        index = {end: k for k, (_, end) in enumerate(offsets)}
+        # The token that ends the turn follows the response.
+        return [
+            (match.group(), index[match.end()] - len(offsets) - 1)
+            for match in NAME.finditer(response)
+            if match.end() in index
+        ]

@@ -1,0 +1,106 @@
+"""The states of the model that the targets of the tiny base refer to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from transformers import PreTrainedModel
+from transformers.models.qwen3_vl.modeling_qwen3_vl import apply_rotary_pos_emb
+
+from models.student.collator import MEDIA
+
+TRACKING, MIDDLE, NAMING = 1, 2, 3
+"""Indices of the language layers that the targets refer to (see `train.tiny_base.heads`)."""
+
+
+@dataclass
+class Trace:
+    """What the losses need of a forward pass of the language model.
+
+    Attributes:
+        embedded: (B, L, H) inputs of the first layer, with the vision tower's output at the visual
+            tokens.
+        outputs: (B, L, H) outputs of layers by index.
+        queries, keys: (B, L, heads, head size) of layers by index, before rotation.
+        rotary: Cosines and sines of the rotary embedding.
+        mask: (B, L) attention mask.
+    """
+
+    mask: Tensor
+    embedded: Tensor = field(init=False)
+    outputs: dict[int, Tensor] = field(default_factory=dict)
+    queries: dict[int, Tensor] = field(default_factory=dict)
+    keys: dict[int, Tensor] = field(default_factory=dict)
+    rotary: tuple[Tensor, Tensor] = field(init=False)
+
+    def log_attention(
+        self, layer: int, head: int, row: Tensor, query: Tensor, key: Tensor
+    ) -> Tensor:
+        """Return the logarithms (K,) of the attention weights of a head between K pairs of
+        positions in the rows `row` of the batch."""
+        cosine, sine = self.rotary
+        queries, keys = apply_rotary_pos_emb(
+            self.queries[layer].transpose(1, 2), self.keys[layer].transpose(1, 2), cosine, sine
+        )
+        chosen = queries[row, head, query]
+        scores = (keys[row, head] @ chosen[:, :, None])[:, :, 0] / math.sqrt(chosen.shape[-1])
+        later = torch.arange(scores.shape[1], device=scores.device) > query[:, None]
+        scores = scores.float().masked_fill(later | (self.mask[row] == 0), -torch.inf)
+        return scores.log_softmax(dim=-1).gather(1, key[:, None])[:, 0]
+
+
+@contextmanager
+def trace_forward(language_model: nn.Module, mask: Tensor) -> Iterator[Trace]:
+    """Record what the losses need while the language model runs once."""
+    trace = Trace(mask)
+    layers = language_model.layers
+
+    def keep_inputs(_: nn.Module, __: tuple, settings: dict[str, Any]) -> None:
+        trace.embedded = settings["inputs_embeds"]
+
+    def keep_rotary(_: nn.Module, __: tuple, settings: dict[str, Any]) -> None:
+        trace.rotary = settings["position_embeddings"]
+
+    def keeper(kept: dict[int, Tensor], layer: int) -> Callable[..., None]:
+        def keep(_: nn.Module, __: tuple, output: Tensor) -> None:
+            kept[layer] = output
+
+        return keep
+
+    hooks = [language_model.register_forward_pre_hook(keep_inputs, with_kwargs=True)]
+    hooks.append(layers[0].self_attn.register_forward_pre_hook(keep_rotary, with_kwargs=True))
+    hooks += [layers[k].register_forward_hook(keeper(trace.outputs, k)) for k in (MIDDLE, NAMING)]
+    for k in (TRACKING, NAMING):
+        attention = layers[k].self_attn
+        hooks.append(attention.q_norm.register_forward_hook(keeper(trace.queries, k)))
+        hooks.append(attention.k_norm.register_forward_hook(keeper(trace.keys, k)))
+    try:
+        yield trace
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def see(model: PreTrainedModel, batch: Mapping[str, Tensor]) -> Tensor:
+    """Return the vision tower's output (B, T, H) at the visual tokens of each sample."""
+    rows = len(batch["input_ids"])
+    encoders = {"video": model.get_video_features, "image": model.get_image_features}
+    parts = []
+    # The clip precedes the images in every sample.
+    for kind, encode in encoders.items():
+        pixels, grid = (batch.get(name) for name in MEDIA[kind])
+        if pixels is not None:
+            merged = torch.cat([*encode(pixels, grid).pooler_output])
+            parts.append(merged.reshape(rows, -1, merged.shape[-1]))
+    return torch.cat(parts, dim=1)
+
+
+def select_tokens(hidden: Tensor, positions: Tensor) -> Tensor:
+    """Return the states (B, T, H) at positions (B, T) of a layer's states (B, L, H)."""
+    return hidden[torch.arange(len(hidden), device=hidden.device)[:, None], positions]

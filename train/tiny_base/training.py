@@ -1,0 +1,264 @@
+"""Train the tiny base in stages: eyes, motion, words.
+
+    eyes     the vision tower alone learns to see objects in single pictures
+    motion   the whole model learns from clips and candidates where objects are and where they go
+    words    the model learns to answer questions in words; the targets of both other stages remain
+
+All stages see the same items. The order of the items, the questions and the candidates depend only
+on the seed and the step, so that a resumed run continues as if it had never stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+from tqdm import tqdm
+from transformers import PreTrainedModel, ProcessorMixin
+
+from conf.entry import Run
+from conf.errors import UserError
+from conf.schema import BaseCommand, BaseTrainConfig, StageConfig
+from data.records import COLORS, MATERIALS, SHAPES, SelectionItem
+from data.render.frame_cache import FrameReader
+from models.student.collator import IGNORED
+from teacher.predicates.facts import COMPASS
+from train.common.curves import plot_curves
+from train.common.held_out import shuffled
+from train.common.journal import CURVES, JOURNAL, read_journal
+from train.tiny_base.data import ItemSampler
+from train.tiny_base.heads import OracleHeads, OracleTargets, pointing_losses
+from train.tiny_base.probe import Probe
+from train.tiny_base.questions import KINDS
+from train.tiny_base.samples import OracleCollator
+from train.tiny_base.trace import MIDDLE, NAMING, see, select_tokens, trace_forward
+
+log = logging.getLogger(__name__)
+
+STAGES = ("eyes", "motion", "words")
+STATE = "state.pt"
+DENSE, POINTING, NAMED = 0.5, 0.3, 3.0
+"""Weights of losses in the stage of words, relative to the loss of the words: those at visual
+tokens, those of attention, and those at names."""
+
+
+def eyes_losses(
+    model: PreTrainedModel, heads: OracleHeads, batch: dict[str, Tensor], targets: OracleTargets
+) -> dict[str, Tensor]:
+    return heads.seen_losses(see(model, batch), targets)
+
+
+def motion_losses(
+    model: PreTrainedModel, heads: OracleHeads, batch: dict[str, Tensor], targets: OracleTargets
+) -> dict[str, Tensor]:
+    inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
+    with trace_forward(model.model.language_model, batch["attention_mask"]) as trace:
+        model.model(**inputs, use_cache=False)
+    return {
+        **heads.seen_losses(select_tokens(trace.embedded, targets.visual), targets),
+        **heads.known_losses(select_tokens(trace.outputs[MIDDLE], targets.visual), targets),
+        **pointing_losses(trace, targets),
+    }
+
+
+def words_losses(
+    model: PreTrainedModel, heads: OracleHeads, batch: dict[str, Tensor], targets: OracleTargets
+) -> dict[str, Tensor]:
+    labels = batch["labels"]
+    inputs = {k: v for k, v in batch.items() if k != "labels"}
+    with trace_forward(model.model.language_model, batch["attention_mask"]) as trace:
+        logits = model(**inputs, use_cache=False).logits
+    dense = {
+        **heads.seen_losses(select_tokens(trace.embedded, targets.visual), targets),
+        **heads.known_losses(select_tokens(trace.outputs[MIDDLE], targets.visual), targets),
+    }
+    losses = {name: DENSE * loss for name, loss in dense.items()}
+    pointing = pointing_losses(trace, targets)
+    losses |= {name: POINTING * loss for name, loss in pointing.items()}
+    if len(targets.names):
+        named = heads.named_losses(trace.outputs[NAMING], targets)
+        losses |= {f"named {name}": NAMED * loss for name, loss in named.items()}
+    predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()
+    losses["words"] = cross_entropy(predicted, following, ignore_index=IGNORED)
+    return losses
+
+
+LOSSES: dict[str, Callable[..., dict[str, Tensor]]] = {
+    "eyes": eyes_losses, "motion": motion_losses, "words": words_losses,
+}  # fmt: skip
+
+
+class BaseTrainer:
+    """Trains a model and the heads through all stages, with checkpoints.
+
+    Args:
+        folder: The run's folder, for the checkpoint, the journal and the curves.
+    """
+
+    def __init__(
+        self,
+        cfg: BaseTrainConfig,
+        model: PreTrainedModel,
+        heads: OracleHeads,
+        collate: OracleCollator,
+        sampler: ItemSampler,
+        probe: Probe,
+        folder: Path,
+    ) -> None:
+        self.cfg, self.model, self.heads = cfg, model, heads
+        self.collate, self.sampler, self.probe, self.folder = collate, sampler, probe, folder
+        self.stage, self.step = 0, 0
+
+    def run(self) -> None:
+        """Train through all stages, from the checkpoint if there is one."""
+        self.optimizer = self._new_optimizer()
+        self._load()
+        for stage in STAGES[self.stage :]:
+            self._run_stage(stage, getattr(self.cfg, stage))
+            self.stage, self.step = self.stage + 1, 0
+            self.optimizer = self._new_optimizer()
+            self._save()
+
+    def _new_optimizer(self) -> torch.optim.AdamW:
+        parameters = [*self.model.parameters(), *self.heads.parameters()]
+        groups = [
+            {"params": [p for p in parameters if p.dim() > 1]},
+            # Biases and the weights of norms do not decay.
+            {"params": [p for p in parameters if p.dim() <= 1], "weight_decay": 0.0},
+        ]
+        betas = (0.9, self.cfg.adam_beta2)
+        return torch.optim.AdamW(groups, betas=betas, weight_decay=self.cfg.weight_decay)
+
+    def _run_stage(self, name: str, stage: StageConfig) -> None:
+        interval = max(1, math.ceil(stage.steps / self.cfg.evaluations))
+        bar = tqdm(total=stage.steps, initial=self.step, desc=name, unit="step")
+        with bar:
+            while self.step < stage.steps:
+                losses = self._train_step(name, stage)
+                self.step += 1
+                total = sum(losses.values())
+                bar.update()
+                bar.set_postfix_str(f"loss {total:.3f}")
+                done = sum(getattr(self.cfg, s).steps for s in STAGES[: self.stage]) + self.step
+                record = {"step": done, "stage": name, "loss": total}
+                if self.step % interval == 0 or self.step == stage.steps:
+                    record |= {f"eval_{k}": v for k, v in self.probe.measure(name).items()}
+                    self._log(record | {f"loss {k}": v for k, v in losses.items()})
+                    self._save()
+                elif self.step % self.cfg.log_steps == 0:
+                    self._log(record)
+
+    def _train_step(self, name: str, stage: StageConfig) -> dict[str, float]:
+        """Take one optimizer step, and return the losses."""
+        self.model.train()
+        samples = self.sampler.batch(name, self.step, stage.batch)
+        batch, targets = self.collate(samples)
+        for group in self.optimizer.param_groups:
+            group["lr"] = stage.lr * schedule(self.step, stage.steps)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.cfg.precision == "bf16"):
+            losses = LOSSES[name](self.model, self.heads, batch, targets)
+        loss = sum(losses.values())
+        if not torch.isfinite(loss):
+            raise UserError(
+                f"the loss of step {self.step} of stage {name} is {loss.item()}; lower "
+                f"train.{name}.lr in another run (run=NAME)",
+                code="non-finite-loss",
+            )
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.cfg.max_grad_norm)
+        self.optimizer.step()
+        return {k: v.item() for k, v in losses.items()}
+
+    def _log(self, record: dict[str, float | str]) -> None:
+        with open(self.folder / JOURNAL, "a") as file:
+            file.write(json.dumps(record) + "\n")
+
+    def _save(self) -> None:
+        """Write the checkpoint and the curves."""
+        state = {
+            "stage": self.stage,
+            "step": self.step,
+            "model": self.model.state_dict(),
+            "heads": self.heads.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "journal": (self.folder / JOURNAL).stat().st_size,
+        }
+        part = self.folder / f"{STATE}.tmp"
+        torch.save(state, part)
+        os.replace(part, self.folder / STATE)
+        plot_curves(read_journal(self.folder), self.folder / CURVES)
+
+    def _load(self) -> None:
+        path = self.folder / STATE
+        journal = self.folder / JOURNAL
+        if not path.exists():
+            journal.unlink(missing_ok=True)
+            return
+        state = torch.load(path, weights_only=True)
+        self.stage, self.step = state["stage"], state["step"]
+        self.model.load_state_dict(state["model"])
+        self.heads.load_state_dict(state["heads"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        os.truncate(journal, state["journal"])
+        log.info("resuming at step %d of stage %s", self.step, [*STAGES, "end"][self.stage])
+
+
+def schedule(step: int, steps: int, warmup: int = 40, least: float = 0.05) -> float:
+    """Return the learning rate at a step as a share of the peak: a linear warm-up, then a cosine
+    down to `least`."""
+    return min(1, (step + 1) / warmup) * (
+        least + (1 - least) * (1 + math.cos(math.pi * step / steps)) / 2
+    )
+
+
+def build_trainer(
+    cfg: BaseCommand,
+    run: Run,
+    model: PreTrainedModel,
+    processor: ProcessorMixin,
+    training: Sequence[SelectionItem],
+    held_out: Sequence[SelectionItem],
+    frames: FrameReader,
+) -> BaseTrainer:
+    """Return the trainer of a run.
+
+    Args:
+        cfg: Settings whose train.precision is bf16 or fp32, not auto.
+    """
+    words = first_tokens(processor)
+    objects = {kind: words[kind] for kind in ("color", "material", "shape")}
+    heads = OracleHeads(model.get_input_embeddings(), objects)
+    collate = OracleCollator(processor, cfg.student.max_length)
+    sampler = ItemSampler(training, frames, cfg.student.frames, cfg.seed)
+    chosen = shuffled(held_out, cfg.seed)[: cfg.train.validation_items]
+    samples = [sampler.sample(item, None, "held out") for item in chosen]
+    worded = {kind: [sampler.sample(i, kind, "held out") for i in chosen[::2]] for kind in KINDS}
+    probe = Probe(model, heads, collate, samples, worded, words, cfg.train.precision == "bf16")
+    return BaseTrainer(cfg.train, model, heads, collate, sampler, probe, run.folder)
+
+
+def first_tokens(processor: ProcessorMixin) -> dict[str, list[int]]:
+    """Return the first tokens of the words for objects, places, motion and relations, by kind."""
+    kinds = {
+        "color": COLORS,
+        "material": MATERIALS,
+        "shape": SHAPES,
+        "heading": COMPASS,
+        "region": ("top", "left", "right", "center", "bottom"),
+        "speed": ("slowly", "steadily", "quickly", "rests", "stationary"),
+        "gap": ("against", "apart"),
+        "height": ("above", "below", "level"),
+    }
+    encode = processor.tokenizer.encode
+    return {
+        kind: [encode(f" {word}", add_special_tokens=False)[0] for word in words]
+        for kind, words in kinds.items()
+    }
