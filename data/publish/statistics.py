@@ -59,7 +59,8 @@ def measure_shortcuts(items: list[SelectionItem], store: Store, blind: bool) -> 
 
         blind_right = blind_accuracies(items, store, store.manifest["seed"])
     progress = tqdm(items, desc="scoring shortcuts", unit="item", disable=None)
-    scores = np.stack([shortcuts.item_scores(item, store) for item in progress])
+    config = store.manifest["config"]
+    scores = np.stack([shortcuts.item_scores(item, store.scene, config) for item in progress])
     answers = np.array([item.answer for item in items])
     right = pd.DataFrame(
         shortcuts.simple_accuracies(scores, answers), columns=list(shortcuts.SIMPLE)

@@ -39,6 +39,7 @@ from data.tracks.retrieval import counterfactual, future
 from data.tracks.selection import event, time, window
 from data.tracks.selection.distractors import BUILDERS_VERSION, Family, Timing
 from data.tracks.selection.pooling import add_reserve, choose_items
+from data.tracks.shortcuts import item_scores, order_target_first
 from data.world.physics import GENERATOR_VERSION
 
 DYNAPIX_FAMILIES = {"event": event.FAMILY, "time": time.FAMILY, "window": window.FAMILY}
@@ -104,8 +105,8 @@ def _choose_balanced(
     difficulty and split.
 
     Args:
-        scores: Scores of the candidates, the target first, by item id. Items without scores, such
-            as matched pairs, are kept.
+        scores: Scores of the candidates by item id. Items without scores, such as matched pairs,
+            are kept.
     """
     pools: dict[tuple[str, ...], list[SelectionItem]] = defaultdict(list)
     for item in items:
@@ -116,7 +117,10 @@ def _choose_balanced(
     for (split, family, difficulty), pool in pools.items():
         rng = named_rng(cfg.seed, "pool", split, family, difficulty)
         kept = choose_items(
-            np.array([scores[item.item_id] for item in pool]),
+            order_target_first(
+                np.array([scores[item.item_id] for item in pool]),
+                np.array([item.answer for item in pool]),
+            ),
             [item.subtype for item in pool],
             {subtype: getattr(quota, split) for subtype, quota in quotas[family].items()},
             rng,
@@ -224,8 +228,9 @@ def _run_job(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> N
     else:
         if cfg.distractors == "balanced":
             cell = replace(cell, world=cfg.world, save=partial(_save, path.parents[1]))
-        made, dropped, scores = fill_quota(subtype, item_families(cfg)[group], cell)
+        made, dropped = fill_quota(subtype, item_families(cfg)[group], cell)
         if cfg.distractors == "balanced":
-            part["scores"] = np.array(scores).tolist()
+            scene_of = partial(_load, path.parents[1])
+            part["scores"] = [item_scores(i, scene_of, asdict(cfg)).tolist() for i in made]
     part |= {"rows": [row.to_row() for row in made], "dropped": dropped}
     write_atomically(path, json.dumps(part).encode())

@@ -43,8 +43,8 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
 def fill_pairs(cell: CellInputs) -> tuple[list[SelectionItem], int]:
     """Make matched-anchor pairs up to the quota: a list with the items of each pair in sequence,
     and the number of targets that `fill_quota` dropped."""
-    filled = fill_quota(MATCHED_ANCHOR, Family({}, timings, time.make_item), cell)
-    return [paired for item in filled.items for paired in _pair(item)], filled.dropped
+    items, dropped = fill_quota(MATCHED_ANCHOR, Family({}, timings, time.make_item), cell)
+    return [paired for item in items for paired in _pair(item)], dropped
 
 
 def _pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:

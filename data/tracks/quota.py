@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count, islice
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -50,27 +50,16 @@ class CellInputs:
         return DistractorPicker(self.min_displacement, self.scene_ids[split], self.scene_of)
 
 
-class Filled(NamedTuple):
-    """The items of one cell.
-
-    Attributes:
-        items: The items of both splits, up to their quotas.
-        dropped: Number of timings that were dropped because no three distractors are suitable.
-        scores: (S, 4) scores of the candidates of each item, the target first; only for balanced
-            items (see `data.tracks.selection.balance.SCORES`).
-    """
-
-    items: list[SelectionItem]
-    dropped: int
-    scores: list[np.ndarray]
-
-
-def fill_quota(subtype: str, family: Family, cell: CellInputs) -> Filled:
+def fill_quota(subtype: str, family: Family, cell: CellInputs) -> tuple[list[SelectionItem], int]:
     """Make the items of one cell, at most one per scene, from scenes in a seeded order.
 
     The timings of a scene are tried in a random order.
+
+    Returns:
+        The items of each split up to its quota, and the number of timings that were dropped because
+        no three distractors are suitable.
     """
-    filled = Filled([], 0, [])
+    items, dropped = [], 0
     for split in SPLITS:
         scene_ids = cell.scene_ids[split]
         rng = named_rng(cell.seed, subtype, split)
@@ -84,12 +73,9 @@ def fill_quota(subtype: str, family: Family, cell: CellInputs) -> Filled:
             order = rng.permutation(len(timings))
             attempts = (family.make_item(subtype, scene, timings[k], rng, picker) for k in order)
             made += islice(filter(None, attempts), 1)
-        filled = Filled(
-            filled.items + shuffle_candidates(made, rng),
-            filled.dropped + picker.dropped,
-            filled.scores + picker.scores,
-        )
-    return filled
+        items += shuffle_candidates(made, rng)
+        dropped += picker.dropped
+    return items, dropped
 
 
 def shuffle_candidates(

@@ -7,14 +7,14 @@ items of the training split, for each family.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from data.records import FrameRef, SelectionItem
+from data.records import FrameRef, Scene, SelectionItem
 from data.render.frame_cache import render_frames
-from data.store import Store
 from data.tracks.selection.balance import (
     SCORES,
     CandidateFrames,
@@ -29,21 +29,27 @@ PENALTY = 1e-2
 """Weight of the squared coefficients in the loss of the logistic model."""
 
 
-def item_scores(item: SelectionItem, store: Store) -> np.ndarray:
-    """Return the scores (S, 4) of an item's candidates, in the order of `SCORES`."""
+def item_scores(
+    item: SelectionItem, scene_of: Callable[[str], Scene], config: Mapping[str, Any]
+) -> np.ndarray:
+    """Return the scores (S, 4) of an item's candidates, in the order of `SCORES`.
+
+    Args:
+        scene_of: Function that loads a scene by its id.
+        config: Settings of the benchmark.
+    """
     frames = [FrameRef(item.scene_id, item.prefix_stop), *item.candidates]
-    states = [(store.scene(f.scene_id), f.frame) for f in frames]
-    images = np.stack([_small_image(frame, store) for frame in frames])
+    states = [(scene_of(f.scene_id), f.frame) for f in frames]
+    images = np.stack([_small_image(*state, config) for state in states])
     compared = CandidateFrames.of(states, [f.frame for f in frames], images)
     return compared.scores(np.array([[1, 2, 3, 4]]))[:, 0]
 
 
-def _small_image(frame: FrameRef, store: Store) -> np.ndarray:
+def _small_image(scene: Scene, frame: int, config: Mapping[str, Any]) -> np.ndarray:
     """Return a frame as a small (H, W, 3) image, rendered by Bullet if its scene was simulated."""
     width, height = IMAGE_SIZE
     small = {"renderer": "bullet", "width": width, "height": height}
-    scene = store.scene(frame.scene_id)
-    pixels = render_frames(scene, [frame.frame], store.manifest["config"] | small)[frame.frame]
+    pixels = render_frames(scene, [frame], {**config, **small})[frame]
     if pixels.shape[:2] == (height, width):
         return pixels
     return np.asarray(Image.fromarray(pixels).resize(IMAGE_SIZE))
@@ -58,11 +64,12 @@ def simple_accuracies(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
         scores: (N, S, 4) scores of the candidates.
         answers: (N,) indices of the targets.
     """
-    shares = rank_shares(_target_first(scores, answers))
+    shares = rank_shares(order_target_first(scores, answers))
     return np.stack([shares[..., 0], shares[..., 3]], axis=-1).reshape(len(scores), -1)
 
 
-def _target_first(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
+def order_target_first(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Return scores (N, S, 4) with those of the target, whose index is in `answers`, first."""
     order = np.array([[a, *(k for k in range(4) if k != a)] for a in answers.tolist()])
     return np.take_along_axis(scores, order[:, None, :], axis=-1)
 

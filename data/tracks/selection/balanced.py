@@ -62,7 +62,6 @@ class BalancedPicker:
             differ by this many px at 336 x 336.
         save: Function that stores an alternative future.
         dropped: Number of timings for which no choice of distractors was suitable.
-        scores: (S, 4) scores of the candidates of each item, the target first.
     """
 
     min_displacement: float
@@ -70,7 +69,6 @@ class BalancedPicker:
     rng: np.random.Generator
     save: Callable[[Scene], None]
     dropped: int = 0
-    scores: list[np.ndarray] = field(default_factory=list)
     balance: Balance = field(init=False)
     _tries: tuple[str, int] = ("", 0)
 
@@ -114,11 +112,9 @@ class BalancedPicker:
             return self._drop()
         states = [(frames, k) for k in range(frames.frames)]
         compared = CandidateFrames.of(states, frame_moments, self._render(frames))
-        scores = compared.scores(choices)
-        best = self.balance.choose(scores)
+        best = self.balance.choose(compared.scores(choices))
         if best is None:
             return self._drop()
-        self.scores.append(scores[:, best])
         candidates = []
         for frame in choices[best].tolist():
             moment = frame_moments[frame]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations, islice
 from typing import Any
 
@@ -68,14 +68,12 @@ class DistractorPicker:
         scene_ids: Scenes of the split; cross-scene distractors come from these.
         scene_of: Function that loads a scene by its id.
         dropped: Number of timings for which fewer than three distractors were found.
-        scores: Always empty; a `BalancedPicker` lists the scores of its items.
     """
 
     min_displacement: float
     scene_ids: list[str]
     scene_of: Callable[[str], Scene]
     dropped: int = 0
-    scores: list[np.ndarray] = field(default_factory=list)
 
     def make_item(
         self,

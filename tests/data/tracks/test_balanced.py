@@ -39,6 +39,7 @@ from data.tracks.shortcuts import (
     fit_logistic,
     item_scores,
     logistic_accuracies,
+    order_target_first,
     simple_accuracies,
 )
 from data.tracks.shortfalls import summarize_store
@@ -65,23 +66,19 @@ def settings(folder_name: str, **changes) -> BenchmarkConfig:
 
 
 @pytest.fixture(scope="module")
-def build(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[Store, list[np.ndarray]]:
-    """A small balanced benchmark, and the scores of the choices of its builder."""
-    chosen = []
-    original = Balance.choose
+def build(tmp_path_factory: pytest.TempPathFactory) -> tuple[Store, list[np.ndarray]]:
+    """A small balanced benchmark, and the scores of the items from which its items were chosen."""
+    pools = []
 
-    def record(self: Balance, scores: np.ndarray) -> int | None:
-        best = original(self, scores)
-        if best is not None:
-            chosen.append(scores[:, best])
-        return best
+    def record(scores: np.ndarray, *args: object) -> list[int]:
+        kept = choose_items(scores, *args)
+        pools.append(scores[kept])
+        return kept
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Balance, "choose", record)
+        patch.setattr("data.tracks.build_items.choose_items", record)
         store = ensure_items(settings("balanced"), tmp_path_factory.mktemp("store"), Workers(1))
-    return store, chosen
+    return store, pools
 
 
 @pytest.fixture(scope="module")
@@ -415,8 +412,14 @@ def test_scores_of_items_are_those_that_were_balanced(
     build: tuple[Store, list[np.ndarray]], items: list[SelectionItem]
 ) -> None:
     """The scores that the statistics compute from the store equal those of the builder."""
-    store, chosen = build
-    built = {tuple(np.sort(scores[0]).round(1)) for scores in chosen}
-    for item in items[:8]:
-        scores = item_scores(item, store)
-        assert tuple(np.sort(scores[0]).round(1)) in built
+    store, pools = build
+    config = store.manifest["config"]
+    scores = np.stack([item_scores(item, store.scene, config) for item in items])
+    scores = order_target_first(scores, np.array([item.answer for item in items]))
+    built = np.concatenate(pools)
+    assert len(built) == len(scores)
+    # Neither the order of the families nor that of the distractors is the same.
+    ordered = [np.sort(s[..., 1:]).round(5).tolist() for s in (built, scores)]
+    targets = [s[..., 0].round(5).tolist() for s in (built, scores)]
+    first, second = (sorted(zip(t, o, strict=True)) for t, o in zip(targets, ordered, strict=True))
+    assert first == second
