@@ -152,7 +152,7 @@ class BaseTrainConfig(Settings):
     """Maximum norm of the gradient, to which it is clipped."""
     precision: str = setting("auto", ("auto", "bf16", "fp32"))
     """Precision of the forward and backward pass, as in `train.sft`."""
-    evaluations: int = setting(10, least=1)
+    evaluations: int = setting(20, least=1)
     """Number of evaluations and checkpoints of each stage."""
     validation_items: int = setting(160, least=1)
     """Number of items, from held-out scenes, of an evaluation."""

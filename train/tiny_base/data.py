@@ -37,7 +37,8 @@ def split_items(
         if extract_predicates(item, frames.scene(item.scene_id), frames.scene) is not None
     ]
     training = [item for item in items if uses_only(item, training_scenes)]
-    validation = [item for item in items if item.scene_id in held_out]
+    # Distractors of other scenes may be of training scenes; such items measure nothing held out.
+    validation = [item for item in items if uses_only(item, held_out)]
     check_not_empty(len(training), "training items")
     check_not_empty(len(validation), "items of held-out training scenes")
     return training, validation
