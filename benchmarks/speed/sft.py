@@ -158,7 +158,7 @@ def measure(overrides: list[str], variant: Variant, steps: int, trl_loss: bool) 
     training, validation = load_datasets(cfg, store, rationales)
     with tempfile.TemporaryDirectory() as folder:
         if variant.trl:
-            lengths = training.lengths(processor.tokenizer, cfg.student.image_size)
+            lengths = training.lengths(processor, cfg.student.image_size)
             order = LengthSampler(lengths, cfg.train.batch, cfg.seed)
             samples = Subset(training, list(islice(order, (steps + 1) * cfg.train.batch)))
             trainer = build_trl_trainer(cfg, model, processor, samples, Path(folder), variant.flash)

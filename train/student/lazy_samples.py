@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from torch.utils.data import Dataset
-from transformers import PreTrainedTokenizerBase
+from transformers import ProcessorMixin
 
 from models.student.prompts import Sample
 
-TOKEN_PIXELS, EXTRA_TOKENS = 32, 8
-"""The side in px of the square that a visual token covers, and the number of text tokens around
-each image or pair of video frames."""
+EXTRA_TOKENS = 8
+"""Number of text tokens around each image or pair of video frames."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +64,12 @@ class StudentDataset(Dataset):
     def texts(self) -> list[str]:
         return [s.text for s in self.samples]
 
-    def lengths(self, tokenizer: PreTrainedTokenizerBase, image_size: int) -> list[int]:
+    def lengths(self, processor: ProcessorMixin, image_size: int) -> list[int]:
         """Estimate each sample's number of tokens, with frames of `image_size` px, not rendered."""
-        ids = tokenizer(self.texts, add_special_tokens=False).input_ids
-        per_medium = round(image_size / TOKEN_PIXELS) ** 2 + EXTRA_TOKENS
+        ids = processor.tokenizer(self.texts, add_special_tokens=False).input_ids
+        # A visual token covers a square of several patches.
+        side = processor.image_processor.patch_size * processor.image_processor.merge_size
+        per_medium = round(image_size / side) ** 2 + EXTRA_TOKENS
         return [len(i) + s.media * per_medium for i, s in zip(ids, self.samples, strict=True)]
 
 

@@ -57,7 +57,7 @@ def build_trainer(
     """
     train, student = cfg.train, cfg.student
     collator = Collator(processor, student.max_length)
-    lengths = training.lengths(processor.tokenizer, student.image_size)
+    lengths = training.lengths(processor, student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit_student(model, processor, student, longest, collator))
     sampler = LengthSampler(lengths, train.batch, cfg.seed, train.micro_batch, world_size())

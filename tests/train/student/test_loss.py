@@ -114,7 +114,7 @@ def test_lengths_are_estimated_without_rendering(
     items = micro_store.selection("train")[:4]
     texts = ["near the top " * words + "\nAnswer: A" for words in (3, 9, 27, 1)]
     samples = StudentDataset([LazySample(text, 10, refuse) for text in texts])
-    estimated = samples.lengths(processor.tokenizer, 96)
+    estimated = samples.lengths(processor, 96)
     real = [
         len(encode(sample, processor, 1500).input_ids)
         for sample in (

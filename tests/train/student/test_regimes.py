@@ -12,12 +12,13 @@ from data.store import Store
 from models.student.answer_parser import parse_choice
 from models.student.collator import encode
 from models.student.prompts import answer_line, instruction
+from models.tiny_qwen3_vl import build_processor
 from teacher.narrate import ensure_rationales
 from teacher.predicates.extraction import extract_predicates
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from train.student.dataset import SupervisedItem, supervised_items
+from train.student.dataset import SupervisedItem, supervised_items, tokenizer_corpus
 from train.student.lazy_samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
@@ -109,15 +110,17 @@ def test_an_order_depends_on_seed_epoch_and_item(micro_store, frames, student_cf
             assert dataset[k].response == expected.response
 
 
+@pytest.mark.parametrize("patch", [16, 12])
 def test_estimated_lengths_differ_as_the_numbers_of_tokens(
-    micro_store, frames, processor, student_cfg
+    micro_store, frames, student_cfg, patch: int
 ) -> None:
     """The estimate leaves out what all prompts have, so the differences between samples count."""
+    processor = build_processor(tokenizer_corpus(micro_store, []), 1024, 96, patch)
     by_mode = items_of(micro_store, "cot")
     supervised = by_mode["reasoning"][:3] + by_mode["answer"][:3]
     samples = [s.lazy_sample(frames, count, None) for count in (4, 5, 12) for s in supervised]
     data = StudentDataset(samples)
-    estimates = np.array(data.lengths(processor.tokenizer, student_cfg.image_size))
+    estimates = np.array(data.lengths(processor, student_cfg.image_size))
     size = student_cfg.max_length
     tokens = np.array([len(encode(sample, processor, size).input_ids) for sample in data])
     assert np.ptp(tokens) > 200
