@@ -121,7 +121,7 @@ class ContrastiveTrainConfig(TrainConfig):
 
 @dataclass
 class StageConfig(Settings):
-    """A stage of the training of the tiny base (see `train.tiny_base.stages`)."""
+    """A stage of the training of the tiny base (see `train.tiny_base.training`)."""
 
     steps: int = setting(1000, least=1)
     """Number of optimizer steps."""

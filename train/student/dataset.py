@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -102,8 +103,7 @@ def supervised_items(
 def load_datasets(
     cfg: SftCommand, store: Store, rationales: list[Rationale]
 ) -> tuple[StudentDataset, dict[str, StudentDataset]]:
-    """Return the training dataset, and the validation datasets by mode or, if the regime is
-    describe, by kind of question.
+    """Return the training dataset, and the validation datasets by mode.
 
     Raises:
         UserError: a dataset is empty.
@@ -143,7 +143,12 @@ def uses_only(item: SelectionItem, scenes: set[str]) -> bool:
 
 def tokenizer_corpus(store: Store, rationales: list[Rationale]) -> list[str]:
     """Return texts to train a tokenizer on: everything that a student reads and writes."""
-    item_questions = sorted({item.question for item in store.selection("train")})
+    return prompt_corpus(store.selection("train")) + [r.text for r in rationales]
+
+
+def prompt_corpus(items: Sequence[SelectionItem], others: Sequence[str] = ()) -> list[str]:
+    """Return the texts of prompts about items and of answers, and `others`, for a tokenizer."""
+    item_questions = sorted({item.question for item in items})
     letters = [
         f"\nCandidate {x}: \nCandidate {x} matches: every object is where it should be.\n"
         f"Candidate {x} does not match: it shows other objects and lacks\n{answer_line(x)}"
@@ -153,5 +158,5 @@ def tokenizer_corpus(store: Store, rationales: list[Rationale]) -> list[str]:
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     instructions = [instruction(mode, "cot") for mode in MODES]
     roles = ["user", "assistant"]
-    prompts = [*item_questions, *letters, *instructions, *roles]
-    return [*prompts * 20, *clock, *(r.text for r in rationales)]
+    prompts = [*item_questions, *letters, *instructions, *others, *roles]
+    return [*prompts * 20, *clock]

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from data.records import LETTERS, SelectionItem
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from models.student.prompts import MODES, answer_line, instruction
 from teacher.candidate_letters import reorder_candidates
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.relations import Bounds
 from train.common.held_out import check_not_empty, held_out_scenes
-from train.student.dataset import uses_only
+from train.student.dataset import prompt_corpus, uses_only
 from train.student.lazy_samples import seeded_rng
 from train.tiny_base.questions import KINDS, QUESTIONS, Question
 from train.tiny_base.samples import OracleSample, make_sample
@@ -96,20 +95,5 @@ def tokenizer_corpus(items: Sequence[SelectionItem], frames: FrameReader, seed: 
         for item in items[::step]
         for kind in KINDS
     ]
-    letters = [
-        f"\nCandidate {x}: \nCandidate {x} matches: every object is where it should be.\n"
-        f"Candidate {x} does not match: it shows other objects and lacks\n{answer_line(x)}"
-        for x in LETTERS
-    ]
-    # Timestamps as prompts have them, with every digit.
-    clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
-    instructions = [instruction(mode, "cot") for mode in MODES]
-    outcome = [
-        "Outcome: This layout is that of candidate",
-        "shows this layout.",
-        "user",
-        "assistant",
-    ]
-    asked = sorted({item.question for item in items})
-    prompts = [*asked, *letters, *instructions, *QUESTIONS, *outcome]
-    return [*prompts * 20, *clock, *answers]
+    outcome = ["Outcome: This layout is that of candidate", "shows this layout."]
+    return prompt_corpus(items, [*QUESTIONS, *outcome]) + answers

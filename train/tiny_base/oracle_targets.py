@@ -17,8 +17,6 @@ from data.records import COLORS, MATERIALS, SHAPES, Scene
 
 CLEARLY_VISIBLE = 0.3
 """An object has a target if its visible fraction is above this."""
-HIDDEN = 0.05
-"""A text may name an object if its visible fraction is above this."""
 AHEAD = (10, 25)
 """Frames ahead for which displacements are predicted."""
 RATE = 10
@@ -92,10 +90,10 @@ def image_targets(
         yield ObjectTarget(name, picture, place, visible, since=since)
 
 
-def visible_objects(scene: Scene, frame: int, least: float = CLEARLY_VISIBLE) -> list[int]:
-    """Return the indices of the objects whose visible fraction in a frame is above `least`."""
+def visible_objects(scene: Scene, frame: int) -> list[int]:
+    """Return the indices of the clearly visible objects of a frame."""
     # A fraction that the simulator does not record is NaN.
-    shown = scene.in_view[frame] & ~(scene.visible_fraction[frame] <= least)
+    shown = scene.in_view[frame] & ~(scene.visible_fraction[frame] <= CLEARLY_VISIBLE)
     return np.flatnonzero(shown).tolist()
 
 

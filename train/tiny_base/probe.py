@@ -23,7 +23,10 @@ class Probe:
     """Measures a model and its heads on held-out samples.
 
     Args:
-        samples: Held-out samples without words by stage.
+        samples: Held-out samples without words.
+        worded: Held-out samples by kind of question.
+        word_ids: First tokens of words by kind of word.
+        bf16: Whether the model computes in bf16.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """Train the tiny base in stages: eyes, motion, words.
 
-    eyes     the vision tower alone learns to see objects in single pictures
+    eyes     the vision tower alone learns to see the objects of single pictures
     motion   the whole model learns from clips and candidates where objects are and where they go
     words    the model learns to answer questions in words; the targets of both other stages remain
 
