@@ -8,7 +8,7 @@ picture. The heads are linear, so the base itself has to represent what they pre
     "known"  visual tokens after the layer `MIDDLE`: place, whether the object moves, velocity,
              displacements ahead, and displacement since the end of the clip
     "named"  names of objects in a text after the layer `NAMING`: in which pictures the object is
-             visible and where, and its displacements ahead
+             visible and where, and its displacement up to the moment that the item asks for
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
 at the tower's output and motion in the middle layers. Two further losses teach attention heads to
@@ -58,7 +58,7 @@ class OracleTargets:
         names: (M, 2) row and position of a name's last token.
         found: (M, PICTURES) token of the named object in each picture, or -1.
         places: (M, 2 * PICTURES) its places, NaN where it is not visible.
-        ahead: (M, 2 * len(AHEAD)) its displacements ahead, or NaN.
+        future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
     """
 
     visual: Tensor
@@ -70,7 +70,7 @@ class OracleTargets:
     names: Tensor
     found: Tensor
     places: Tensor
-    ahead: Tensor
+    future: Tensor
 
 
 class OracleHeads(nn.Module):
@@ -98,7 +98,7 @@ class OracleHeads(nn.Module):
 
         self.seen = heads({"presence": 1, "inside": 2, "velocity": 2})
         self.known = heads({"place": 2, "moving": 1} | dict.fromkeys(DISPLACEMENTS, 2))
-        self.named = heads({"shown": PICTURES, "places": 2 * PICTURES, "ahead": 2 * len(AHEAD)})
+        self.named = heads({"shown": PICTURES, "places": 2 * PICTURES, "future": 2})
         self.norms = nn.ModuleDict({n: nn.LayerNorm(hidden) for n in ("seen", "known", "named")})
 
     def seen_losses(self, tokens: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
@@ -185,7 +185,25 @@ class OracleHeads(nn.Module):
         return {
             "shown": binary_cross_entropy_with_logits(self.named["shown"](named), shown),
             "places": distance(self.named["places"](named), targets.places, SCALES["place"]),
-            "ahead": distance(self.named["ahead"](named), targets.ahead, SCALES["since"]),
+            "future": distance(self.named["future"](named), targets.future, SCALES["since"]),
+        }
+
+    def named_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+        """Return the errors of what the heads read at names, as shares of the image:
+        `named_place_error`, and `named_future_error` beside `named_future_still`, the error of
+        staying put, of objects that will be displaced."""
+        row, at = targets.names.T
+        named = self.norms["named"](hidden[row, at])
+        read = {name: self.named[name](named).float() for name in ("places", "future")}
+        places = (read["places"] / SCALES["place"] - targets.places).unflatten(1, (-1, 2))
+        errors = places.norm(dim=-1)
+        still = targets.future.norm(dim=1)
+        displaced = still > MOVING
+        future = (read["future"] / SCALES["since"] - targets.future).norm(dim=1)
+        return {
+            "named_place_error": errors[~errors.isnan()],
+            "named_future_error": future[displaced],
+            "named_future_still": still[displaced],
         }
 
 

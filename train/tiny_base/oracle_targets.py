@@ -17,7 +17,7 @@ from data.records import COLORS, MATERIALS, SHAPES, Scene
 
 CLEARLY_VISIBLE = 0.3
 """An object has a target if its visible fraction is above this."""
-AHEAD = (10, 25)
+AHEAD = (10, 25, 50)
 """Frames ahead for which displacements are predicted."""
 RATE = 10
 """A velocity is the displacement during this many frames."""
@@ -88,6 +88,14 @@ def image_targets(
         place, visible = _place(scene, frame, k), _fraction(scene, frame, k)
         name = scene.objects[k].noun_phrase
         yield ObjectTarget(name, picture, place, visible, since=since)
+
+
+def future_displacements(scene: Scene, frame: int, later: int) -> dict[str, tuple[float, float]]:
+    """Return the displacements, by name, of a frame's clearly visible objects up to a later one."""
+    return {
+        scene.objects[k].noun_phrase: _displacement(scene, k, frame, later)
+        for k in visible_objects(scene, frame)
+    }
 
 
 def visible_objects(scene: Scene, frame: int) -> list[int]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from transformers import PreTrainedModel
 
 from train.tiny_base.heads import OracleHeads
-from train.tiny_base.trace import MIDDLE, see, select_tokens, trace_forward
+from train.tiny_base.trace import MIDDLE, NAMING, see, select_tokens, trace_forward
 
 if TYPE_CHECKING:
     from train.tiny_base.samples import OracleCollator, OracleSample
@@ -72,15 +72,21 @@ class Probe:
 
     def _follow_words(self) -> dict[str, float]:
         """Return the share of words of each kind that the model predicts, given the correct words
-        before them."""
-        right: dict[str, list[Tensor]] = defaultdict(list)
+        before them, and the errors of what the heads read at names."""
+        found: dict[str, list[Tensor]] = defaultdict(list)
         for kind, samples in self.worded.items():
             for k in range(0, len(samples), BATCH):
-                batch, _ = self.collate(samples[k : k + BATCH])
+                batch, targets = self.collate(samples[k : k + BATCH])
                 labels = batch.pop("labels")[:, 1:]
-                predicted = self.model(**batch, use_cache=False).logits[:, :-1].argmax(dim=-1)
+                language, mask = self.model.model.language_model, batch["attention_mask"]
+                with trace_forward(language, mask) as trace:
+                    logits = self.model(**batch, use_cache=False).logits
+                predicted = logits[:, :-1].argmax(dim=-1)
                 for words, ids in self.word_ids.items():
                     of_kind = torch.isin(labels, ids)
-                    right[f"words_{words}/{kind}"].append((predicted == labels)[of_kind].float())
-        joined = {name: torch.cat(values) for name, values in right.items()}
+                    found[f"words_{words}/{kind}"].append((predicted == labels)[of_kind].float())
+                measures = self.heads.named_measures(trace.outputs[NAMING], targets)
+                for name, values in measures.items():
+                    found[f"{name}/{kind}"].append(values)
+        joined = {name: torch.cat(values) for name, values in found.items()}
         return {name: values.mean().item() for name, values in joined.items() if len(values)}

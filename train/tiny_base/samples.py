@@ -7,7 +7,7 @@ of `train.tiny_base.questions`.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,9 +30,10 @@ from models.student.collator import Collator
 from models.student.prompts import Sample, conversation, load_clip
 from train.tiny_base.heads import PICTURES, OracleTargets
 from train.tiny_base.oracle_targets import (
-    AHEAD,
+    UNKNOWN,
     ObjectTarget,
     clip_targets,
+    future_displacements,
     image_targets,
     largest_per_token,
     stack_targets,
@@ -49,11 +50,14 @@ class OracleSample:
 
     Attributes:
         last: Index of the last picture of the clip, which the candidates follow; -1 without clip.
+        future: Displacements of objects, by name, from the end of the clip to the moment that the
+            item asks for.
     """
 
     sample: Sample
     targets: tuple[ObjectTarget, ...]
     last: int
+    future: Mapping[str, tuple[float, float]]
 
 
 def make_sample(
@@ -63,11 +67,12 @@ def make_sample(
     scene = frames.scene(item.scene_id)
     targets: list[ObjectTarget] = []
     parts: list[str | np.ndarray] = [item.question]
-    clip, last = None, -1
+    clip, last, future = None, -1, {}
     if question.clip:
         shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, frame_count)
         clip, last = load_clip(item.scene_id, shown, frames), (len(shown) + 1) // 2 - 1
         targets += clip_targets(scene, shown)
+        future = future_displacements(scene, item.prefix_stop, item.target_frame)
     if question.candidates:
         for picture, (letter, c) in enumerate(zip(LETTERS, item.candidates, strict=True), last + 1):
             follows = original_scene_id(c.scene_id) == original_scene_id(item.scene_id)
@@ -76,7 +81,7 @@ def make_sample(
             parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
     parts.append(f"\n{question.text}")
     sample = conversation(item.item_id, parts, question.answer, clip)
-    return OracleSample(sample, tuple(targets), last)
+    return OracleSample(sample, tuple(targets), last, future)
 
 
 class OracleCollator:
@@ -104,7 +109,7 @@ class OracleCollator:
         names: list[tuple[int, int]] = []
         found: list[list[int]] = []
         places: list[list[float]] = []
-        ahead: list[list[float]] = []
+        future: list[tuple[float, float]] = []
         for row, s in enumerate(samples):
             largest = largest_per_token(s.targets, grid)
             at = {id(t): t.picture * grid**2 + t.cell(grid) for t in s.targets}
@@ -119,12 +124,8 @@ class OracleCollator:
                 names.append((row, length + position))
                 pictures = [where.get((s.last + k, name)) for k in range(PICTURES)]
                 found.append([at[id(t)] if t else -1 for t in pictures])
-                nowhere = (float("nan"),) * 2
-                places.append([x for t in pictures for x in (t.place if t else nowhere)])
-                unknown = (nowhere,) * len(AHEAD)
-                ahead.append(
-                    [x for d in (pictures[0].ahead if pictures[0] else unknown) for x in d]
-                )
+                places.append([x for t in pictures for x in (t.place if t else UNKNOWN)])
+                future.append(s.future.get(name, UNKNOWN))
         truth = stack_targets(kept)
         return OracleTargets(
             visual=visual,
@@ -136,7 +137,7 @@ class OracleCollator:
             names=torch.tensor(names, dtype=torch.long).reshape(-1, 2),
             found=torch.tensor(found, dtype=torch.long).reshape(-1, PICTURES),
             places=torch.tensor(places).reshape(-1, 2 * PICTURES) - 0.5,
-            ahead=torch.tensor(ahead).reshape(-1, 2 * len(AHEAD)),
+            future=torch.tensor(future).reshape(-1, 2),
         )
 
     def _names(self, response: str) -> list[tuple[str, int]]:

@@ -18,6 +18,7 @@ from train.tiny_base.oracle_targets import (
     RATE,
     ObjectTarget,
     clip_targets,
+    future_displacements,
     image_targets,
     largest_per_token,
 )
@@ -101,6 +102,19 @@ def test_image_targets_refer_to_the_end_of_the_clip(micro_store: Store, items) -
         moved = np.subtract(after[name].place, before[name].place)
         assert after[name].since == pytest.approx(moved)
         assert np.isnan([*after[name].velocity, *before[name].since]).all()
+
+
+def test_the_future_is_the_displacement_to_the_item_s_moment(micro_store: Store, items) -> None:
+    for item in items:
+        scene = micro_store.scene(item.scene_id)
+        places = scene.image_positions / scene.image_size
+        names = [o.noun_phrase for o in scene.objects]
+        future = future_displacements(scene, item.prefix_stop, item.target_frame)
+        assert future
+        for name, moved in future.items():
+            k = names.index(name)
+            reached = places[item.prefix_stop, k] + moved
+            assert reached == pytest.approx(places[item.target_frame, k], nan_ok=True)
 
 
 def test_a_token_has_the_target_of_which_most_is_visible() -> None:

@@ -104,6 +104,7 @@ def test_command_saves_a_base_that_can_be_loaded(cfg, tmp_path: Path) -> None:
     metrics = main.__wrapped__(cfg, run)
     assert 0 <= metrics["color"] <= 1
     assert metrics["ahead_25_still"] > 0
+    assert metrics["named_future_still/predict"] > 0
     student = replace(cfg.student, architecture=None, model=str(run.folder / "student"))
     model, processor = loading.load_base(student, "bf16", list)
     assert {p.dtype for p in model.parameters()} <= {torch.float32, torch.bfloat16}
