@@ -11,7 +11,7 @@ from torch import Tensor
 from transformers import PreTrainedModel
 
 from train.tiny_base.heads import OracleHeads
-from train.tiny_base.trace import MIDDLE, NAMING, see, select_tokens, trace_forward
+from train.tiny_base.trace import MIDDLE, NAMING, see, select_tokens, trace_forward, trace_states
 
 if TYPE_CHECKING:
     from train.tiny_base.samples import OracleCollator, OracleSample
@@ -60,10 +60,7 @@ class Probe:
             if not with_motion:
                 tokens, hidden = see(self.model, batch), None
             else:
-                inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
-                language, mask = self.model.model.language_model, batch["attention_mask"]
-                with trace_forward(language, mask) as trace:
-                    self.model.model(**inputs, use_cache=False)
+                trace = trace_states(self.model, batch)
                 tokens = select_tokens(trace.embedded, targets.visual)
                 hidden = select_tokens(trace.outputs[MIDDLE], targets.visual)
             for name, values in self.heads.measures(tokens, hidden, targets).items():

@@ -87,6 +87,14 @@ def trace_forward(language_model: nn.Module, mask: Tensor) -> Iterator[Trace]:
             hook.remove()
 
 
+def trace_states(model: PreTrainedModel, batch: Mapping[str, Tensor]) -> Trace:
+    """Run a model on a batch without computing logits, and return the trace."""
+    inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
+    with trace_forward(model.model.language_model, batch["attention_mask"]) as trace:
+        model.model(**inputs, use_cache=False)
+    return trace
+
+
 def see(model: PreTrainedModel, batch: Mapping[str, Tensor]) -> Tensor:
     """Return the vision tower's output (B, T, H) at the visual tokens of each sample."""
     rows = len(batch["input_ids"])

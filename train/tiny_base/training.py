@@ -38,7 +38,7 @@ from train.tiny_base.heads import OracleHeads, OracleTargets, pointing_losses
 from train.tiny_base.probe import Probe
 from train.tiny_base.questions import KINDS
 from train.tiny_base.samples import OracleCollator
-from train.tiny_base.trace import MIDDLE, NAMING, see, select_tokens, trace_forward
+from train.tiny_base.trace import MIDDLE, NAMING, see, select_tokens, trace_forward, trace_states
 
 log = logging.getLogger(__name__)
 
@@ -58,9 +58,7 @@ def eyes_losses(
 def motion_losses(
     model: PreTrainedModel, heads: OracleHeads, batch: dict[str, Tensor], targets: OracleTargets
 ) -> dict[str, Tensor]:
-    inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
-    with trace_forward(model.model.language_model, batch["attention_mask"]) as trace:
-        model.model(**inputs, use_cache=False)
+    trace = trace_states(model, batch)
     return {
         **heads.seen_losses(select_tokens(trace.embedded, targets.visual), targets),
         **heads.known_losses(select_tokens(trace.outputs[MIDDLE], targets.visual), targets),
