@@ -36,6 +36,12 @@ PREDICTED, DESCRIBED, COMPARED = 7, 4, 3
 """Maximum numbers of statements in a prediction, about each described candidate, and compared with
 all candidates."""
 
+WEIGHTS = {
+    "region": 8, "gap": 4, "side": 2, "height": 2, "nearer": 2, "sight": 1, "between": 1,
+    "extreme": 1,
+}  # fmt: skip
+"""Relative frequencies of the kinds of statements, close to those in rationales."""
+
 
 @dataclass(frozen=True)
 class Question:
@@ -127,15 +133,16 @@ def make_writer(
 
 
 def sample_statements(view: View, rng: np.random.Generator, count: int) -> list[Relation]:
-    """Sample up to `count` different statements that are true of a frame, of its kinds in equal
-    shares; either of two objects may be the subject."""
+    """Sample up to `count` different statements that are true of a frame, of its kinds with the
+    frequencies `WEIGHTS`; either of two objects may be the subject."""
     by_kind: dict[str, list[Relation]] = {}
     for statement in sorted(view.statements):
         if statement.kind not in CHANGES:
             by_kind.setdefault(statement.kind, []).append(statement)
     kinds = [*by_kind]
+    weights = np.array([WEIGHTS.get(kind, 1) for kind in kinds], dtype=float)
     chosen: dict[Relation, None] = {}
     for _ in range(count):
-        options = by_kind[kinds[rng.integers(len(kinds))]]
+        options = by_kind[kinds[rng.choice(len(kinds), p=weights / weights.sum())]]
         chosen[options[rng.integers(len(options))]] = None
     return [flip_relation(s) if s.kind in SYMMETRIC and rng.random() < 0.5 else s for s in chosen]
