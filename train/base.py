@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from conf.entry import Run, command
@@ -28,24 +29,29 @@ def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
     from data.render.frame_cache import FrameReader
     from models import compat, loading
     from models.precision import resolve_precision
-    from train.tiny_base.data import split_items, tokenizer_corpus
+    from train.common.held_out import shuffled
+    from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
+    from train.tiny_base.own_words import measure_own_words
     from train.tiny_base.training import build_trainer
 
     compat.keep_freed_memory()
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     frames = FrameReader(store, cfg.student.image_size)
     training, held_out = split_items(store, frames)
+    sampler = ItemSampler(training, frames, cfg.student.frames, cfg.seed)
     precision = resolve_precision(cfg.train.precision)
     cfg = replace(cfg, train=replace(cfg.train, precision=precision))
 
     log.info("training %s on %d items, computing in %s", cfg.student.name, len(training), precision)
     set_seed(cfg.seed)
-    model, processor = loading.load_base(
-        cfg.student, precision, lambda: tokenizer_corpus(training, frames, cfg.seed)
-    )
-    trainer = build_trainer(cfg, run, model, processor, training, held_out, frames)
+    corpus = partial(tokenizer_corpus, sampler)
+    model, processor = loading.load_base(cfg.student, precision, corpus)
+    measured = shuffled(held_out, cfg.seed)[: cfg.train.validation_items]
+    trainer = build_trainer(cfg, run, model, processor, sampler, measured)
     trainer.run()
+    log.info("measuring the base on %d items of held-out scenes", len(measured))
     metrics = trainer.probe.measure("words")
+    metrics |= measure_own_words(model, processor, sampler, measured, cfg.student, precision)
     # A base is saved in bf16, as released bases are, whatever its precision in training.
     loading.save_student(model, processor, run.folder / "student", "bf16")
     log.info("the base is in %s", run.folder / "student")

@@ -64,36 +64,37 @@ class ItemSampler:
         return samples
 
     def sample(self, item: SelectionItem, kind: str | None, key: str) -> OracleSample:
-        """Return a sample of an item, with its candidates in random order.
+        """Return a sample of an item (see `ask`)."""
+        return self.make(*self.ask(item, kind, key))
+
+    def ask(
+        self, item: SelectionItem, kind: str | None, key: str
+    ) -> tuple[SelectionItem, Question]:
+        """Return an item with its candidates in random order, and a question about it.
 
         Args:
             kind: The kind of question; None asks none.
             key: Seed of the order and of the question, with the run's seed and the item.
         """
-        item, question = ask(item, kind, self.frames, self.seed, key)
+        rng = seeded_rng(self.seed, key, item.item_id)
+        item = reorder_candidates(item, rng.permutation(len(LETTERS)).tolist())
+        if kind is None:
+            return item, SILENT
+        scene = self.frames.scene(item.scene_id)
+        predicates = extract_predicates(item, scene, self.frames.scene, Bounds())
+        return item, KINDS[kind](predicates, item, rng)
+
+    def make(self, item: SelectionItem, question: Question) -> OracleSample:
+        """Return the sample of a question about an item."""
         return make_sample(item, question, self.frames, self.frame_count)
 
 
-def ask(
-    item: SelectionItem, kind: str | None, frames: FrameReader, *keys: int | str
-) -> tuple[SelectionItem, Question]:
-    """Return an item with its candidates in random order, and a question of a kind about it."""
-    rng = seeded_rng(*keys, item.item_id)
-    item = reorder_candidates(item, rng.permutation(len(LETTERS)).tolist())
-    if kind is None:
-        return item, SILENT
-    scene = frames.scene(item.scene_id)
-    predicates = extract_predicates(item, scene, frames.scene, Bounds())
-    return item, KINDS[kind](predicates, item, rng)
-
-
-def tokenizer_corpus(items: Sequence[SelectionItem], frames: FrameReader, seed: int) -> list[str]:
+def tokenizer_corpus(sampler: ItemSampler) -> list[str]:
     """Return texts to train the tokenizer on: the answers of the base, and prompts of students."""
+    items = sampler.items
     step = max(1, len(items) // CORPUS_ITEMS)
     answers = [
-        ask(item, kind, frames, seed, "tokenizer")[1].answer
-        for item in items[::step]
-        for kind in KINDS
+        sampler.ask(item, kind, "tokenizer")[1].answer for item in items[::step] for kind in KINDS
     ]
     outcome = ["Outcome: This layout is that of candidate", "shows this layout."]
     return prompt_corpus(items, [*QUESTIONS, *outcome]) + answers

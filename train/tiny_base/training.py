@@ -27,11 +27,9 @@ from conf.entry import Run
 from conf.errors import UserError
 from conf.schema import BaseCommand, BaseTrainConfig, StageConfig
 from data.records import COLORS, MATERIALS, SHAPES, SelectionItem
-from data.render.frame_cache import FrameReader
 from models.student.collator import IGNORED
 from teacher.predicates.facts import COMPASS
 from train.common.curves import plot_curves
-from train.common.held_out import shuffled
 from train.common.journal import CURVES, JOURNAL, read_journal
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import OracleHeads, OracleTargets, pointing_losses
@@ -222,23 +220,21 @@ def build_trainer(
     run: Run,
     model: PreTrainedModel,
     processor: ProcessorMixin,
-    training: Sequence[SelectionItem],
+    sampler: ItemSampler,
     held_out: Sequence[SelectionItem],
-    frames: FrameReader,
 ) -> BaseTrainer:
     """Return the trainer of a run.
 
     Args:
         cfg: Settings whose train.precision is bf16 or fp32, not auto.
+        held_out: Items on which the base is measured.
     """
     words = first_tokens(processor)
     objects = {kind: words[kind] for kind in ("color", "material", "shape")}
     heads = OracleHeads(model.get_input_embeddings(), objects)
     collate = OracleCollator(processor, cfg.student.max_length)
-    sampler = ItemSampler(training, frames, cfg.student.frames, cfg.seed)
-    chosen = shuffled(held_out, cfg.seed)[: cfg.train.validation_items]
-    samples = [sampler.sample(item, None, "held out") for item in chosen]
-    worded = {kind: [sampler.sample(i, kind, "held out") for i in chosen[::2]] for kind in KINDS}
+    samples = [sampler.sample(item, None, "held out") for item in held_out]
+    worded = {kind: [sampler.sample(i, kind, "held out") for i in held_out[::2]] for kind in KINDS}
     probe = Probe(model, heads, collate, samples, worded, words, cfg.train.precision == "bf16")
     return BaseTrainer(cfg.train, model, heads, collate, sampler, probe, run.folder)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from models import loading
 from tests.tiny_models import SMALL
 from train.base import main
 from train.common.held_out import held_out_scenes
-from train.tiny_base.data import split_items, tokenizer_corpus
+from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
 from train.tiny_base.training import STATE, BaseTrainer, build_trainer, schedule
 
 pytestmark = pytest.mark.slow
@@ -47,10 +48,11 @@ def start(cfg: BaseCommand, store: Store, folder: Path) -> BaseTrainer:
     frames = FrameReader(store, cfg.student.image_size)
     training, held_out = split_items(store, frames)
     set_seed(cfg.seed)
-    corpus = tokenizer_corpus(training, frames, cfg.seed)
-    model, processor = loading.load_base(cfg.student, "fp32", lambda: corpus)
-    run = Run("test", folder)
-    return build_trainer(cfg, run, model, processor, training, held_out, frames)
+    sampler = ItemSampler(training, frames, cfg.student.frames, cfg.seed)
+    corpus = partial(tokenizer_corpus, sampler)
+    model, processor = loading.load_base(cfg.student, "fp32", corpus)
+    measured = held_out[: cfg.train.validation_items]
+    return build_trainer(cfg, Run("test", folder), model, processor, sampler, measured)
 
 
 @pytest.mark.parametrize("stopped_after", [3, 6, 13])

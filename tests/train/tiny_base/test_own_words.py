@@ -1,0 +1,54 @@
+"""What the tiny base says is measured against the oracle."""
+
+from __future__ import annotations
+
+import pytest
+
+from data.render.frame_cache import FrameReader
+from data.store import Store
+from models.student.responses import GeneratedText
+from train.tiny_base import own_words
+from train.tiny_base.data import ItemSampler, split_items
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def measure(micro_store: Store, model, processor, student_cfg, monkeypatch: pytest.MonkeyPatch):
+    """Measure answers that a function makes of the true ones."""
+    frames = FrameReader(micro_store, student_cfg.image_size)
+    items, _ = split_items(micro_store, frames)
+    sampler = ItemSampler(items, frames, 4, 0)
+
+    def measure_answers(change) -> dict[str, float]:
+        true = [
+            sampler.ask(item, kind, "held out")[1].answer
+            for kind in own_words.SECTIONS
+            for item in items[: own_words.BATCH]
+        ]
+        batches = iter(
+            [true[k : k + own_words.BATCH] for k in range(0, len(true), own_words.BATCH)]
+        )
+        monkeypatch.setattr(
+            own_words, "generate", lambda *_: [GeneratedText(change(t)) for t in next(batches)]
+        )
+        return own_words.measure_own_words(
+            model, processor, sampler, items[: own_words.BATCH], student_cfg, "fp32"
+        )
+
+    return measure_answers
+
+
+def test_true_answers_are_right_in_every_respect(measure) -> None:
+    measures = measure(lambda text: text)
+    assert {"said_region/predict", "said_color/parse", "said_name/describe"} <= measures.keys()
+    assert set(measures.values()) == {1.0}
+
+
+def test_false_words_are_noticed(measure) -> None:
+    metal = measure(lambda text: text.replace(" rubber ", " metal "))
+    # Another object may have the false material, and then seems to be meant.
+    assert metal["said_material/parse"] < metal["said_color/parse"]
+    assert metal["said_name/parse"] < 0.8
+    regions = measure(lambda text: text.replace("near the ", "not near the "))
+    assert regions["said_region/predict"] == 0

@@ -1,0 +1,82 @@
+"""Measure what the tiny base says in its own words: its answers are generated, and their claims
+are compared with the oracle.
+
+    said_color/parse        share of the names in answers to `parse` whose colour is that of an
+                            object of the scene; likewise for material and shape
+    said_name/parse         share of the names that an object of the scene has
+    said_region/predict     share of the claims about regions in answers to `predict` that the
+                            oracle supports, of those that it can decide; likewise for other
+                            kinds of claims
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+
+from transformers import PreTrainedModel, ProcessorMixin
+
+from conf.schema import StudentConfig
+from data.records import SelectionItem
+from models.student.collator import Collator
+from models.student.generation import generate
+from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.relations import Bounds
+from teacher.validation.claim_extraction import extract_claims
+from train.tiny_base.data import ItemSampler
+from train.tiny_base.samples import NAME
+
+SECTIONS = {"parse": "", "predict": "", "describe": "Candidate analysis: "}
+"""The kinds of questions whose answers are read, and what they lack to be read as sections of a
+rationale. Answers to `compare` state predictions that need not be true."""
+WORDS = ("color", "material", "shape")
+BATCH = 32
+
+
+def measure_own_words(
+    model: PreTrainedModel,
+    processor: ProcessorMixin,
+    sampler: ItemSampler,
+    items: Sequence[SelectionItem],
+    student: StudentConfig,
+    precision: str,
+) -> dict[str, float]:
+    """Return the measures of answers about held-out items, by name."""
+    collate = Collator(processor, student.max_length)
+    limit = student.max_new_tokens
+    model.eval()
+    found: dict[str, list[bool]] = defaultdict(list)
+    for kind, section in SECTIONS.items():
+        for k in range(0, len(items), BATCH):
+            asked = [sampler.ask(item, kind, "held out") for item in items[k : k + BATCH]]
+            samples = [replace(sampler.make(*question).sample, response=None) for question in asked]
+            texts = generate(model, processor, collate(samples), limit, precision)
+            for (item, _), text in zip(asked, texts, strict=True):
+                for name, right in _read(section + text.text, item, sampler):
+                    found[f"said_{name}/{kind}"].append(right)
+    return {name: sum(values) / len(values) for name, values in found.items()}
+
+
+def _read(text: str, item: SelectionItem, sampler: ItemSampler) -> list[tuple[str, bool]]:
+    """Return what a text says, by the kind of word or claim, and whether it is right."""
+    scene = sampler.frames.scene
+    predicates = extract_predicates(item, scene(item.scene_id), scene, Bounds())
+    claims = [c for c in extract_claims(text, predicates) if c.kind != "mention"]
+    decided = [c for c in claims if c.verdict != "unknown"]
+    read = [(claim.kind, claim.verdict == "supported") for claim in decided]
+    objects = _names(item, sampler)
+    for match in NAME.finditer(text):
+        said = match.group().split()
+        # The object with most words in common is the one that is meant.
+        closest = max(objects, key=lambda o: sum(a == b for a, b in zip(o, said, strict=True)))
+        equal = [a == b for a, b in zip(closest, said, strict=True)]
+        read += [*zip(WORDS, equal, strict=True), ("name", all(equal))]
+    return read
+
+
+def _names(item: SelectionItem, sampler: ItemSampler) -> list[list[str]]:
+    """Return the words of the names of all objects in an item's frames."""
+    scenes = {item.scene_id, *(c.scene_id for c in item.candidates)}
+    names = {o.noun_phrase for scene in scenes for o in sampler.frames.scene(scene).objects}
+    return [name.split() for name in sorted(names)]
