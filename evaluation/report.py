@@ -24,6 +24,7 @@ def main(cfg: ReportCommand, run: Run) -> None:
         distinguish_item_sets,
         read_measurements,
     )
+    from evaluation.reporting.overview import write_overview
     from evaluation.reporting.page import render_page
     from evaluation.reporting.runs import RETRIEVAL_KINDS, SELECTION_KINDS, gather_runs
     from evaluation.reporting.sections import build_sections
@@ -58,6 +59,8 @@ def main(cfg: ReportCommand, run: Run) -> None:
         write_text(run.folder / name, content)
 
     log.info("%s", text)
+    if overview := write_overview(selections, retrievals, browser):
+        log.info("\n%s", overview)
     log.info("\ntables: %s\npage: %s", run.folder / "tables", run.folder / PAGE)
 
 

@@ -376,3 +376,15 @@ def test_invalid_patterns_are_refused_by_the_settings():
     assert ReportCommand(runs=["", "select/*"]).check()
     assert ReportCommand(items=-1).check()
     assert not ReportCommand(runs=["select/*"]).check()
+
+
+def test_the_overview_names_the_student_and_shows_responses(report, caplog):
+    caplog.set_level("INFO")
+    report(items=12)
+    overview = next(m for m in caplog.messages if "is right in" in m)
+    first, *rest = overview.strip().splitlines()
+    assert re.match(r"\w+ \(reasoning\) is right in \d+\.\d% \[", first)
+    assert "chance 25%" in first
+    assert "trained on answers alone" in first
+    assert any(line.startswith("emb finds the future frame among the first 10") for line in rest)
+    assert sum(line.startswith("Item ") for line in rest) >= 2

@@ -1,0 +1,98 @@
+"""The report's overview: what the trained models reach, in a line each, and responses in full."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from textwrap import indent
+
+from evaluation.metrics.baselines import TITLES
+from evaluation.metrics.intervals import Interval
+from evaluation.metrics.results import RetrievalResult
+from evaluation.reporting.item_browser import ItemBrowser
+from evaluation.reporting.measurements import Measurement, widest_results
+
+EXAMPLES = 5
+"""Number of responses that are shown."""
+CHANCE = 25.0
+"""Accuracy of random choices among four candidates, in percent."""
+
+
+def write_overview(
+    selections: Sequence[Measurement], retrievals: Sequence[Measurement], browser: ItemBrowser
+) -> str:
+    """Return the overview of a report; empty if no trained model was measured."""
+    students = [m for m in selections if m.trained and not m.variants]
+    reasoning = [m for m in students if m.result.mode == "reasoning"]
+    main = max(reasoning or students, key=lambda m: m.run.started, default=None)
+    lines = []
+    if main is not None:
+        lines.append(_describe_student(main, students, browser))
+        reasons = main.run.report.reasons.get(main.result.key)
+        if reasons is not None:
+            shares = {
+                part: percent(summary.supported)
+                for part, summary in reasons.parts.items()
+                if summary.supported is not None
+            }
+            said = ", ".join(f"{share} about the {part}" for part, share in shares.items())
+            lines.append(
+                f"Its claims that the oracle supports: {said}. Answers that are right for true "
+                f"reasons: {percent(reasons.true)}."
+            )
+    lines += _describe_retriever(retrievals)
+    if main is not None:
+        lines += _show_responses(main, browser)
+    return "\n".join(lines)
+
+
+def percent(interval: Interval) -> str:
+    value, low, high = (100 * x for x in (interval.value, interval.low, interval.high))
+    return f"{value:.1f}% [{low:.1f}, {high:.1f}]"
+
+
+def _describe_student(
+    main: Measurement, students: Sequence[Measurement], browser: ItemBrowser
+) -> str:
+    """Return the accuracy of a student, beside students that answer at once and the best baseline
+    that does not predict."""
+    beside = [f"chance {CHANCE:.0f}%"]
+    for m in students:
+        if m.group == main.group and m.regime == "answer_only":
+            beside.append(f"trained on answers alone {percent(m.result.micro)}")
+    rules = [r for r in browser.baselines.get(main.group, []) if r.name != TITLES["velocity"]]
+    if rules:
+        best = max(rules, key=lambda rule: rule.micro.value)
+        beside.append(f"best rule without prediction, {best.name}, {percent(best.micro)}")
+    return (
+        f"{main.label} is right in {percent(main.result.micro)} of {main.result.n:,} unseen items "
+        f"of {main.group} ({'; '.join(beside)})."
+    )
+
+
+def _describe_retriever(retrievals: Sequence[Measurement]) -> Iterator[str]:
+    widest = [m for m in widest_results(retrievals) if isinstance(m.result, RetrievalResult)]
+    for m in (m for m in widest if m.trained):
+        same = [w for w in widest if w.group == m.group and not w.trained]
+        beside = "".join(f"; {w.name} {100 * w.result.recall_10.value:.1f}%" for w in same)
+        yield (
+            f"{m.name} finds the future frame among the first 10 of {m.result.frames:,} in "
+            f"{percent(m.result.recall_10)} of {m.result.queries:,} queries{beside}."
+        )
+
+
+def _show_responses(main: Measurement, browser: ItemBrowser) -> Iterator[str]:
+    """Yield responses of a student, in turn to items that it solves and to others."""
+    shown = [
+        (entry, response)
+        for entry in browser.entries
+        for response in entry["responses"]
+        if entry["benchmark"] == main.group and response["model"] == main.label
+    ]
+    solved = [pair for pair in shown if pair[1]["verdict"] == "correct"]
+    others = [pair for pair in shown if pair[1]["verdict"] != "correct"]
+    for entry, response in [*solved[: EXAMPLES - EXAMPLES // 2], *others[: EXAMPLES // 2]]:
+        yield (
+            f"\nItem {entry['id']}: {entry['question']} The target is {entry['answer']}; the "
+            f"response is {response['verdict']}."
+        )
+        yield indent(response["text"], "    ")
