@@ -3,12 +3,14 @@
 Words are a thin signal: a text names a few objects, while the oracle knows every object in every
 picture. The heads are linear, so the base itself has to represent what they predict. They read
 
-    "seen"   visual tokens, as the vision tower gives them: colour, material, shape, whether the
-             centre of an object is in the token, where in the token, and velocity
-    "known"  visual tokens after the layer `MIDDLE`: place, whether the object moves, velocity,
-             displacements ahead, and displacement since the end of the clip
-    "named"  names of objects in a text after the layer `NAMING`: in which pictures the object is
-             visible and where, and its displacement up to the moment that the item asks for
+    "seen"     visual tokens, as the vision tower gives them: colour, material, shape, whether the
+               centre of an object is in the token, where in the token and in the image, velocity
+    "known"    visual tokens after the layer `MIDDLE`: place, whether the object moves, velocity,
+               displacements ahead, and displacement since the end of the clip
+    "spelled"  names of objects in a text after the layer `MIDDLE`: colour, material and shape, as
+               in "seen", so that attention can compare a name with visual tokens
+    "named"    names of objects in a text after the layer `NAMING`: in which pictures the object is
+               visible and where, and its displacement up to the moment that the item asks for
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
 at the tower's output and motion in the middle layers. Two further losses teach attention heads to
@@ -26,11 +28,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
-from data.records import COLORS, LETTERS, MATERIALS, SHAPES
+from data.records import LETTERS
 from train.tiny_base.oracle_targets import AHEAD
 from train.tiny_base.trace import NAMING, TRACKING, Trace
 
-WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
 PICTURES = 1 + len(LETTERS)
 """Pictures in which a named object is found: the last one of the clip, and the candidates."""
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
@@ -56,6 +57,7 @@ class OracleTargets:
         inside: (N, 2) place in the token, from -0.5 to 0.5.
         tracked: (K, 3) row, token of a candidate, and token of the same object in the clip.
         names: (M, 2) row and position of a name's last token.
+        named: (M,) the named object's colour, material and shape, by kind.
         found: (M, PICTURES) token of the named object in each picture, or -1.
         places: (M, 2 * PICTURES) its places, NaN where it is not visible.
         future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
@@ -68,6 +70,7 @@ class OracleTargets:
     inside: Tensor
     tracked: Tensor
     names: Tensor
+    named: dict[str, Tensor]
     found: Tensor
     places: Tensor
     future: Tensor
@@ -83,7 +86,7 @@ class OracleHeads(nn.Module):
     Args:
         embedding: The embedding of the language model's tokens. The vision tower's output has the
             same width.
-        word_ids: Tokens of the words of each kind of `WORDS`.
+        word_ids: Tokens of the words of each kind of `oracle_targets.WORDS`.
     """
 
     def __init__(self, embedding: nn.Embedding, word_ids: Mapping[str, list[int]]) -> None:
@@ -96,10 +99,12 @@ class OracleHeads(nn.Module):
         def heads(widths: Mapping[str, int]) -> nn.ModuleDict:
             return nn.ModuleDict({name: nn.Linear(hidden, n) for name, n in widths.items()})
 
-        self.seen = heads({"presence": 1, "inside": 2, "velocity": 2})
+        self.seen = heads({"presence": 1, "inside": 2, "velocity": 2, "place": 2})
         self.known = heads({"place": 2, "moving": 1} | dict.fromkeys(DISPLACEMENTS, 2))
         self.named = heads({"shown": PICTURES, "places": 2 * PICTURES, "future": 2})
-        self.norms = nn.ModuleDict({n: nn.LayerNorm(hidden) for n in ("seen", "known", "named")})
+        self.norms = nn.ModuleDict(
+            {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled")}
+        )
 
     def seen_losses(self, tokens: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the losses of the vision tower's output at all visual tokens, (B, T, H)."""
@@ -110,8 +115,9 @@ class OracleHeads(nn.Module):
         losses = {"presence": 2 * binary_cross_entropy_with_logits(presence, targets.presence)}
         for kind, logits in self.word_logits(seen).items():
             losses[kind] = cross_entropy(logits, targets.truth[kind])
-        truth = targets.truth | {"inside": targets.inside}
-        for name in ("inside", "velocity"):
+        place = targets.truth["place"] - 0.5
+        truth = targets.truth | {"inside": targets.inside, "place": place}
+        for name in ("inside", "velocity", "place"):
             losses[f"seen {name}"] = distance(self.seen[name](seen), truth[name], SCALES[name])
         return losses
 
@@ -176,6 +182,15 @@ class OracleHeads(nn.Module):
             found[f"{name}_error"] = (read[name] - truth[name]).norm(dim=1)[displaced]
             found[f"{name}_still"] = distances[displaced]
         return found
+
+    def spelled_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+        """Return the losses at names in texts, from the output of the layer `MIDDLE`, (B, L, H)."""
+        row, at = targets.names.T
+        spelled = self.norms["spelled"](hidden[row, at])
+        return {
+            kind: cross_entropy(logits, targets.named[kind])
+            for kind, logits in self.word_logits(spelled).items()
+        }
 
     def named_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the losses at names in texts, from the output of the layer `NAMING`, (B, L, H)."""

@@ -15,6 +15,8 @@ import torch
 
 from data.records import COLORS, MATERIALS, SHAPES, Scene
 
+WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
+"""The words of a noun phrase, in their order."""
 CLEARLY_VISIBLE = 0.3
 """An object has a target if its visible fraction is above this."""
 AHEAD = (10, 25, 50)
@@ -133,6 +135,16 @@ def largest_per_token(targets: Sequence[ObjectTarget], grid: int) -> list[Object
     return list(best.values())
 
 
+def name_words(names: Sequence[str]) -> dict[str, torch.Tensor]:
+    """Return the indices (N,) of the colours, materials and shapes in the noun phrases of N
+    objects."""
+    words = np.array([name.split() for name in names]).reshape(-1, 3)
+    return {
+        kind: torch.tensor([options.index(word) for word in column], dtype=torch.long)
+        for (kind, options), column in zip(WORDS.items(), words.T.tolist(), strict=True)
+    }
+
+
 def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, torch.Tensor]:
     """Return the properties of N targets as tensors.
 
@@ -140,12 +152,7 @@ def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, torch.Tensor]:
         `color`, `material` and `shape` (N,) indices; `place`, `velocity`, `since` and `ahead_<h>`
         (N, 2) for each h of `AHEAD`.
     """
-    words = np.array([t.name.split() for t in targets]).reshape(-1, 3)
-    kinds = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
-    stacked = {
-        kind: torch.tensor([names.index(word) for word in words[:, k].tolist()], dtype=torch.long)
-        for k, (kind, names) in enumerate(kinds.items())
-    }
+    stacked = name_words([t.name for t in targets])
 
     def pairs(values: list[tuple[float, float]]) -> torch.Tensor:
         return torch.tensor(values, dtype=torch.float32).reshape(-1, 2)

@@ -25,12 +25,12 @@ from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.relations import Bounds
 from teacher.validation.claim_extraction import extract_claims
 from train.tiny_base.data import ItemSampler
+from train.tiny_base.oracle_targets import WORDS
 from train.tiny_base.samples import NAME
 
 SECTIONS = {"parse": "", "predict": "", "describe": "Candidate analysis: "}
 """The kinds of questions whose answers are read, and what they lack to be read as sections of a
 rationale. Answers to `compare` state predictions that need not be true."""
-WORDS = ("color", "material", "shape")
 BATCH = 32
 
 

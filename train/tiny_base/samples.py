@@ -36,6 +36,7 @@ from train.tiny_base.oracle_targets import (
     future_displacements,
     image_targets,
     largest_per_token,
+    name_words,
     stack_targets,
 )
 from train.tiny_base.questions import Question
@@ -107,6 +108,7 @@ class OracleCollator:
         objects: list[tuple[int, int]] = []
         tracked: list[tuple[int, int, int]] = []
         names: list[tuple[int, int]] = []
+        named: list[str] = []
         found: list[list[int]] = []
         places: list[list[float]] = []
         future: list[tuple[float, float]] = []
@@ -122,6 +124,7 @@ class OracleCollator:
                     tracked.append((row, at[id(t)], at[id(where[s.last, t.name])]))
             for name, position in self._names(s.sample.response or ""):
                 names.append((row, length + position))
+                named.append(name)
                 pictures = [where.get((s.last + k, name)) for k in range(PICTURES)]
                 found.append([at[id(t)] if t else -1 for t in pictures])
                 places.append([x for t in pictures for x in (t.place if t else UNKNOWN)])
@@ -135,6 +138,7 @@ class OracleCollator:
             inside=truth["place"] * grid % 1 - 0.5,
             tracked=torch.tensor(tracked, dtype=torch.long).reshape(-1, 3),
             names=torch.tensor(names, dtype=torch.long).reshape(-1, 2),
+            named=name_words(named),
             found=torch.tensor(found, dtype=torch.long).reshape(-1, PICTURES),
             places=torch.tensor(places).reshape(-1, 2 * PICTURES) - 0.5,
             future=torch.tensor(future).reshape(-1, 2),

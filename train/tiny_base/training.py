@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 STAGES = ("eyes", "motion", "words")
 STATE = "state.pt"
-DENSE, POINTING, NAMED = 0.5, 0.3, 3.0
+DENSE, POINTING, NAMED = 0.5, 1.0, 3.0
 """Weights of losses in the stage of words, relative to the loss of the words: those at visual
 tokens, those of attention, and those at names."""
 
@@ -81,6 +81,8 @@ def words_losses(
     if len(targets.names):
         named = heads.named_losses(trace.outputs[NAMING], targets)
         losses |= {f"named {name}": NAMED * loss for name, loss in named.items()}
+        spelled = heads.spelled_losses(trace.outputs[MIDDLE], targets)
+        losses |= {f"spelled {kind}": DENSE * loss for kind, loss in spelled.items()}
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()
     losses["words"] = cross_entropy(predicted, following, ignore_index=IGNORED)
     return losses
