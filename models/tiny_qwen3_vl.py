@@ -59,7 +59,7 @@ def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditi
             "pad_token_id": padding,
             "rope_parameters": {
                 "rope_type": "default",
-                "rope_theta": 5e6,
+                "rope_theta": 1000.0,
                 "mrope_section": [half - height - width, height, width],
                 "mrope_interleaved": True,
             },
