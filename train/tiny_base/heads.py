@@ -11,11 +11,14 @@ picture. The heads are linear, so the base itself has to represent what they pre
                in "seen", so that attention can compare a name with visual tokens
     "named"    names of objects in a text after the layer `NAMING`: in which pictures the object is
                visible and where, and its displacement up to the moment that the item asks for
+    "spoken"   every token of a text from a name to the next, after the layer `SPEAKING`: place and
+               velocity of the named object in the picture that the text speaks of there
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
-at the tower's output and motion in the middle layers. Two further losses teach attention heads to
-find an object: at a visual token of a candidate, the same object at the end of the clip (layer
-`TRACKING`); at an object's name in a text, the object in each picture (layer `NAMING`).
+at the tower's output and motion in the middle layers. Further losses teach attention heads where
+to look: at a visual token of a candidate, the same object at the end of the clip (layer
+`TRACKING`); at an object's name in a text, the object in each picture (layer `NAMING`); after a
+name, this name and the letter of the candidate that the text speaks of (layer `RECALLING`).
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy,
 
 from data.records import LETTERS
 from train.tiny_base.oracle_targets import AHEAD
-from train.tiny_base.trace import NAMING, TRACKING, Trace
+from train.tiny_base.trace import NAMING, RECALLING, TRACKING, Trace
 
 PICTURES = 1 + len(LETTERS)
 """Pictures in which a named object is found: the last one of the clip, and the candidates."""
@@ -61,6 +64,10 @@ class OracleTargets:
         found: (M, PICTURES) token of the named object in each picture, or -1.
         places: (M, 2 * PICTURES) its places, NaN where it is not visible.
         future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
+        spoken: (S, 2) row and position of the tokens from each name to the next.
+        said: (S, 4) place and velocity of the object there, or NaN.
+        subjects: (_, 3) row, position after a name, and position of the name.
+        letters: (_, 3) row, position that speaks of a candidate, and position of its letter.
     """
 
     visual: Tensor
@@ -74,6 +81,10 @@ class OracleTargets:
     found: Tensor
     places: Tensor
     future: Tensor
+    spoken: Tensor
+    said: Tensor
+    subjects: Tensor
+    letters: Tensor
 
 
 class OracleHeads(nn.Module):
@@ -102,8 +113,9 @@ class OracleHeads(nn.Module):
         self.seen = heads({"presence": 1, "inside": 2, "velocity": 2, "place": 2})
         self.known = heads({"place": 2, "moving": 1} | dict.fromkeys(DISPLACEMENTS, 2))
         self.named = heads({"shown": PICTURES, "places": 2 * PICTURES, "future": 2})
+        self.spoken = heads({"place": 2, "velocity": 2})
         self.norms = nn.ModuleDict(
-            {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled")}
+            {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled", "spoken")}
         )
 
     def seen_losses(self, tokens: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
@@ -203,6 +215,17 @@ class OracleHeads(nn.Module):
             "future": distance(self.named["future"](named), targets.future, SCALES["since"]),
         }
 
+    def spoken_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+        """Return the losses at the tokens from each name to the next, from the output of the layer
+        `SPEAKING`, (B, L, H)."""
+        row, at = targets.spoken.T
+        spoken = self.norms["spoken"](hidden[row, at])
+        truth = dict(zip(("place", "velocity"), targets.said.split(2, dim=1), strict=True))
+        return {
+            name: distance(head(spoken), truth[name], SCALES[name])
+            for name, head in self.spoken.items()
+        }
+
     def named_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the errors of what the heads read at names, as shares of the image:
         `named_place_error`, and `named_future_error` beside `named_future_still`, the error of
@@ -227,7 +250,8 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     attention weight on the object's token.
 
     At a visual token, head 0 of layer `TRACKING` finds the object at the end of the clip. At a
-    name, head k of layer `NAMING` finds the object in picture k.
+    name, head k of layer `NAMING` finds the object in picture k. After a name, heads 0 and 1 of
+    layer `RECALLING` find this name and the letter of the candidate.
     """
     losses = {}
     row, start, end = targets.tracked.T
@@ -240,6 +264,12 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         if len(row):
             key = targets.visual[row, found[found >= 0]]
             losses[f"find {head}"] = -trace.log_attention(NAMING, head, row, query, key).mean()
+    for head, (name, pairs) in enumerate(
+        {"subject": targets.subjects, "letter": targets.letters}.items()
+    ):
+        row, query, key = pairs.T
+        if len(row):
+            losses[name] = -trace.log_attention(RECALLING, head, row, query, key).mean()
     return losses
 
 

@@ -25,8 +25,8 @@ from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.relations import Bounds
 from teacher.validation.claim_extraction import extract_claims
 from train.tiny_base.data import ItemSampler
+from train.tiny_base.mentions import NAME
 from train.tiny_base.oracle_targets import WORDS
-from train.tiny_base.samples import NAME
 
 SECTIONS = {"parse": "", "predict": "", "describe": "Candidate analysis: "}
 """The kinds of questions whose answers are read, and what they lack to be read as sections of a

@@ -6,7 +6,6 @@ of `train.tiny_base.questions`.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,10 +16,7 @@ from torch import Tensor
 from transformers import ProcessorMixin
 
 from data.records import (
-    COLORS,
     LETTERS,
-    MATERIALS,
-    SHAPES,
     SelectionItem,
     original_scene_id,
     sample_prefix_frames,
@@ -29,6 +25,7 @@ from data.render.frame_cache import FrameReader
 from models.student.collator import Collator
 from models.student.prompts import Sample, conversation, load_clip
 from train.tiny_base.heads import PICTURES, OracleTargets
+from train.tiny_base.mentions import Mention, find_mentions
 from train.tiny_base.oracle_targets import (
     UNKNOWN,
     ObjectTarget,
@@ -40,9 +37,6 @@ from train.tiny_base.oracle_targets import (
     stack_targets,
 )
 from train.tiny_base.questions import Question
-
-NAME = re.compile(" ".join(f"(?:{'|'.join(words)})" for words in (COLORS, MATERIALS, SHAPES)))
-"""Matches the noun phrase of an object."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +106,10 @@ class OracleCollator:
         found: list[list[int]] = []
         places: list[list[float]] = []
         future: list[tuple[float, float]] = []
+        spoken: list[tuple[int, int]] = []
+        said: list[tuple[float, ...]] = []
+        subjects: list[tuple[int, int, int]] = []
+        letters: list[tuple[int, int, int]] = []
         for row, s in enumerate(samples):
             largest = largest_per_token(s.targets, grid)
             at = {id(t): t.picture * grid**2 + t.cell(grid) for t in s.targets}
@@ -122,9 +120,20 @@ class OracleCollator:
             for t in largest:
                 if t.picture > s.last and (s.last, t.name) in where and not np.isnan(t.since[0]):
                     tracked.append((row, at[id(t)], at[id(where[s.last, t.name])]))
-            for name, position in self._names(s.sample.response or ""):
-                names.append((row, length + position))
+            mentions, tokens = find_mentions(s.sample.response or "", self._processor.tokenizer)
+            # The token that ends the turn follows the response.
+            first = length - tokens - 1
+            for m in mentions:
+                name, position = m.name, first + m.last
+                names.append((row, position))
                 named.append(name)
+                spoken += [(row, first + k) for k in range(m.last, m.stop)]
+                said += [spoken_state(s, where, m)] * (m.stop - m.last)
+                subjects += [(row, first + k, position) for k in range(m.last + 1, m.stop)]
+                if m.letter_at is not None:
+                    letters += [
+                        (row, first + k, first + m.letter_at) for k in range(m.last, m.stop)
+                    ]
                 pictures = [where.get((s.last + k, name)) for k in range(PICTURES)]
                 found.append([at[id(t)] if t else -1 for t in pictures])
                 places.append([x for t in pictures for x in (t.place if t else UNKNOWN)])
@@ -142,19 +151,27 @@ class OracleCollator:
             found=torch.tensor(found, dtype=torch.long).reshape(-1, PICTURES),
             places=torch.tensor(places).reshape(-1, 2 * PICTURES) - 0.5,
             future=torch.tensor(future).reshape(-1, 2),
+            spoken=torch.tensor(spoken, dtype=torch.long).reshape(-1, 2),
+            said=torch.tensor(said).reshape(-1, 4),
+            subjects=torch.tensor(subjects, dtype=torch.long).reshape(-1, 3),
+            letters=torch.tensor(letters, dtype=torch.long).reshape(-1, 3),
         )
 
-    def _names(self, response: str) -> list[tuple[str, int]]:
-        """Return the names of objects in a response, and the positions of their last tokens counted
-        from the end of the sequence, as negative numbers."""
-        tokens = self._processor.tokenizer(
-            response, add_special_tokens=False, return_offsets_mapping=True
-        )
-        offsets = tokens["offset_mapping"]
-        index = {end: k for k, (_, end) in enumerate(offsets)}
-        # The token that ends the turn follows the response.
-        return [
-            (match.group(), index[match.end()] - len(offsets) - 1)
-            for match in NAME.finditer(response)
-            if match.end() in index
-        ]
+
+def spoken_state(
+    sample: OracleSample, where: Mapping[tuple[int, str], ObjectTarget], mention: Mention
+) -> tuple[float, ...]:
+    """Return the place (from -0.5 to 0.5) and the velocity of a named object in the picture that
+    the text speaks of there; NaN where the oracle does not determine them."""
+    now = where.get((sample.last, mention.name))
+    place, velocity = UNKNOWN, UNKNOWN
+    if mention.letter is not None:
+        shown = where.get((sample.last + 1 + LETTERS.index(mention.letter), mention.name))
+        place = shown.place if shown else UNKNOWN
+    elif mention.section == "Prediction":
+        # The prediction of a question that shows candidates may be that of any of them.
+        moved = UNKNOWN if sample.sample.images else sample.future.get(mention.name, UNKNOWN)
+        place = (now.place[0] + moved[0], now.place[1] + moved[1]) if now else UNKNOWN
+    elif now is not None:
+        place, velocity = now.place, now.velocity
+    return place[0] - 0.5, place[1] - 0.5, *velocity

@@ -15,7 +15,7 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import apply_rotary_pos_emb
 
 from models.student.collator import MEDIA
 
-TRACKING, MIDDLE, NAMING = 1, 2, 3
+TRACKING, MIDDLE, NAMING, RECALLING, SPEAKING = 1, 2, 3, 4, 5
 """Indices of the language layers that the targets refer to (see `train.tiny_base.heads`)."""
 
 
@@ -75,8 +75,11 @@ def trace_forward(language_model: nn.Module, mask: Tensor) -> Iterator[Trace]:
 
     hooks = [language_model.register_forward_pre_hook(keep_inputs, with_kwargs=True)]
     hooks.append(layers[0].self_attn.register_forward_pre_hook(keep_rotary, with_kwargs=True))
-    hooks += [layers[k].register_forward_hook(keeper(trace.outputs, k)) for k in (MIDDLE, NAMING)]
-    for k in (TRACKING, NAMING):
+    hooks += [
+        layers[k].register_forward_hook(keeper(trace.outputs, k))
+        for k in (MIDDLE, NAMING, SPEAKING)
+    ]
+    for k in (TRACKING, NAMING, RECALLING):
         attention = layers[k].self_attn
         hooks.append(attention.q_norm.register_forward_hook(keeper(trace.queries, k)))
         hooks.append(attention.k_norm.register_forward_hook(keeper(trace.keys, k)))

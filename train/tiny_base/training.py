@@ -36,7 +36,15 @@ from train.tiny_base.heads import OracleHeads, OracleTargets, pointing_losses
 from train.tiny_base.probe import Probe
 from train.tiny_base.questions import KINDS
 from train.tiny_base.samples import OracleCollator
-from train.tiny_base.trace import MIDDLE, NAMING, see, select_tokens, trace_forward, trace_states
+from train.tiny_base.trace import (
+    MIDDLE,
+    NAMING,
+    SPEAKING,
+    see,
+    select_tokens,
+    trace_forward,
+    trace_states,
+)
 
 log = logging.getLogger(__name__)
 
@@ -81,6 +89,8 @@ def words_losses(
     if len(targets.names):
         named = heads.named_losses(trace.outputs[NAMING], targets)
         losses |= {f"named {name}": NAMED * loss for name, loss in named.items()}
+        spoken = heads.spoken_losses(trace.outputs[SPEAKING], targets)
+        losses |= {f"spoken {name}": NAMED * loss for name, loss in spoken.items()}
         spelled = heads.spelled_losses(trace.outputs[MIDDLE], targets)
         losses |= {f"spelled {kind}": DENSE * loss for kind, loss in spelled.items()}
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()

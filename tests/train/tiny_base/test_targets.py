@@ -13,6 +13,7 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import PICTURES, OracleHeads, distance, octant, pointing_losses
+from train.tiny_base.mentions import find_mentions
 from train.tiny_base.oracle_targets import (
     AHEAD,
     RATE,
@@ -23,8 +24,16 @@ from train.tiny_base.oracle_targets import (
     largest_per_token,
 )
 from train.tiny_base.questions import KINDS
-from train.tiny_base.samples import OracleCollator, OracleSample
-from train.tiny_base.trace import NAMING, TRACKING, see, select_tokens, trace_forward
+from train.tiny_base.samples import OracleCollator, OracleSample, spoken_state
+from train.tiny_base.trace import (
+    NAMING,
+    RECALLING,
+    SPEAKING,
+    TRACKING,
+    see,
+    select_tokens,
+    trace_forward,
+)
 from train.tiny_base.training import first_tokens, motion_losses, words_losses
 
 GRID = 3
@@ -58,7 +67,7 @@ def deep_model(model):
     from tests.tiny_models import SMALL
 
     model = build_model(
-        replace(SMALL, layers=NAMING + 2, heads=PICTURES, kv_heads=PICTURES),
+        replace(SMALL, layers=SPEAKING + 1, heads=PICTURES, kv_heads=PICTURES),
         model.config.text_config.vocab_size,
     )
     return model.eval()
@@ -150,6 +159,45 @@ def test_names_end_where_the_text_names_objects(samples, collate, processor) -> 
                 assert place.tolist() == pytest.approx(t.place, abs=1e-6)
 
 
+def test_texts_speak_of_the_last_name_and_letter(processor) -> None:
+    text = (
+        "Prediction: The red metal cube will be left of the blue metal cube. It is so.\n"
+        "Candidate analysis: Candidate B shows the red metal cube near the top."
+    )
+    ids = processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+    mentions, tokens = find_mentions(text, processor.tokenizer)
+    assert tokens == len(ids)
+    decode = processor.tokenizer.decode
+    assert [decode(ids[m.last : m.stop]).split()[1:] for m in mentions] == [
+        ["will", "be", "left", "of", "the"],
+        [],
+        ["near", "the", "top"],
+    ]
+    assert [(m.section, m.letter) for m in mentions] == [
+        ("Prediction", None),
+        ("Prediction", None),
+        ("Candidate analysis", "B"),
+    ]
+    assert decode(ids[mentions[2].letter_at]).strip() == "B"
+
+
+def test_spoken_states_are_those_of_the_oracle(samples, collate, processor) -> None:
+    _, targets = collate(samples)
+    assert len(targets.said) == len(targets.spoken) > 20
+    assert not targets.said[:, :2].isnan().all()
+    first = samples[0]
+    mentions, _ = find_mentions(first.sample.response, processor.tokenizer)
+    where = {(t.picture, t.name): t for t in first.targets}
+    compared = 0
+    for m in mentions:
+        said = spoken_state(first, where, m)
+        picture = first.last if m.letter is None else first.last + 1 + "ABCD".index(m.letter)
+        if m.section != "Prediction" and (shown := where.get((picture, m.name))):
+            assert np.add(said[:2], 0.5) == pytest.approx(shown.place)
+            compared += 1
+    assert compared
+
+
 def test_vision_tower_alone_gives_what_the_whole_model_embeds(samples, collate, deep_model) -> None:
     batch, targets = collate(samples)
     inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
@@ -160,7 +208,7 @@ def test_vision_tower_alone_gives_what_the_whole_model_embeds(samples, collate, 
     torch.testing.assert_close(alone, select_tokens(trace.embedded, targets.visual))
 
 
-@pytest.mark.parametrize("layer", [TRACKING, NAMING])
+@pytest.mark.parametrize("layer", [TRACKING, NAMING, RECALLING])
 def test_traced_attention_is_that_of_the_model(samples, collate, deep_model, layer: int) -> None:
     batch, targets = collate(samples)
     inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
@@ -181,7 +229,7 @@ def test_losses_train_the_layers_that_they_refer_to(samples, collate, deep_model
     losses["place"].backward(retain_graph=True)
     layers = deep_model.model.language_model.layers
     weights = [layer.mlp.down_proj.weight.grad for layer in layers]
-    assert [w is not None for w in weights] == [True, True, True, False, False]
+    assert [w is not None for w in weights] == [True] * 3 + [False] * 3
     deep_model.zero_grad(set_to_none=True)
     losses["color"].backward()
     assert layers[0].mlp.down_proj.weight.grad is None
@@ -195,6 +243,7 @@ def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, hea
     for _ in range(8):
         losses = words_losses(deep_model, heads, batch, targets)
         assert {"words", "track", "find 0", "named places", "color", "since"} <= losses.keys()
+        assert {"subject", "letter", "spoken place", "spelled color"} <= losses.keys()
         total = sum(losses.values())
         optimizer.zero_grad()
         total.backward()
@@ -210,7 +259,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate
 
     _, targets = collate(samples)
     losses = pointing_losses(Certain(), targets)
-    assert len(losses) == 6
+    assert len(losses) == 8
     assert not any(loss.item() for loss in losses.values())
 
 

@@ -26,7 +26,7 @@ from train.tiny_base.training import STATE, BaseTrainer, build_trainer, schedule
 
 pytestmark = pytest.mark.slow
 
-SIZES = replace(SMALL, layers=5, heads=5, kv_heads=5)
+SIZES = replace(SMALL, layers=6, heads=5, kv_heads=5)
 STAGE = StageConfig(steps=4, batch=2, lr=1e-3)
 
 
