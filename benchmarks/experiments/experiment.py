@@ -87,22 +87,28 @@ class Experiment:
         return results
 
     def train_and_evaluate(
-        self, name: str, training: Sequence[str] | None, evaluation: Sequence[str] = ()
+        self,
+        name: str,
+        training: Sequence[str] | None,
+        evaluation: Sequence[str] = (),
+        trained: str | None = None,
     ) -> Path:
         """Train and evaluate a variant, and return the folder of the evaluation.
 
         Args:
+            name: Run of the evaluation.
             training: Overrides of the training; None evaluates an untrained model.
             evaluation: Overrides of the evaluation.
+            trained: Run of the training; by default, that of the evaluation.
         """
-        shared = [*self.shared_overrides, f"run={name}"]
+        trained = trained or name
         if training is not None:
-            run_command([self.trainer, *training, *shared])
+            run_command([self.trainer, *training, *self.shared_overrides, f"run={trained}"])
             kind = self.trainer.partition(".")[2]
-            evaluation = [*evaluation, f"model={self.args.checkpoints / kind / name}"]
+            evaluation = [*evaluation, f"model={self.args.checkpoints / kind / trained}"]
         folder = self.args.checkpoints / self.evaluator.partition(".")[2] / name
         if not (folder / "metrics.json").exists():
-            run_command([self.evaluator, *evaluation, *shared])
+            run_command([self.evaluator, *evaluation, *self.shared_overrides, f"run={name}"])
         return folder
 
 

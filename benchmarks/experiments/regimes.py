@@ -1,17 +1,20 @@
-"""Compares the paper's training regimes at tiny scale: zero-shot, answer-only, CoT, CoT without the
-candidate analysis, and CoT without the match layout, on more than a thousand test items.
+"""Compares ways to train a student at tiny scale, on more than a thousand test items: zero-shot,
+answers alone, rationales in the paper's vocabulary and in relational words, and the latter without
+the candidate analysis or without the match layout.
 
     python -m benchmarks.experiments.regimes            # train and evaluate what is missing
     python -m benchmarks.experiments.regimes --table    # print the recorded results
 
-Every chosen letter is recorded in `letters.parquet`, one row per test item, run and mode, together
-with the hash of the base's weights. Accuracies are means over three seeds; intervals are 95%
+`--benchmark comparison_balanced` measures on balanced items. Every chosen letter is recorded in
+`letters.parquet`, one row per test item, run, mode and control, with the hash of the base's
+weights and what the response claims. Accuracies are means over three seeds; intervals are 95%
 percentile intervals of a bootstrap that resamples scenes and seeds.
 """
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,29 +23,61 @@ import pandas as pd
 
 from benchmarks.experiments.experiment import Experiment, Job, create_parser
 from conf.compose import compose
+from conf.files import read_json_lines
 from conf.schema import SelectCommand, SftCommand
-from data.records import FAMILIES
-from data.store import open_store
+from data.records import FAMILIES, SelectionItem
+from data.store import Store, open_store
+from data.tracks.controls import MATCHED_ANCHOR
+from evaluation.metrics.reasons import PARTS, SUPPORTED, read_reasons
 from models.fingerprints import weights_digest
 
 LETTERS = Path(__file__).with_name("letters.parquet")
-MODES = {
-    "zero-shot": ("reasoning", "answer"),
-    "answer_only": ("answer",),
-    "cot": ("reasoning", "answer"),
-    "cot_no_candidate_analysis": ("reasoning", "answer"),
-    "cot_no_match_layout": ("reasoning", "answer"),
+BOTH = ("reasoning", "answer")
+RELATIONAL = "teacher.predicates=relational"
+ZERO_SHOT = "zero-shot"
+UNCHANGED = "none"
+CONTROLS = ("candidate_only", "shuffled_prefix", MATCHED_ANCHOR)
+"""Overlays of `evaluation.select`: without the prefix, with its frames shuffled, and on pairs of
+items whose question names the target's moment by an event or by a time."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to train a student.
+
+    Attributes:
+        training: Overrides of `train.sft`; None leaves the base untrained.
+        modes: Modes of its evaluation.
+        controls: Whether it is also evaluated under `CONTROLS`.
+    """
+
+    training: tuple[str, ...] | None
+    modes: tuple[str, ...] = BOTH
+    controls: bool = False
+
+
+VARIANTS = {
+    ZERO_SHOT: Variant(None),
+    "answers alone": Variant(("+exp=answer_only",), ("answer",), controls=True),
+    "CoT": Variant(("+exp=cot",)),
+    "relational CoT": Variant(("+exp=cot", RELATIONAL), controls=True),
+    "relational CoT without candidate analysis": Variant(
+        ("+exp=cot_no_candidate_analysis", RELATIONAL)
+    ),
+    "relational CoT without match layout": Variant(("+exp=cot_no_match_layout", RELATIONAL)),
 }
-"""The modes in which each regime is evaluated. Zero-shot decodes greedily, so it has one seed."""
+MAIN = ("relational CoT", "reasoning")
 PAIRS = (
-    (("cot", "reasoning"), ("answer_only", "answer")),
-    (("cot", "answer"), ("answer_only", "answer")),
-    (("cot", "reasoning"), ("cot", "answer")),
-    (("cot", "reasoning"), ("cot_no_candidate_analysis", "reasoning")),
-    (("cot", "reasoning"), ("cot_no_match_layout", "reasoning")),
-    (("cot", "reasoning"), ("zero-shot", "reasoning")),
+    (MAIN, ("answers alone", "answer")),
+    (MAIN, ("CoT", "reasoning")),
+    (MAIN, ("relational CoT", "answer")),
+    (MAIN, ("relational CoT without candidate analysis", "reasoning")),
+    (MAIN, ("relational CoT without match layout", "reasoning")),
+    (MAIN, (ZERO_SHOT, "reasoning")),
+    (("CoT", "reasoning"), ("answers alone", "answer")),
+    (("relational CoT", "answer"), ("answers alone", "answer")),
 )
-"""The regimes and modes that the second table compares: first minus second."""
+"""The variants and modes that the second table compares: first minus second."""
 DRAWS = 4000
 """Number of bootstrap samples."""
 
@@ -50,75 +85,179 @@ DRAWS = 4000
 def main() -> None:
     parser = create_parser(__doc__, "comparison", LETTERS)
     parser.add_argument("--student", default="tiny")
+    parser.add_argument("--variants", nargs="+", choices=[*VARIANTS], default=[*VARIANTS])
     args = parser.parse_args()
     preset = compose("train.sft", SftCommand, [f"student={args.student}"]).student
     base = weights_digest(preset.model)
     identity = {"base": base, "benchmark": args.benchmark}
-    experiment = Experiment(args, identity, "regime", "train.sft", "evaluation.select")
+    experiment = Experiment(args, identity, "variant", "train.sft", "evaluation.select")
 
     def evaluate(job: Job) -> list[dict[str, Any]]:
-        regime, seed = job
-        student = f"student={args.student}"
-        training = [f"+exp={regime}", f"seed={seed}", student]
+        name, seed = job
+        variant, student = VARIANTS[name], f"student={args.student}"
+        folder = f"{args.benchmark}-{base[:8]}-{name.replace(' ', '_')}-{seed}"
+        training = variant.training and [*variant.training, f"seed={seed}", student]
         # The default modes ask a base for a structured record, which the tiny base cannot write.
-        zero_shot = regime == "zero-shot"
-        folder = experiment.train_and_evaluate(
-            f"{args.benchmark}-{base[:8]}-{regime}-{seed}",
-            None if zero_shot else training,
-            [student, "batch=64", *(["modes=[reasoning,answer]"] if zero_shot else [])],
-        )
-        return read_letters(folder, Path(args.store), args.benchmark, regime)
+        modes = f"modes=[{','.join(variant.modes)}]"
+        evaluation = [student, "batch=64", modes]
+        rows = []
+        for control in (UNCHANGED, *(CONTROLS if variant.controls else ())):
+            changed = control != UNCHANGED
+            run = experiment.train_and_evaluate(
+                f"{folder}-{control}" if changed else folder,
+                training,
+                [*evaluation, *([f"+exp={control}"] if changed else [])],
+                trained=folder,
+            )
+            store = open_benchmark(Path(args.store), args.benchmark)
+            rows += read_letters(run, store, control, variant.modes)
+        return rows
 
-    # Sorted by seed, so that an interrupted experiment has fewer seeds of every regime.
-    trained = [regime for regime in MODES if regime != "zero-shot"]
-    jobs = [("zero-shot", 0), *((r, seed) for seed in range(args.seeds) for r in trained)]
+    # Sorted by seed, so that an interrupted experiment has fewer seeds of every variant.
+    trained = [name for name in args.variants if name != ZERO_SHOT]
+    jobs = [(ZERO_SHOT, 0)] if ZERO_SHOT in args.variants else []
+    jobs += [(name, seed) for seed in range(args.seeds) for name in trained]
     print_tables(experiment.run(jobs, evaluate))
 
 
-def read_letters(folder: Path, store: Path, benchmark: str, regime: str) -> list[dict[str, Any]]:
-    """Return the rows of a run: the chosen letter for each test item in each mode."""
+def open_benchmark(store: Path, benchmark: str) -> Store:
     cfg = compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
-    lines = [json.loads(line) for line in (folder / "answers.jsonl").read_text().splitlines()]
-    letters = {(r["item_id"], r["mode"]): r["letter"] for r in lines if "item_id" in r}
-    return [
-        {
-            "mode": mode, "item_id": item.item_id, "family": item.family,
-            "scene_id": item.scene_id, "answer": item.letter, "letter": letters[item.item_id, mode],
-        }
-        for item in open_store(store / cfg.name).selection("test")
-        for mode in MODES[regime]
-    ]  # fmt: skip
+    return open_store(store / cfg.store_name)
+
+
+def read_letters(
+    folder: Path, store: Store, control: str, modes: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return the rows of a run: the chosen letter for each test item in each mode, and what the
+    response claims."""
+    lines = [line for line in read_json_lines(folder / "answers.jsonl") if "item_id" in line]
+    keys = {
+        line["key"]: line["asked"].get("control") or UNCHANGED
+        for line in read_json_lines(folder / "answers.jsonl")
+        if "asked" in line
+    }
+    suite = MATCHED_ANCHOR if control == MATCHED_ANCHOR else None
+    wanted = UNCHANGED if suite else control
+    answers = {(r["item_id"], r["mode"]): r for r in lines if keys[r["key"]] == wanted}
+    rows = []
+    for item in store.selection("test", suite):
+        for mode in modes:
+            answer = answers[item.item_id, mode]
+            row = {
+                "mode": mode, "control": control, "item_id": item.item_id, "family": item.family,
+                "scene_id": item.scene_id, "answer": item.letter, "letter": answer["letter"],
+            }  # fmt: skip
+            rows.append(row | dict(count_claims(item, answer, store)))
+    return rows
+
+
+def count_claims(
+    item: SelectionItem, answer: dict[str, Any], store: Store
+) -> Iterator[tuple[str, Any]]:
+    """Yield columns with what a response in reasoning mode claims (see `read_reasons`)."""
+    if answer["mode"] != "reasoning":
+        return
+    reasons = read_reasons(item, answer["text"], answer["letter"], store)
+    if reasons is None:
+        return
+    for part in PARTS:
+        claims = reasons.claims[part]
+        yield f"{part}_claims", len(claims)
+        yield f"{part}_supported", sum(c.verdict == SUPPORTED for c in claims)
+    yield "follows", reasons.follows
+    yield "true_reasons", reasons.true
 
 
 def print_tables(table: pd.DataFrame) -> None:
-    """Print the accuracies of regimes and modes, then the differences in `PAIRS`, in percent."""
-    groups = [(regime, mode) for regime in MODES for mode in MODES[regime]]
-    correct = {g: credit_matrix(table, *g) for g in groups}
+    """Print the accuracies of variants and modes, their differences, the controls, and what the
+    responses claim, in percent."""
+    unchanged = table[table.control == UNCHANGED]
+    groups = [(name, mode) for name, v in VARIANTS.items() for mode in v.modes]
+    correct = {g: credit_matrix(unchanged, *g) for g in groups}
     correct = {group: credits for group, credits in correct.items() if credits.shape[1]}
     resampling = Resampling(next(iter(correct.values())).index)
-    print("| | mode | " + " | ".join(FAMILIES) + " | macro | by seed | parsed |")
-    print("|---" * (len(FAMILIES) + 5) + "|")
-    for (regime, mode), credits in correct.items():
-        rows = table[(table.regime == regime) & (table["mode"] == mode)]
+    print_accuracies(unchanged, correct, resampling)
+    print_differences(correct, resampling)
+    print_controls(table, correct, resampling)
+    print_claims(unchanged)
+
+
+def print_accuracies(
+    table: pd.DataFrame, correct: dict[tuple[str, str], pd.DataFrame], resampling: Resampling
+) -> None:
+    print_header("", "mode", *FAMILIES, "macro", "by seed", "parsed")
+    for (name, mode), credits in correct.items():
+        rows = table[(table.variant == name) & (table["mode"] == mode)]
         seeds = [100 * resampling.means(credits[[seed]])[-1] for seed in credits]
         cells = [
             f"{m:.1f} [{low:.1f}, {high:.1f}]" for m, low, high in resampling.intervals(credits)
         ]
-        cells += [" ".join(f"{s:.1f}" for s in seeds), f"{100 * rows.letter.notna().mean():.1f}"]
-        print(f"| {regime} | {mode} | " + " | ".join(cells) + " |", flush=True)
-    print("\n| difference | " + " | ".join(FAMILIES) + " | macro |")
-    print("|---" * (len(FAMILIES) + 2) + "|")
+        by_seed = " ".join(f"{s:.1f}" for s in seeds)
+        print_row(name, mode, *cells, by_seed, f"{100 * rows.letter.notna().mean():.1f}")
+
+
+def print_differences(correct: dict[tuple[str, str], pd.DataFrame], resampling: Resampling) -> None:
+    print_header("difference", *FAMILIES, "macro")
     for first, second in PAIRS:
         if first in correct and second in correct:
             intervals = resampling.intervals(correct[first], correct[second])
-            cells = [f"{m:+.1f} [{low:+.1f}, {high:+.1f}]" for m, low, high in intervals]
-            title = f"{' '.join(first)} minus {' '.join(second)}"
-            print(f"| {title} | " + " | ".join(cells) + " |", flush=True)
+            title = f"{', '.join(first)} minus {', '.join(second)}"
+            print_row(title, *(f"{m:+.1f} [{low:+.1f}, {high:+.1f}]" for m, low, high in intervals))
 
 
-def credit_matrix(table: pd.DataFrame, regime: str, mode: str) -> pd.DataFrame:
+def print_controls(
+    table: pd.DataFrame, correct: dict[tuple[str, str], pd.DataFrame], resampling: Resampling
+) -> None:
+    """Print the macro accuracy under the controls and its difference from the unchanged items, and
+    the accuracies on matched-anchor pairs by what names the moment."""
+    controls = [control for control in CONTROLS if control != MATCHED_ANCHOR]
+    print_header("macro", "unchanged", *controls, "pairs, event", "pairs, time")
+    for (name, mode), credits in correct.items():
+        if not VARIANTS[name].controls:
+            continue
+        cells = [f"{100 * resampling.means(credits)[-1]:.1f}"]
+        for control in controls:
+            changed = credit_matrix(table[table.control == control], name, mode)
+            m, low, high = resampling.intervals(changed, credits)[-1]
+            mean = 100 * resampling.means(changed)[-1]
+            cells.append(f"{mean:.1f} ({m:+.1f} [{low:+.1f}, {high:+.1f}])")
+        pairs = credit_matrix(table[table.control == MATCHED_ANCHOR], name, mode)
+        by_family = pairs.groupby("family").mean().mean(axis=1)
+        cells += [f"{100 * by_family[family]:.1f}" for family in ("event", "time")]
+        print_row(f"{name}, {mode}", *cells)
+
+
+def print_claims(table: pd.DataFrame) -> None:
+    """Print how many claims the responses in reasoning mode make, and the shares of them that the
+    oracle supports."""
+    reasoning = table[(table["mode"] == "reasoning") & table.follows.notna()]
+    columns = [f"{part}: claims, true" for part in PARTS]
+    print_header("claims", *columns, "answer follows", "right for true reasons")
+    for name in VARIANTS:
+        rows = reasoning[reasoning.variant == name]
+        if len(rows):
+            cells = []
+            for part in PARTS:
+                claims, supported = rows[f"{part}_claims"].sum(), rows[f"{part}_supported"].sum()
+                share = f"{100 * supported / claims:.1f}" if claims else "-"
+                cells.append(f"{claims / len(rows):.1f}, {share}")
+            shares = (rows.follows.astype(float), rows.true_reasons.astype(float))
+            print_row(name, *cells, *(f"{100 * share.mean():.1f}" for share in shares))
+
+
+def print_header(*titles: str) -> None:
+    print()
+    print_row(*titles)
+    print("|---" * len(titles) + "|")
+
+
+def print_row(*cells: str) -> None:
+    print("| " + " | ".join(cells) + " |", flush=True)
+
+
+def credit_matrix(table: pd.DataFrame, variant: str, mode: str) -> pd.DataFrame:
     """Return 1 for each right answer and 0 for each wrong one, (items, seeds)."""
-    rows = table[(table.regime == regime) & (table["mode"] == mode)]
+    rows = table[(table.variant == variant) & (table["mode"] == mode)]
     credits = (rows.letter == rows.answer).astype(float)
     return credits.groupby([rows.family, rows.scene_id, rows.item_id, rows.seed]).sum().unstack()
 
@@ -126,8 +265,8 @@ def credit_matrix(table: pd.DataFrame, regime: str, mode: str) -> pd.DataFrame:
 class Resampling:
     """A bootstrap over scenes and seeds of the accuracy in each family and their mean, the macro.
 
-    All regimes share the resampled scenes. Their seeds are resampled independently, since runs of
-    two regimes with the same seed have nothing in common but its number.
+    All variants share the resampled scenes. Their seeds are resampled independently, since runs of
+    two variants with the same seed have nothing in common but its number.
     """
 
     def __init__(self, items: pd.MultiIndex) -> None:
