@@ -66,8 +66,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--benchmark",
         type=Path,
-        help="folder of a built benchmark, such as store/tiny, that the tests of built benchmarks "
-        "use instead of the small one",
+        help="folder of a built benchmark, such as store/tiny-above, that the tests of built "
+        "benchmarks use instead of the small one",
     )
 
 

@@ -1,4 +1,4 @@
-"""Train a student on rationales or answers, by default with LoRA over a frozen 4-bit base."""
+"""Train a student on rationales or answers, with LoRA over a frozen base."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Measure what the tiny base says in its own words: its answers are generated, and their claims
 are compared with the oracle.
 
-    said_color/parse        share of the names in answers to `parse` whose colour is that of an
-                            object of the scene; likewise for material and shape
-    said_name/parse         share of the names that an object of the scene has
+    said_name/parse         share of the names in answers to `parse` that a shown object has
+    said_color/parse        share of the names whose colour is that of the shown object with which
+                            the name shares most words; likewise for material and shape
     said_region/predict     share of the claims about regions in answers to `predict` that the
                             oracle supports, of those that it can decide; likewise for other
                             kinds of claims
@@ -53,19 +53,21 @@ def measure_own_words(
             samples = [replace(sampler.make(*question).sample, response=None) for question in asked]
             texts = generate(model, processor, collate(samples), limit, precision)
             for (item, _), text in zip(asked, texts, strict=True):
-                for name, right in _read(section + text.text, item, sampler):
+                for name, right in _read(section + text.text, item, kind, sampler):
                     found[f"said_{name}/{kind}"].append(right)
     return {name: sum(values) / len(values) for name, values in found.items()}
 
 
-def _read(text: str, item: SelectionItem, sampler: ItemSampler) -> list[tuple[str, bool]]:
-    """Return what a text says, by the kind of word or claim, and whether it is right."""
+def _read(
+    text: str, item: SelectionItem, kind: str, sampler: ItemSampler
+) -> list[tuple[str, bool]]:
+    """Return what an answer says, by the kind of word or claim, and whether it is right."""
     scene = sampler.frames.scene
     predicates = extract_predicates(item, scene(item.scene_id), scene, Bounds())
     claims = [c for c in extract_claims(text, predicates) if c.kind != "mention"]
     decided = [c for c in claims if c.verdict != "unknown"]
     read = [(claim.kind, claim.verdict == "supported") for claim in decided]
-    objects = _names(item, sampler)
+    objects = _shown_names(item, kind, sampler)
     for match in NAME.finditer(text):
         said = match.group().split()
         # The object with most words in common is the one that is meant.
@@ -75,8 +77,9 @@ def _read(text: str, item: SelectionItem, sampler: ItemSampler) -> list[tuple[st
     return read
 
 
-def _names(item: SelectionItem, sampler: ItemSampler) -> list[list[str]]:
-    """Return the words of the names of all objects in an item's frames."""
-    scenes = {item.scene_id, *(c.scene_id for c in item.candidates)}
+def _shown_names(item: SelectionItem, kind: str, sampler: ItemSampler) -> list[list[str]]:
+    """Return the words of the names of all objects in the scenes that a kind of question shows."""
+    shows_candidates = kind == "describe"
+    scenes = {c.scene_id for c in item.candidates} if shows_candidates else {item.scene_id}
     names = {o.noun_phrase for scene in scenes for o in sampler.frames.scene(scene).objects}
     return [name.split() for name in sorted(names)]

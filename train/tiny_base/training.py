@@ -51,8 +51,8 @@ log = logging.getLogger(__name__)
 STAGES = ("eyes", "motion", "words")
 STATE = "state.pt"
 DENSE, POINTING, NAMED = 0.5, 1.0, 3.0
-"""Weights of losses in the stage of words, relative to the loss of the words: those at visual
-tokens, those of attention, and those at names."""
+"""Weights of losses in the stage of words, relative to the loss of the words: those of what visual
+tokens and names show, those of attention, and those of places and motion in texts."""
 
 
 def eyes_losses(
