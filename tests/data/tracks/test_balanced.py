@@ -419,7 +419,6 @@ def test_scores_of_items_are_those_that_were_balanced(
     built = np.concatenate(pools)
     assert len(built) == len(scores)
     # Neither the order of the families nor that of the distractors is the same.
-    ordered = [np.sort(s[..., 1:]).round(5).tolist() for s in (built, scores)]
-    targets = [s[..., 0].round(5).tolist() for s in (built, scores)]
-    first, second = (sorted(zip(t, o, strict=True)) for t, o in zip(targets, ordered, strict=True))
-    assert first == second
+    rows = [np.concatenate([s[..., :1], np.sort(s[..., 1:])], axis=-1) for s in (built, scores)]
+    first, second = (r[np.argsort(r[:, 0, 0])] for r in rows)
+    np.testing.assert_allclose(first, second, rtol=1e-6, atol=1e-6)

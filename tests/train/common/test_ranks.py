@@ -74,12 +74,15 @@ def overrides(settings: SftCommand | ContrastiveCommand, folder: Path) -> list[s
 def plan_student(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any]:
     """Describe the run of a student for launched.py."""
     student = settings.student
-    keys = ("name", "model", "quantization", "image_size", "max_length", "max_new_tokens")
+    keys = (
+        "name", "model", "quantization", "image_size", "frames", "max_length", "max_new_tokens",
+    )  # fmt: skip
     command = [
         "+exp=cot",
         *overrides(settings, folder),
         *(f"student.{key}={getattr(student, key)}" for key in keys),
         f"student.lora.rank={student.lora.rank}",
+        f"student.lora.alpha={student.lora.alpha}",
     ]
     plan = {"trainer": "sft", "fsdp": False, "checkpoint": None, "failing_rank": None}
     return {**plan, "overrides": command, "folder": folder, **changes}
@@ -104,6 +107,7 @@ def plan_retriever(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]
         *model,
         *overrides(settings, folder),
         f"retriever.image_size={retriever.image_size}",
+        f"retriever.frames={retriever.frames}",
         f"retriever.widths={retriever.widths}",
     ]
     plan = {"trainer": "contrastive", "fsdp": False, "checkpoint": None, "failing_rank": None}
