@@ -127,13 +127,18 @@ class RelationalWriter(Writer):
         if not self.statements:
             return super().judgement(candidate)
         view = self.view_of[candidate.letter]
-        for s in self.statements:
-            if normalize_relation(s) not in view.statements:
-                return self.contrast(s, view)
+        if (wrong := self.find_false(view)) is not None:
+            return self.contrast(wrong, view)
         text = f"shows {self.all_shown()}"
         if candidate.agrees:
             return f"{text}, and agrees"
         return f"{text} but {self.difference(candidate.differences[0])}"
+
+    def find_false(self, view: View) -> Relation | None:
+        """Return the first deciding statement that is false of a candidate."""
+        return next(
+            (s for s in self.statements if normalize_relation(s) not in view.statements), None
+        )
 
     def contrast(self, s: Relation, view: View) -> str:
         """State how a candidate differs from a deciding statement that is false of it."""
@@ -155,9 +160,8 @@ class RelationalWriter(Writer):
         if candidate.agrees or not self.statements:
             return super().match(candidate)
         view = self.view_of[candidate.letter]
-        for s in self.statements:
-            if normalize_relation(s) not in view.statements:
-                return f"Candidate {candidate.letter} does not match: it {self.contrast(s, view)}."
+        if (wrong := self.find_false(view)) is not None:
+            return f"Candidate {candidate.letter} does not match: it {self.contrast(wrong, view)}."
         return super().match(candidate)
 
     def outcome(self, answer: str | None) -> list[str]:

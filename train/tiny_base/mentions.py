@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from transformers import PreTrainedTokenizerBase
 
 from data.records import COLORS, LETTERS, MATERIALS, SHAPES
+from teacher.sections import SECTIONS
 
 NAME = re.compile(" ".join(f"(?:{'|'.join(words)})" for words in (COLORS, MATERIALS, SHAPES)))
 """Matches the noun phrase of an object."""
 EVENTS = re.compile(
     rf"(?P<name>{NAME.pattern})|[Cc]andidate (?P<letter>[{''.join(LETTERS)}])\b"
-    r"|(?P<section>Scene parse|Motion analysis|Prediction|Candidate analysis):|(?P<end>\.(?=\s|$))"
+    rf"|(?P<section>{'|'.join(SECTIONS)}):|(?P<end>\.(?=\s|$))"
 )
 
 

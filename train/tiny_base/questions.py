@@ -4,43 +4,58 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
 (`KINDS`) ask for
 
     parse      the objects at the end of a clip, and their motion
-    predict    statements that will be true at the target
-    describe   statements about three of four candidates
-    compare    for each of three statements, which candidates agree with it
+    predict    where each object will be at the target, and how the objects will lie to each other
+    describe   where each candidate shows each object, and how they lie to each other
+    compare    for each of two statements, which candidates agree with it
+    explain    the steps of a rationale about a statement that is true of the target
 
-None of them is the selection task: no answer says which candidate is the target, and statements are
-chosen at random, not because they decide the item.
+None of them is the selection task: no answer says which candidate is the target. Statements are
+chosen at random, not because they decide the item; those of `explain` are true of at least two
+candidates.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from data.records import SelectionItem
 from teacher.deciding import Decision
 from teacher.predicates.facts import Relation, RelationalPredicates, View
-from teacher.predicates.relations import CHANGES, SYMMETRIC, flip_relation, normalize_relation
+from teacher.predicates.relations import (
+    CHANGES,
+    SYMMETRIC,
+    find_topic,
+    flip_relation,
+    normalize_relation,
+)
 from teacher.writers.paper import Detail, join_sentences
 from teacher.writers.relational import RelationalWriter
 
 PARSE = "Describe the scene, and how its objects move."
 PREDICT = "Say what will be true of the scene."
-DESCRIBE = "Describe candidates."
+DESCRIBE = "Describe the candidates."
 COMPARE = "Compare the candidates with predictions."
-QUESTIONS = (PARSE, PREDICT, DESCRIBE, COMPARE)
-DETAIL = Detail(parsed=6, analysed=4, predicted=6, pairs=2, relations=2)
-PREDICTED, DESCRIBED, COMPARED = 7, 4, 3
-"""Maximum numbers of statements in a prediction, about each described candidate, and compared with
-all candidates."""
+EXPLAIN = (
+    "Check a prediction step by step: scene parse, motion analysis, prediction, candidate analysis "
+    "and outcome. Then say of each candidate, in a line of its own, whether it matches and why."
+)
+QUESTIONS = (PARSE, PREDICT, DESCRIBE, COMPARE, EXPLAIN)
+FULL = Detail(parsed=6, analysed=4, predicted=6, pairs=2, relations=2)
+SPARSE = Detail(parsed=3, analysed=2, predicted=1, pairs=1)
+PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
+"""Maximum numbers of relations in a prediction and about each candidate, and of statements that are
+compared with all candidates."""
 
 WEIGHTS = {
     "region": 8, "gap": 4, "side": 2, "height": 2, "nearer": 2, "sight": 1, "between": 1,
     "extreme": 1,
 }  # fmt: skip
 """Relative frequencies of the kinds of statements, close to those in rationales."""
+PLACES = ("region", "sight")
+"""Kinds of statements that say where a single object is."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +64,19 @@ class Question:
 
     Attributes:
         clip, candidates: Whether the prompt shows the clip, and the candidates.
+        foresees: Whether the answer's predictions are true of the target.
     """
 
     text: str
     answer: str
     clip: bool = True
     candidates: bool = True
+    foresees: bool = True
 
 
 def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the scene at the end of the clip, and for the motion."""
-    statements = sample_statements(p.target, rng, DETAIL.relations)
+    statements = sample_statements(p.target, rng, FULL.relations)
     writer = make_writer(p, item, rng, statements)
     answer = (
         f"Scene parse: {join_sentences(writer.scene_parse())}\n"
@@ -69,55 +86,83 @@ def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator
 
 
 def predict(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
-    """Ask for statements that are true of the target."""
-    statements = sample_statements(p.target, rng, PREDICTED)
-    writer = make_writer(p, item, rng, statements)
-    parts = [writer.statement(s, "will be") for s in statements]
+    """Ask for the place of each object at the target, and for relations."""
+    writer = make_writer(p, item, rng)
+    parts = [writer.expected(o) for o in writer.ranked]
+    relations = sample_statements(p.target, rng, PREDICTED, without=PLACES)
+    parts += [writer.statement(s, "will be") for s in relations]
     parts[0] = f"{p.moment}, {parts[0]}"
     return Question(PREDICT, f"Prediction: {join_sentences(parts)}", candidates=False)
 
 
 def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
-    """Ask for statements about candidates."""
+    """Ask for the place of each object in each candidate, and for relations. Those of the first
+    candidate are chosen at random; the others follow it in the same respects."""
+    writer = make_writer(p, item, rng)
+    subjects = rng.permutation([o.object for o in p.objects]).tolist()
+    topics = sample_statements(p.views[0], rng, DESCRIBED, without=PLACES)
     lines = []
-    for k in rng.permutation(len(p.views))[:3]:
-        statements = sample_statements(p.views[k], rng, DESCRIBED)
-        writer = make_writer(p, item, rng, ())
-        parts = [writer.statement(s, "is") for s in statements]
-        lines.append(f"Candidate {p.views[k].letter}: {join_sentences(parts)}")
+    for view in p.views:
+        places = {s.objects[0]: s for s in view.statements if s.kind in PLACES}
+        parts = [writer.statement(places[name], "is") for name in subjects if name in places]
+        relations = [
+            topic
+            if normalize_relation(topic) in view.statements
+            else find_topic(topic, view.relations)
+            for topic in topics
+        ]
+        parts += [writer.statement(s, "is") for s in relations if s is not None]
+        lines.append(f"Candidate {view.letter}: {join_sentences(parts)}")
     return Question(DESCRIBE, "\n".join(lines), clip=False)
 
 
 def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask which candidates agree with statements, each true of some candidate but not of all."""
     named = {o.object for o in p.objects}
-    blocks = []
+    blocks: dict[Relation, str] = {}
     for k in rng.permutation(len(p.views))[:COMPARED]:
-        options = [s for s in sample_statements(p.views[k], rng, 12) if named.issuperset(s.objects)]
-        agreeing = {s: [normalize_relation(s) in v.statements for v in p.views] for s in options}
-        options = [s for s in options if not all(agreeing[s])] or options
+        options = sample_statements(p.views[k], rng, 12)
+        options = [s for s in options if named.issuperset(s.objects) and s not in blocks]
+        options = [s for s in options if len(agreeing(p, [s])) < len(p.views)] or options
         if not options:
             continue
         writer = make_writer(p, item, rng, options[:1])
-        (statement,) = writer.statements
-        shown = (
-            "no " + statement.objects[0] if statement.kind == "sight" else writer.shown(statement)
+        parts = [f"candidate {view.letter} {judge(writer, view)}" for view in p.views]
+        blocks[options[0]] = (
+            f"Prediction: {join_sentences([writer.statement(writer.statements[0], 'will be')])}\n"
+            f"Candidate analysis: {join_sentences(parts)}\n"
+            f"Outcome: {join_sentences([name_agreeing(p, options[:1])])}"
         )
-        judgements = [
-            f"shows {shown}, and agrees" if agrees else writer.contrast(statement, view)
-            for agrees, view in zip(agreeing[options[0]], p.views, strict=True)
-        ]
-        parts = [f"candidate {v.letter} {j}" for v, j in zip(p.views, judgements, strict=True)]
-        blocks.append(
-            f"Prediction: {join_sentences([writer.statement(statement, 'will be')])}\n"
-            f"Candidate analysis: {join_sentences(parts)}"
-        )
-    return Question(COMPARE, "\n".join(blocks))
+    return Question(COMPARE, "\n".join(blocks.values()), foresees=False)
+
+
+def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+    """Ask for the steps of a rationale, with statements that are true of the target and of another
+    candidate; for the first two steps if there are none."""
+    statements = sample_shared_statements(p, rng)
+    if not statements:
+        return replace(parse(p, item, rng), text=EXPLAIN, candidates=True)
+    writer = make_writer(p, item, rng, statements, SPARSE)
+    shortest = min(writer.statements, key=lambda s: len(s.objects))
+    sections = {
+        "Scene parse": writer.scene_parse(),
+        "Motion analysis": writer.motion_analysis(),
+        "Prediction": writer.prediction(),
+        "Candidate analysis": [f"candidate {v.letter} {judge(writer, v)}" for v in p.views],
+        "Outcome": [writer.statement(shortest, "is"), name_agreeing(p, statements)],
+    }
+    lines = [f"{title}: {join_sentences(parts)}" for title, parts in sections.items()]
+    for view in p.views:
+        wrong = writer.find_false(view)
+        match = f"does not match: it {writer.contrast(wrong, view)}" if wrong else "matches"
+        lines.append(f"Candidate {view.letter} {match}.")
+    return Question(EXPLAIN, "\n".join(lines))
 
 
 Kind = Callable[[RelationalPredicates, SelectionItem, np.random.Generator], Question]
 KINDS: dict[str, Kind] = {
     "parse": parse, "predict": predict, "describe": describe, "compare": compare,
+    "explain": explain,
 }  # fmt: skip
 
 
@@ -125,24 +170,64 @@ def make_writer(
     p: RelationalPredicates,
     item: SelectionItem,
     rng: np.random.Generator,
-    statements: tuple[Relation, ...] | list[Relation],
+    statements: Sequence[Relation] = (),
+    detail: Detail = FULL,
 ) -> RelationalWriter:
     """Return a writer of the narrator's phrases about the given statements."""
     decision = Decision(tuple(statements), ())
-    return RelationalWriter(p, decision, DETAIL, item.item_id, int(rng.integers(2**31)))
+    return RelationalWriter(p, decision, detail, item.item_id, int(rng.integers(2**31)))
 
 
-def sample_statements(view: View, rng: np.random.Generator, count: int) -> list[Relation]:
+def judge(writer: RelationalWriter, view: View) -> str:
+    """State which of the writer's statements is false of a candidate, or that all are true."""
+    if (wrong := writer.find_false(view)) is not None:
+        return writer.contrast(wrong, view)
+    return f"shows {writer.all_shown()}, and agrees"
+
+
+def agreeing(p: RelationalPredicates, statements: Sequence[Relation]) -> list[str]:
+    """Return the letters of the candidates of which all statements are true."""
+    wanted = {normalize_relation(s) for s in statements}
+    return [view.letter for view in p.views if wanted <= view.statements]
+
+
+def name_agreeing(p: RelationalPredicates, statements: Sequence[Relation]) -> str:
+    """Return the clause that names the candidates of which all statements are true."""
+    *letters, last = agreeing(p, statements)
+    if not letters:
+        return f"candidate {last} agrees"
+    return f"candidates {', '.join(letters)} and {last} agree"
+
+
+def sample_statements(
+    view: View, rng: np.random.Generator, count: int, without: Sequence[str] = ()
+) -> list[Relation]:
     """Sample up to `count` different statements that are true of a frame, of its kinds with the
-    frequencies `WEIGHTS`; either of two objects may be the subject."""
+    frequencies `WEIGHTS`; either of two objects may be the subject.
+
+    Args:
+        without: Kinds of statements that are left out.
+    """
     by_kind: dict[str, list[Relation]] = {}
     for statement in sorted(view.statements):
-        if statement.kind not in CHANGES:
+        if statement.kind not in (*CHANGES, *without):
             by_kind.setdefault(statement.kind, []).append(statement)
     kinds = [*by_kind]
     weights = np.array([WEIGHTS.get(kind, 1) for kind in kinds], dtype=float)
     chosen: dict[Relation, None] = {}
-    for _ in range(count):
+    for _ in range(count if kinds else 0):
         options = by_kind[kinds[rng.choice(len(kinds), p=weights / weights.sum())]]
         chosen[options[rng.integers(len(options))]] = None
     return [flip_relation(s) if s.kind in SYMMETRIC and rng.random() < 0.5 else s for s in chosen]
+
+
+def sample_shared_statements(p: RelationalPredicates, rng: np.random.Generator) -> list[Relation]:
+    """Sample one or two statements that are true of the target and of another candidate, if
+    possible not of all candidates. The list is empty if there are none."""
+    options = sample_statements(p.target, rng, 12)
+    shared = [s for s in options if len(agreeing(p, [s])) > 1]
+    first = ([s for s in shared if len(agreeing(p, [s])) < len(p.views)] or shared)[:1]
+    if not first or rng.random() < 0.6:
+        return first
+    second = [s for s in shared if s not in first and len(agreeing(p, [*first, s])) > 1]
+    return first + second[:1]

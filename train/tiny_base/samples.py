@@ -47,12 +47,14 @@ class OracleSample:
         last: Index of the last picture of the clip, which the candidates follow; -1 without clip.
         future: Displacements of objects, by name, from the end of the clip to the moment that the
             item asks for.
+        foresees: Whether predictions in the response are true of that moment.
     """
 
     sample: Sample
     targets: tuple[ObjectTarget, ...]
     last: int
     future: Mapping[str, tuple[float, float]]
+    foresees: bool
 
 
 def make_sample(
@@ -76,7 +78,7 @@ def make_sample(
             parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
     parts.append(f"\n{question.text}")
     sample = conversation(item.item_id, parts, question.answer, clip)
-    return OracleSample(sample, tuple(targets), last, future)
+    return OracleSample(sample, tuple(targets), last, future, question.foresees)
 
 
 class OracleCollator:
@@ -168,9 +170,8 @@ def spoken_state(
     if mention.letter is not None:
         shown = where.get((sample.last + 1 + LETTERS.index(mention.letter), mention.name))
         place = shown.place if shown else UNKNOWN
-    elif mention.section == "Prediction":
-        # The prediction of a question that shows candidates may be that of any of them.
-        moved = UNKNOWN if sample.sample.images else sample.future.get(mention.name, UNKNOWN)
+    elif mention.section in ("Prediction", "Outcome"):
+        moved = sample.future.get(mention.name, UNKNOWN) if sample.foresees else UNKNOWN
         place = (now.place[0] + moved[0], now.place[1] + moved[1]) if now else UNKNOWN
     elif now is not None:
         place, velocity = now.place, now.velocity

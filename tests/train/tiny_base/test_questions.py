@@ -51,7 +51,8 @@ def test_statements_about_candidates_are_true(described: Described) -> None:
     supported = 0
     for item, p in described:
         for block in ask("compare", item, p).answer.split("Prediction: ")[1:]:
-            claims = extract_claims(block[block.index("Candidate analysis:") :], p)
+            block = block[block.index("Candidate analysis:") : block.index("Outcome:")]
+            claims = extract_claims(block, p)
             # What candidates agree with is the stated prediction, not the target.
             claims = [c for c in claims if c.candidate is not None and c.kind not in RELATIVE]
             assert [c for c in claims if c.verdict == "contradicted"] == [], block
@@ -63,11 +64,43 @@ def test_candidates_agree_with_the_statements_that_are_true_of_them(described: D
     agreeing = []
     for item, p in described:
         for block in ask("compare", item, p).answer.split("Prediction: ")[1:]:
-            judged = re.findall(r"Candidate ([A-D]) ([^.]+)\.", block)
+            judged = re.findall(r"Candidate ([A-D]) ((?:shows|lacks)[^.]+)\.", block)
             assert [letter for letter, _ in judged] == list(LETTERS)
-            agreeing.append(sum(text.endswith(", and agrees") for _, text in judged))
+            letters = [letter for letter, text in judged if text.endswith(", and agrees")]
+            outcome = re.search(r"Candidates? ([^.]+) agrees?\.$", block.strip())[1]
+            assert re.findall(r"\b[A-D]\b", outcome) == letters
+            agreeing.append(len(letters))
     assert 1 <= min(agreeing) <= max(agreeing) <= 4
     assert np.mean(np.array(agreeing) == 4) < 0.3
+
+
+def test_statements_that_are_explained_are_true_of_the_target_and_another_candidate(
+    described: Described,
+) -> None:
+    explained = 0
+    for item, p in described:
+        answer = ask("explain", item, p).answer
+        claims = extract_claims(answer, p)
+        assert [c for c in claims if c.verdict == "contradicted" and c.kind not in RELATIVE] == []
+        if "Outcome:" not in answer:
+            continue
+        explained += 1
+        named = re.search(r"Candidates ([^.]+) agree\.", answer)[1]
+        letters = re.findall(r"\b[A-D]\b", named)
+        assert p.answer in letters
+        assert len(letters) > 1
+        assert re.findall(r"Candidate ([A-D]) [^.]+, and agrees\.", answer) == letters
+        assert re.findall(r"^Candidate ([A-D]) matches\.$", answer, re.MULTILINE) == letters
+        wrong = re.findall(r"^Candidate ([A-D]) does not match: it ", answer, re.MULTILINE)
+        assert sorted(letters + wrong) == list(LETTERS)
+    assert explained > 0.9 * len(described)
+
+
+def test_each_candidate_is_described_with_each_object_once(described: Described) -> None:
+    for item, p in described:
+        for line in ask("describe", item, p).answer.splitlines():
+            placed = re.findall(r"The (\w+ \w+ \w+) is (?:near the|out of sight)", line)
+            assert len(placed) == len(set(placed)) <= len(p.objects)
 
 
 @pytest.mark.parametrize("kind", ["describe", "compare"])
@@ -89,6 +122,7 @@ def test_questions_show_what_they_ask_about(described: Described) -> None:
         "predict": (True, False),
         "describe": (False, True),
         "compare": (True, True),
+        "explain": (True, True),
     }
 
 

@@ -1,0 +1,132 @@
+"""Measures which part of a student's rationale costs its accuracy: the student continues the true
+rationale of each test item from different places.
+
+    python -m benchmarks.experiments.causes checkpoints/sft/exp-cot
+
+The rows are what was given of the true rationale:
+
+    nothing                the student writes everything
+    scene and motion       what can be seen in the prefix is given: perception
+    prediction             what will be true at the target is given too: foresight
+    candidate analysis     what the candidates show is given too: comparison
+
+The last row leaves only the choice of the letter. The true rationale states what decides the item,
+so giving a part also gives away which objects matter.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from conf.compose import compose
+from conf.schema import SelectCommand, SftCommand, TeacherConfig
+from data.parallel import batched
+from data.records import FAMILIES, SelectionItem
+from data.render.frame_cache import FrameReader
+from data.store import Store, open_store
+from evaluation.select import limit_items
+from models import loading
+from models.precision import resolve_precision
+from models.student.answer_parser import parse_choice
+from models.student.collator import Collator
+from models.student.generation import generate
+from models.student.prompts import Sample, selection_sample
+from models.student.responses import GeneratedText
+from models.trained_runs import product_folder, trained_settings
+from teacher.narrator import write_rationale
+from teacher.sections import split_sections
+from teacher.vocabulary import choose_vocabulary, describe_item
+
+GIVEN = {
+    "nothing": None,
+    "scene and motion": "Motion analysis",
+    "prediction": "Prediction",
+    "candidate analysis": "Candidate analysis",
+}
+"""The last given section of the true rationale, by row of the table."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    parser.add_argument("student", type=Path, help="folder of a run of train.sft")
+    parser.add_argument("--benchmark", default="tiny")
+    parser.add_argument("--store", type=Path, default=Path("store"))
+    parser.add_argument("--items", type=int, default=300, help="number of test items")
+    parser.add_argument("--batch", type=int, default=32)
+    args = parser.parse_args()
+    trained = trained_settings(args.student, SftCommand, "student")
+    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={args.benchmark}"]).benchmark
+    store = open_store(args.store / cfg.store_name)
+    items = limit_items(store.selection("test"), args.items, seed=0)
+    truth = {item.item_id: true_rationale(item, store, trained.teacher) for item in items}
+    items = [item for item in items if truth[item.item_id]]
+    student = Student(trained, args.student, store)
+    print("| given | " + " | ".join(FAMILIES) + " | macro |\n|---|---|---|---|---|", flush=True)
+    for name, section in GIVEN.items():
+        right: dict[str, list[bool]] = {family: [] for family in FAMILIES}
+        for batch in tqdm([*batched(items, args.batch)], desc=name, unit="batch", leave=False):
+            given = [end_after(truth[item.item_id], section) for item in batch]
+            for item, letter in zip(batch, student.choose(batch, given), strict=True):
+                right[item.family].append(letter == item.letter)
+        shares = [100 * sum(values) / len(values) for values in right.values()]
+        cells = [f"{share:.1f}" for share in (*shares, sum(shares) / len(shares))]
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+def true_rationale(item: SelectionItem, store: Store, teacher: TeacherConfig) -> str:
+    """Return the built-in narrator's rationale of an item; empty if its prefix is too short."""
+    predicates = describe_item(item, store, teacher)
+    if predicates is None:
+        return ""
+    return write_rationale(choose_vocabulary(predicates, teacher), item, teacher.seed)
+
+
+def end_after(rationale: str, section: str | None) -> str:
+    """Return a rationale up to the end of a section; nothing if `section` is None."""
+    for heading, _, stop in split_sections(rationale):
+        if heading == section:
+            return rationale[:stop].rstrip() + "\n"
+    return ""
+
+
+class Student:
+    """A trained student that continues responses."""
+
+    def __init__(self, trained: SftCommand, folder: Path, store: Store) -> None:
+        self._settings, self._frames = trained, FrameReader(store, trained.student.image_size)
+        self._precision = resolve_precision(trained.train.precision)
+        weights = product_folder(folder, "student")
+        self._model, self._processor = loading.load_trained(
+            trained.student, self._precision, weights
+        )
+        self._collate = Collator(self._processor, trained.student.max_length)
+
+    def choose(self, items: Sequence[SelectionItem], given: Sequence[str]) -> Iterator[str | None]:
+        """Let the student continue a given start of its response to each item, and yield the
+        letters that it chooses."""
+        samples = [self._sample(item, text) for item, text in zip(items, given, strict=True)]
+        inputs = self._collate(samples)
+        if samples[0].response is not None:
+            # Rows are padded on the left: the last token of each ends its turn.
+            for name in ("input_ids", "attention_mask", "mm_token_type_ids"):
+                inputs[name] = inputs[name][:, :-1]
+            del inputs["logits_to_keep"]
+        limit = self._settings.student.max_new_tokens
+        texts = generate(self._model, self._processor, inputs, limit, self._precision)
+        for start, text in zip(given, texts, strict=True):
+            whole = GeneratedText(start + text.text, text.cut)
+            yield parse_choice(whole.text, cut=whole.cut).letter
+
+    def _sample(self, item: SelectionItem, given: str) -> Sample:
+        regime, frame_count = self._settings.train.regime, self._settings.student.frames
+        return selection_sample(
+            item, "reasoning", regime, self._frames, frame_count, response=given or None
+        )
+
+
+if __name__ == "__main__":
+    main()
