@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 150
+MANY_PANELS, LOW_DPI = 8, 60
+"""A figure with more panels than this has fewer dots per inch."""
 COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
 """Colors that people with any colour vision can distinguish (Paul Tol's bright set)."""
 
@@ -62,12 +64,16 @@ def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:
         axes.grid(axis="y", color="#eeeeee")
         if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-    figure.savefig(path)
+    figure.savefig(path, dpi=DPI if len(panels) <= MANY_PANELS else LOW_DPI)
 
 
 def panel_and_label(measure: str) -> tuple[str, str]:
     """Return the panel in which a measure is plotted and the label of its curve, such as
-    ("letter accuracy", "answer event") for answer_letter_accuracy_event."""
+    ("letter accuracy", "answer event") for answer_letter_accuracy_event, or ("words region",
+    "parse") for words_region/parse."""
+    if "/" in measure:
+        panel, _, label = measure.replace("_", " ").partition("/")
+        return panel, label
     common = re.sub(r"_(event|time|window)$|@\d+$", "", measure).split("_")
     panel = common[-1:] if common[-1] == "loss" else common[-2:]
     rest = " ".join(word for word in measure.split("_") if word not in panel)

@@ -57,6 +57,10 @@ class ObjectTarget:
         column, row = (min(max(int(share * grid), 0), grid - 1) for share in self.place)
         return row * grid + column
 
+    def token(self, grid: int) -> int:
+        """Return the index of the object's token among the visual tokens of all pictures."""
+        return self.picture * grid**2 + self.cell(grid)
+
 
 def clip_targets(scene: Scene, frames: Sequence[int]) -> Iterator[ObjectTarget]:
     """Yield the targets of a clip. Their places are those in the later frame of each pair."""

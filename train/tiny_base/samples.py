@@ -6,14 +6,14 @@ of `train.tiny_base.questions`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from transformers import ProcessorMixin
+from transformers import PreTrainedTokenizerBase, ProcessorMixin
 
 from data.records import (
     LETTERS,
@@ -93,71 +93,126 @@ class OracleCollator:
         ids = batch["input_ids"]
         media = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
         visual = torch.isin(ids, media).nonzero()[:, 1].reshape(len(samples), -1)
-        tokens = visual.shape[1] // samples[0].sample.pictures
-        return batch, self._stack(samples, visual, round(tokens**0.5), ids.shape[1])
+        grid = round((visual.shape[1] // samples[0].sample.pictures) ** 0.5)
+        mentions = [
+            mention
+            for row, s in enumerate(samples)
+            for mention in locate_mentions(s, row, grid, self._processor.tokenizer, ids.shape[1])
+        ]
+        return batch, stack_samples(samples, mentions, visual, grid)
 
-    def _stack(
-        self, samples: Sequence[OracleSample], visual: Tensor, grid: int, length: int
-    ) -> OracleTargets:
-        presence = torch.zeros(visual.shape)
-        kept: list[ObjectTarget] = []
-        objects: list[tuple[int, int]] = []
-        tracked: list[tuple[int, int, int]] = []
-        names: list[tuple[int, int]] = []
-        named: list[str] = []
-        found: list[list[int]] = []
-        places: list[list[float]] = []
-        future: list[tuple[float, float]] = []
-        spoken: list[tuple[int, int]] = []
-        said: list[tuple[float, ...]] = []
-        subjects: list[tuple[int, int, int]] = []
-        letters: list[tuple[int, int, int]] = []
-        for row, s in enumerate(samples):
-            largest = largest_per_token(s.targets, grid)
-            at = {id(t): t.picture * grid**2 + t.cell(grid) for t in s.targets}
-            kept += largest
-            objects += [(row, at[id(t)]) for t in largest]
-            presence[row, [at[id(t)] for t in largest]] = 1
-            where = {(t.picture, t.name): t for t in s.targets}
-            for t in largest:
-                if t.picture > s.last and (s.last, t.name) in where and not np.isnan(t.since[0]):
-                    tracked.append((row, at[id(t)], at[id(where[s.last, t.name])]))
-            mentions, tokens = find_mentions(s.sample.response or "", self._processor.tokenizer)
-            # The token that ends the turn follows the response.
-            first = length - tokens - 1
-            for m in mentions:
-                name, position = m.name, first + m.last
-                names.append((row, position))
-                named.append(name)
-                spoken += [(row, first + k) for k in range(m.last, m.stop)]
-                said += [spoken_state(s, where, m)] * (m.stop - m.last)
-                subjects += [(row, first + k, position) for k in range(m.last + 1, m.stop)]
-                if m.letter_at is not None:
-                    letters += [
-                        (row, first + k, first + m.letter_at) for k in range(m.last, m.stop)
-                    ]
-                pictures = [where.get((s.last + k, name)) for k in range(PICTURES)]
-                found.append([at[id(t)] if t else -1 for t in pictures])
-                places.append([x for t in pictures for x in (t.place if t else UNKNOWN)])
-                future.append(s.future.get(name, UNKNOWN))
-        truth = stack_targets(kept)
-        return OracleTargets(
-            visual=visual,
-            presence=presence,
-            objects=torch.tensor(objects, dtype=torch.long).reshape(-1, 2),
-            truth=truth,
-            inside=truth["place"] * grid % 1 - 0.5,
-            tracked=torch.tensor(tracked, dtype=torch.long).reshape(-1, 3),
-            names=torch.tensor(names, dtype=torch.long).reshape(-1, 2),
-            named=name_words(named),
-            found=torch.tensor(found, dtype=torch.long).reshape(-1, PICTURES),
-            places=torch.tensor(places).reshape(-1, 2 * PICTURES) - 0.5,
-            future=torch.tensor(future).reshape(-1, 2),
-            spoken=torch.tensor(spoken, dtype=torch.long).reshape(-1, 2),
-            said=torch.tensor(said).reshape(-1, 4),
-            subjects=torch.tensor(subjects, dtype=torch.long).reshape(-1, 3),
-            letters=torch.tensor(letters, dtype=torch.long).reshape(-1, 3),
+
+@dataclass(frozen=True)
+class LocatedMention:
+    """A mention of an object, with the oracle's targets. Positions are those of the batch.
+
+    Attributes:
+        row, position: Row of the batch, and position of the name's last token.
+        spoken: Positions from the name's last token to the next name.
+        state: Place (from -0.5 to 0.5) and velocity of the object in the picture that the text
+            speaks of; NaN where the oracle does not determine them.
+        letter_at: Position of the letter of the candidate that the text speaks of, if any.
+        found: Visual token of the object in each of `PICTURES`, or -1.
+        places: The object's places in these pictures, NaN where it is not visible.
+        future: Its displacement to the moment that the item asks for, or NaN.
+    """
+
+    name: str
+    row: int
+    position: int
+    spoken: range
+    state: tuple[float, ...]
+    letter_at: int | None
+    found: tuple[int, ...]
+    places: tuple[float, ...]
+    future: tuple[float, float]
+
+
+def locate_mentions(
+    sample: OracleSample, row: int, grid: int, tokenizer: PreTrainedTokenizerBase, length: int
+) -> Iterator[LocatedMention]:
+    """Yield the mentions of objects in a sample's response.
+
+    Args:
+        length: Number of tokens of a row of the batch.
+    """
+    shown = {(t.picture, t.name): t for t in sample.targets}
+    mentions, tokens = find_mentions(sample.sample.response or "", tokenizer)
+    # The token that ends the turn follows the response.
+    first = length - tokens - 1
+    for m in mentions:
+        pictures = [shown.get((sample.last + k, m.name)) for k in range(PICTURES)]
+        yield LocatedMention(
+            m.name,
+            row,
+            first + m.last,
+            range(first + m.last, first + m.stop),
+            spoken_state(sample, shown, m),
+            None if m.letter_at is None else first + m.letter_at,
+            tuple(t.token(grid) if t else -1 for t in pictures),
+            tuple(x for t in pictures for x in (t.place if t else UNKNOWN)),
+            sample.future.get(m.name, UNKNOWN),
         )
+
+
+def stack_samples(
+    samples: Sequence[OracleSample],
+    mentions: Sequence[LocatedMention],
+    visual: Tensor,
+    grid: int,
+) -> OracleTargets:
+    """Return the targets of a batch.
+
+    Args:
+        visual: (B, T) positions of the visual tokens, grid x grid for each picture.
+    """
+    objects = [
+        (row, t) for row, s in enumerate(samples) for t in largest_per_token(s.targets, grid)
+    ]
+    at = torch.tensor([(row, t.token(grid)) for row, t in objects]).reshape(-1, 2)
+    presence = torch.zeros(visual.shape)
+    presence[at[:, 0], at[:, 1]] = 1
+    truth = stack_targets([t for _, t in objects])
+
+    def integers(rows: list[tuple[int, ...]], columns: int) -> Tensor:
+        return torch.tensor(rows, dtype=torch.long).reshape(-1, columns)
+
+    return OracleTargets(
+        visual=visual,
+        presence=presence,
+        objects=at,
+        truth=truth,
+        inside=truth["place"] * grid % 1 - 0.5,
+        tracked=integers([*track_objects(samples, objects, grid)], 3),
+        names=integers([(m.row, m.position) for m in mentions], 2),
+        named=name_words([m.name for m in mentions]),
+        found=integers([m.found for m in mentions], PICTURES),
+        places=torch.tensor([m.places for m in mentions]).reshape(-1, 2 * PICTURES) - 0.5,
+        future=torch.tensor([m.future for m in mentions]).reshape(-1, 2),
+        spoken=integers([(m.row, k) for m in mentions for k in m.spoken], 2),
+        said=torch.tensor([m.state for m in mentions for _ in m.spoken]).reshape(-1, 4),
+        subjects=integers([(m.row, k, m.position) for m in mentions for k in m.spoken[1:]], 3),
+        letters=integers(
+            [
+                (m.row, k, m.letter_at)
+                for m in mentions
+                if m.letter_at is not None
+                for k in m.spoken
+            ],
+            3,
+        ),
+    )
+
+
+def track_objects(
+    samples: Sequence[OracleSample], objects: Sequence[tuple[int, ObjectTarget]], grid: int
+) -> Iterator[tuple[int, int, int]]:
+    """Yield the row, the visual token in a candidate and that at the end of the clip of each object
+    that both show."""
+    before = [{t.name: t for t in s.targets if t.picture == s.last} for s in samples]
+    for row, t in objects:
+        if t.picture > samples[row].last and t.name in before[row] and not np.isnan(t.since[0]):
+            yield row, t.token(grid), before[row][t.name].token(grid)
 
 
 def spoken_state(
