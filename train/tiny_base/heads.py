@@ -4,15 +4,17 @@ Words are a thin signal: a text names a few objects, while the oracle knows ever
 picture. The heads are linear, so the base itself has to represent what they predict. They read
 
     "seen"     visual tokens, as the vision tower gives them: colour, material, shape, whether the
-               centre of an object is in the token, where in the token and in the image, velocity
+               centre of an object is in the token, where in the token and in the image, and the
+               displacement between the two frames of the picture
     "known"    visual tokens after the layer `MIDDLE`: place, whether the object moves, velocity,
                displacements ahead, and displacement since the end of the clip
     "spelled"  names of objects in a text after the layer `MIDDLE`: colour, material and shape, as
                in "seen", so that attention can compare a name with visual tokens
     "named"    names of objects in a text after the layer `NAMING`: in which pictures the object is
                visible and where, and its displacement up to the moment that the item asks for
-    "spoken"   every token of a text from a name to the next, after the layer `SPEAKING`: place and
-               velocity of the named object in the picture that the text speaks of there
+    "spoken"   every token of a text from a name to the next name or letter or the end of the
+               sentence, after the layer `SPEAKING`: place and velocity of the named object in the
+               picture that the text speaks of there
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
 at the tower's output and motion in the middle layers. Further losses teach attention heads where
@@ -39,7 +41,7 @@ PICTURES = 1 + len(LETTERS)
 """Pictures in which a named object is found: the last one of the clip, and the candidates."""
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
 DISPLACEMENTS = ("velocity", *AHEADS, "since")
-SCALES = {"place": 3.0, "inside": 1.0} | dict.fromkeys(DISPLACEMENTS, 5.0)
+SCALES = {"place": 3.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(DISPLACEMENTS, 5.0)
 """Factors on places and displacements, so that their losses are of similar size."""
 BEND = 0.1
 """Scaled error above which the loss of a place or displacement is linear."""
@@ -57,7 +59,7 @@ class OracleTargets:
         presence: (B, T) 1 where the centre of an object is in the token, otherwise 0.
         objects: (N, 2) row of the batch and token.
         truth: Properties of the N objects, see `oracle_targets.stack_targets`.
-        inside: (N, 2) place in the token, from -0.5 to 0.5.
+        inside: (N, 2) place in the token, from -0.5 to 0.5, or beyond at the border of the picture.
         tracked: (K, 3) row, token of a candidate, and token of the same object in the clip.
         names: (M, 2) row and position of a name's last token.
         named: (M,) the named object's colour, material and shape, by kind.
@@ -110,7 +112,7 @@ class OracleHeads(nn.Module):
         def heads(widths: Mapping[str, int]) -> nn.ModuleDict:
             return nn.ModuleDict({name: nn.Linear(hidden, n) for name, n in widths.items()})
 
-        self.seen = heads({"presence": 1, "inside": 2, "velocity": 2, "place": 2})
+        self.seen = heads({"presence": 1, "inside": 2, "shift": 2, "place": 2})
         self.known = heads({"place": 2, "moving": 1} | dict.fromkeys(DISPLACEMENTS, 2))
         self.named = heads({"shown": PICTURES, "places": 2 * PICTURES, "future": 2})
         self.spoken = heads({"place": 2, "velocity": 2})
@@ -129,7 +131,7 @@ class OracleHeads(nn.Module):
             losses[kind] = cross_entropy(logits, targets.truth[kind])
         place = targets.truth["place"] - 0.5
         truth = targets.truth | {"inside": targets.inside, "place": place}
-        for name in ("inside", "velocity", "place"):
+        for name in ("inside", "shift", "place"):
             losses[f"seen {name}"] = distance(self.seen[name](seen), truth[name], SCALES[name])
         return losses
 
@@ -174,8 +176,8 @@ class OracleHeads(nn.Module):
         found = {kind: logits.argmax(dim=-1) == truth[kind] for kind, logits in words.items()}
         moves = truth["velocity"].norm(dim=1) > MOVING
         if hidden is None:
-            velocity = self.seen["velocity"](seen)
-            found["heading"] = (octant(velocity) == octant(truth["velocity"]))[moves]
+            shift = self.seen["shift"](seen)
+            found["heading"] = (octant(shift) == octant(truth["velocity"]))[moves]
             return found
         known = self.norms["known"](hidden[row, token])
         read = {

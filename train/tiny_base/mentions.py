@@ -24,7 +24,7 @@ class Mention:
 
     Attributes:
         last: Index of the name's last token.
-        stop: Index of the token before which the sentence stops to speak of the object.
+        stop: Index of the first token that no longer speaks of the object.
         section: Title of the section of the rationale; None before the first.
         letter: The candidate that the text speaks of; None if it speaks of the scene.
         letter_at: Index of the token of the letter, if any.

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from data.records import COLORS, MATERIALS, SHAPES, Scene
+from teacher.predicates.motion import COURSE_FRAMES
 
 WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
 """The words of a noun phrase, in their order."""
@@ -36,8 +37,10 @@ class ObjectTarget:
     Attributes:
         name: Noun phrase of the object.
         picture: Index of the picture; the pictures of the clip precede the images.
-        place: Column and row of the object's centre, from 0 to 1.
+        place: Column and row of the object's centre, from 0 to 1; beyond for an object of which the
+            border of the picture cuts off more than half.
         visible: Visible fraction.
+        shift: Displacement between the two frames of the picture; NaN in images.
         velocity: Displacement during `RATE` frames; NaN in images.
         ahead: Displacement during each number of frames of `AHEAD`; NaN in images.
         since: Displacement from the object's place at the end of the clip; NaN in the clip and in
@@ -48,6 +51,7 @@ class ObjectTarget:
     picture: int
     place: tuple[float, float]
     visible: float = 1.0
+    shift: tuple[float, float] = UNKNOWN
     velocity: tuple[float, float] = UNKNOWN
     ahead: tuple[tuple[float, float], ...] = (UNKNOWN,) * len(AHEAD)
     since: tuple[float, float] = UNKNOWN
@@ -72,7 +76,8 @@ def clip_targets(scene: Scene, frames: Sequence[int]) -> Iterator[ObjectTarget]:
                 picture,
                 _place(scene, later, k),
                 _fraction(scene, later, k),
-                _displacement(scene, k, earlier, later, RATE / max(later - earlier, 1)),
+                _displacement(scene, k, earlier, later),
+                _velocity(scene, k, earlier, later),
                 tuple(_displacement(scene, k, later, later + h) for h in AHEAD),
             )
 
@@ -104,6 +109,19 @@ def future_displacements(scene: Scene, frame: int, later: int) -> dict[str, tupl
     }
 
 
+def observed_states(scene: Scene, frame: int) -> dict[str, tuple[float, ...]]:
+    """Return the places and velocities (4 numbers), by name, of a frame's clearly visible objects.
+    The velocity is that of the frames from which the predicates derive headings."""
+    start = max(frame - COURSE_FRAMES + 1, 0)
+    return {
+        scene.objects[k].noun_phrase: (
+            *_place(scene, frame, k),
+            *_velocity(scene, k, start, frame),
+        )
+        for k in visible_objects(scene, frame)
+    }
+
+
 def visible_objects(scene: Scene, frame: int) -> list[int]:
     """Return the indices of the clearly visible objects of a frame."""
     # A fraction that the simulator does not record is NaN.
@@ -129,7 +147,13 @@ def _displacement(
     return tuple(moved.tolist()) if np.abs(moved).max() <= FARTHEST else UNKNOWN
 
 
-def largest_per_token(targets: Sequence[ObjectTarget], grid: int) -> list[ObjectTarget]:
+def _velocity(scene: Scene, k: int, frame: int, later: int) -> tuple[float, float]:
+    if later == frame:
+        return UNKNOWN
+    return _displacement(scene, k, frame, later, RATE / (later - frame))
+
+
+def most_visible_per_token(targets: Sequence[ObjectTarget], grid: int) -> list[ObjectTarget]:
     """Keep one target per token: that of the object of which most is visible."""
     best: dict[tuple[int, int], ObjectTarget] = {}
     for target in targets:
@@ -153,15 +177,15 @@ def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, torch.Tensor]:
     """Return the properties of N targets as tensors.
 
     Returns:
-        `color`, `material` and `shape` (N,) indices; `place`, `velocity`, `since` and `ahead_<h>`
-        (N, 2) for each h of `AHEAD`.
+        `color`, `material` and `shape` (N,) indices; `place`, `shift`, `velocity`, `since` and
+        `ahead_<h>` (N, 2) for each h of `AHEAD`.
     """
     stacked = name_words([t.name for t in targets])
 
     def pairs(values: list[tuple[float, float]]) -> torch.Tensor:
         return torch.tensor(values, dtype=torch.float32).reshape(-1, 2)
 
-    for name in ("place", "velocity", "since"):
+    for name in ("place", "shift", "velocity", "since"):
         stacked[name] = pairs([getattr(t, name) for t in targets])
     for k, h in enumerate(AHEAD):
         stacked[f"ahead_{h}"] = pairs([t.ahead[k] for t in targets])

@@ -23,7 +23,7 @@ import numpy as np
 
 from data.records import SelectionItem
 from teacher.deciding import Decision
-from teacher.predicates.facts import Relation, RelationalPredicates, View
+from teacher.predicates.facts import OUT_OF_VIEW, Relation, RelationalPredicates, View
 from teacher.predicates.relations import (
     CHANGES,
     SYMMETRIC,
@@ -76,7 +76,8 @@ class Question:
 
 def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the scene at the end of the clip, and for the motion."""
-    statements = sample_statements(p.target, rng, FULL.relations)
+    p = leave_out_unseen(p)
+    statements = sample_statements(p, p.target, rng, FULL.relations)
     writer = make_writer(p, item, rng, statements)
     answer = (
         f"Scene parse: {join_sentences(writer.scene_parse())}\n"
@@ -87,9 +88,10 @@ def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator
 
 def predict(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the place of each object at the target, and for relations."""
+    p = leave_out_unseen(p)
     writer = make_writer(p, item, rng)
     parts = [writer.expected(o) for o in writer.ranked]
-    relations = sample_statements(p.target, rng, PREDICTED, without=PLACES)
+    relations = sample_statements(p, p.target, rng, PREDICTED, without=PLACES)
     parts += [writer.statement(s, "will be") for s in relations]
     parts[0] = f"{p.moment}, {parts[0]}"
     return Question(PREDICT, f"Prediction: {join_sentences(parts)}", candidates=False)
@@ -99,8 +101,9 @@ def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Genera
     """Ask for the place of each object in each candidate, and for relations. Those of the first
     candidate are chosen at random; the others follow it in the same respects."""
     writer = make_writer(p, item, rng)
-    subjects = rng.permutation([o.object for o in p.objects]).tolist()
-    topics = sample_statements(p.views[0], rng, DESCRIBED, without=PLACES)
+    shown = {s.objects[0] for v in p.views for s in v.statements if s.kind == "region"}
+    subjects = rng.permutation([o.object for o in p.objects if o.object in shown]).tolist()
+    topics = sample_statements(p, p.views[0], rng, DESCRIBED, without=PLACES)
     lines = []
     for view in p.views:
         places = {s.objects[0]: s for s in view.statements if s.kind in PLACES}
@@ -117,12 +120,12 @@ def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Genera
 
 
 def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
-    """Ask which candidates agree with statements, each true of some candidate but not of all."""
-    named = {o.object for o in p.objects}
+    """Ask which candidates agree with statements, each true of some candidate and, if possible, not
+    of all."""
     blocks: dict[Relation, str] = {}
     for k in rng.permutation(len(p.views))[:COMPARED]:
-        options = sample_statements(p.views[k], rng, 12)
-        options = [s for s in options if named.issuperset(s.objects) and s not in blocks]
+        options = sample_statements(p, p.views[k], rng, 12)
+        options = [s for s in options if s not in blocks]
         options = [s for s in options if len(agreeing(p, [s])) < len(p.views)] or options
         if not options:
             continue
@@ -139,6 +142,7 @@ def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
 def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the steps of a rationale, with statements that are true of the target and of another
     candidate; for the first two steps if there are none."""
+    p = leave_out_unseen(p)
     statements = sample_shared_statements(p, rng)
     if not statements:
         return replace(parse(p, item, rng), text=EXPLAIN, candidates=True)
@@ -164,6 +168,22 @@ KINDS: dict[str, Kind] = {
     "parse": parse, "predict": predict, "describe": describe, "compare": compare,
     "explain": explain,
 }  # fmt: skip
+
+
+def leave_out_unseen(p: RelationalPredicates) -> RelationalPredicates:
+    """Leave out what is said of objects that are out of view at the cut, unless all are: a model
+    could only guess their names."""
+    seen = {o.object for o in p.objects if o.sight != OUT_OF_VIEW}
+    if not seen:
+        return p
+    return replace(
+        p,
+        objects=tuple(o for o in p.objects if o.object in seen),
+        # Without any, the writer would deny that there are collision courses.
+        courses=tuple(m for m in p.courses if seen.issuperset(m.objects)) or p.courses,
+        contacts=tuple(m for m in p.contacts if seen.issuperset(m.objects)),
+        close=tuple(c for c in p.close if seen.issuperset(c.objects)),
+    )
 
 
 def make_writer(
@@ -200,17 +220,22 @@ def name_agreeing(p: RelationalPredicates, statements: Sequence[Relation]) -> st
 
 
 def sample_statements(
-    view: View, rng: np.random.Generator, count: int, without: Sequence[str] = ()
+    p: RelationalPredicates,
+    view: View,
+    rng: np.random.Generator,
+    count: int,
+    without: Sequence[str] = (),
 ) -> list[Relation]:
-    """Sample up to `count` different statements that are true of a frame, of its kinds with the
-    frequencies `WEIGHTS`; either of two objects may be the subject.
+    """Sample up to `count` different statements about objects of `p` that are true of a frame, of
+    its kinds with the frequencies `WEIGHTS`; either of two objects may be the subject.
 
     Args:
         without: Kinds of statements that are left out.
     """
+    names = {o.object for o in p.objects}
     by_kind: dict[str, list[Relation]] = {}
     for statement in sorted(view.statements):
-        if statement.kind not in (*CHANGES, *without):
+        if statement.kind not in (*CHANGES, *without) and names.issuperset(statement.objects):
             by_kind.setdefault(statement.kind, []).append(statement)
     kinds = [*by_kind]
     weights = np.array([WEIGHTS.get(kind, 1) for kind in kinds], dtype=float)
@@ -224,7 +249,7 @@ def sample_statements(
 def sample_shared_statements(p: RelationalPredicates, rng: np.random.Generator) -> list[Relation]:
     """Sample one or two statements that are true of the target and of another candidate, if
     possible not of all candidates. The list is empty if there are none."""
-    options = sample_statements(p.target, rng, 12)
+    options = sample_statements(p, p.target, rng, 12)
     shared = [s for s in options if len(agreeing(p, [s])) > 1]
     first = ([s for s in shared if len(agreeing(p, [s])) < len(p.views)] or shared)[:1]
     if not first or rng.random() < 0.6:

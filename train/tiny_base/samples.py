@@ -24,6 +24,7 @@ from data.records import (
 from data.render.frame_cache import FrameReader
 from models.student.collator import Collator
 from models.student.prompts import Sample, conversation, load_clip
+from teacher.predicates.motion import find_cut
 from train.tiny_base.heads import PICTURES, OracleTargets
 from train.tiny_base.mentions import Mention, find_mentions
 from train.tiny_base.oracle_targets import (
@@ -32,8 +33,9 @@ from train.tiny_base.oracle_targets import (
     clip_targets,
     future_displacements,
     image_targets,
-    largest_per_token,
+    most_visible_per_token,
     name_words,
+    observed_states,
     stack_targets,
 )
 from train.tiny_base.questions import Question
@@ -45,6 +47,8 @@ class OracleSample:
 
     Attributes:
         last: Index of the last picture of the clip, which the candidates follow; -1 without clip.
+        observed: Places and velocities of objects, by name, at the cut, which texts about the clip
+            describe.
         future: Displacements of objects, by name, from the end of the clip to the moment that the
             item asks for.
         foresees: Whether predictions in the response are true of that moment.
@@ -53,6 +57,7 @@ class OracleSample:
     sample: Sample
     targets: tuple[ObjectTarget, ...]
     last: int
+    observed: Mapping[str, tuple[float, ...]]
     future: Mapping[str, tuple[float, float]]
     foresees: bool
 
@@ -64,11 +69,12 @@ def make_sample(
     scene = frames.scene(item.scene_id)
     targets: list[ObjectTarget] = []
     parts: list[str | np.ndarray] = [item.question]
-    clip, last, future = None, -1, {}
+    clip, last, observed, future = None, -1, {}, {}
     if question.clip:
         shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, frame_count)
         clip, last = load_clip(item.scene_id, shown, frames), (len(shown) + 1) // 2 - 1
         targets += clip_targets(scene, shown)
+        observed = observed_states(scene, find_cut(scene, item.prefix_start, item.prefix_stop))
         future = future_displacements(scene, item.prefix_stop, item.target_frame)
     if question.candidates:
         for picture, (letter, c) in enumerate(zip(LETTERS, item.candidates, strict=True), last + 1):
@@ -78,7 +84,7 @@ def make_sample(
             parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
     parts.append(f"\n{question.text}")
     sample = conversation(item.item_id, parts, question.answer, clip)
-    return OracleSample(sample, tuple(targets), last, future, question.foresees)
+    return OracleSample(sample, tuple(targets), last, observed, future, question.foresees)
 
 
 class OracleCollator:
@@ -136,7 +142,7 @@ def locate_mentions(
     Args:
         length: Number of tokens of a row of the batch.
     """
-    shown = {(t.picture, t.name): t for t in sample.targets}
+    shown = shown_objects(sample)
     mentions, tokens = find_mentions(sample.sample.response or "", tokenizer)
     # The token that ends the turn follows the response.
     first = length - tokens - 1
@@ -167,12 +173,13 @@ def stack_samples(
         visual: (B, T) positions of the visual tokens, grid x grid for each picture.
     """
     objects = [
-        (row, t) for row, s in enumerate(samples) for t in largest_per_token(s.targets, grid)
+        (row, t) for row, s in enumerate(samples) for t in most_visible_per_token(s.targets, grid)
     ]
     at = torch.tensor([(row, t.token(grid)) for row, t in objects]).reshape(-1, 2)
     presence = torch.zeros(visual.shape)
     presence[at[:, 0], at[:, 1]] = 1
     truth = stack_targets([t for _, t in objects])
+    scaled = truth["place"] * grid
 
     def integers(rows: list[tuple[int, ...]], columns: int) -> Tensor:
         return torch.tensor(rows, dtype=torch.long).reshape(-1, columns)
@@ -182,7 +189,7 @@ def stack_samples(
         presence=presence,
         objects=at,
         truth=truth,
-        inside=truth["place"] * grid % 1 - 0.5,
+        inside=scaled - scaled.floor().clamp(0, grid - 1) - 0.5,
         tracked=integers([*track_objects(samples, objects, grid)], 3),
         names=integers([(m.row, m.position) for m in mentions], 2),
         named=name_words([m.name for m in mentions]),
@@ -215,19 +222,25 @@ def track_objects(
             yield row, t.token(grid), before[row][t.name].token(grid)
 
 
+def shown_objects(sample: OracleSample) -> dict[tuple[int, str], ObjectTarget]:
+    """Return the visible objects of a sample by picture and name."""
+    return {(t.picture, t.name): t for t in sample.targets}
+
+
 def spoken_state(
-    sample: OracleSample, where: Mapping[tuple[int, str], ObjectTarget], mention: Mention
+    sample: OracleSample, shown: Mapping[tuple[int, str], ObjectTarget], mention: Mention
 ) -> tuple[float, ...]:
     """Return the place (from -0.5 to 0.5) and the velocity of a named object in the picture that
     the text speaks of there; NaN where the oracle does not determine them."""
-    now = where.get((sample.last, mention.name))
     place, velocity = UNKNOWN, UNKNOWN
     if mention.letter is not None:
-        shown = where.get((sample.last + 1 + LETTERS.index(mention.letter), mention.name))
-        place = shown.place if shown else UNKNOWN
+        seen = shown.get((sample.last + 1 + LETTERS.index(mention.letter), mention.name))
+        place = seen.place if seen else UNKNOWN
     elif mention.section in ("Prediction", "Outcome"):
-        moved = sample.future.get(mention.name, UNKNOWN) if sample.foresees else UNKNOWN
-        place = (now.place[0] + moved[0], now.place[1] + moved[1]) if now else UNKNOWN
-    elif now is not None:
-        place, velocity = now.place, now.velocity
+        now, moved = shown.get((sample.last, mention.name)), sample.future.get(mention.name)
+        if now and moved and sample.foresees:
+            place = now.place[0] + moved[0], now.place[1] + moved[1]
+    elif mention.name in sample.observed:
+        state = sample.observed[mention.name]
+        place, velocity = state[:2], state[2:]
     return place[0] - 0.5, place[1] - 0.5, *velocity

@@ -42,7 +42,7 @@ def measure(micro_store: Store, model, processor, student_cfg, monkeypatch: pyte
 def test_true_answers_are_right_in_every_respect(measure) -> None:
     measures = measure(lambda text: text)
     assert {"said_region/predict", "said_color/parse", "said_name/describe"} <= measures.keys()
-    assert set(measures.values()) == {1.0}
+    assert {k: v for k, v in measures.items() if v < 1} == {}
 
 
 def test_false_words_are_noticed(measure) -> None:

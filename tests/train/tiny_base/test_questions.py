@@ -130,7 +130,7 @@ def test_sampled_statements_are_different_and_true(described: Described) -> None
     kinds, rng = set(), np.random.default_rng(1)
     for _, p in described:
         for view in p.views:
-            statements = sample_statements(view, rng, 6)
+            statements = sample_statements(p, view, rng, 6)
             assert len(set(map(normalize_relation, statements))) == len(statements)
             assert {*map(normalize_relation, statements)} <= view.statements
             kinds |= {s.kind for s in statements}

@@ -8,23 +8,31 @@ import numpy as np
 import pytest
 import torch
 
-from data.records import SelectionItem, sample_prefix_frames
+from data.records import LETTERS, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
+from teacher.predicates.motion import find_cut
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import PICTURES, OracleHeads, distance, octant, pointing_losses
 from train.tiny_base.mentions import find_mentions
 from train.tiny_base.oracle_targets import (
     AHEAD,
     RATE,
+    UNKNOWN,
     ObjectTarget,
     clip_targets,
     future_displacements,
     image_targets,
-    largest_per_token,
+    most_visible_per_token,
+    observed_states,
 )
 from train.tiny_base.questions import KINDS
-from train.tiny_base.samples import OracleCollator, OracleSample, spoken_state
+from train.tiny_base.samples import (
+    OracleCollator,
+    OracleSample,
+    shown_objects,
+    spoken_state,
+)
 from train.tiny_base.trace import (
     NAMING,
     RECALLING,
@@ -42,7 +50,11 @@ GRID = 3
 
 @pytest.fixture(scope="module")
 def items(micro_store: Store) -> list[SelectionItem]:
-    return [i for i in micro_store.selection("train") if i.prefix_stop - i.prefix_start >= 8]
+    return [
+        item
+        for item in micro_store.selection("train")
+        if find_cut(micro_store.scene(item.scene_id), item.prefix_start, item.prefix_stop)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +143,19 @@ def test_a_token_has_the_target_of_which_most_is_visible() -> None:
     other = replace(one, name="blue metal cube", place=(0.2, 0.3), visible=0.9)
     elsewhere = replace(one, name="gray metal cube", place=(0.2, 0.4))
     assert [t.cell(GRID) for t in (one, other, elsewhere)] == [0, 0, 3]
-    assert largest_per_token([one, other, elsewhere], GRID) == [other, elsewhere]
+    assert most_visible_per_token([one, other, elsewhere], GRID) == [other, elsewhere]
     assert replace(one, place=(1.2, -0.1)).cell(GRID) == GRID - 1
+
+
+def test_places_in_tokens_and_in_pictures_agree(samples, collate) -> None:
+    """Also at the border, where the centre of an object may be outside of the picture."""
+    beyond = replace(samples[0].targets[0], place=(1.1, -0.2), name="gray metal cube")
+    outside = replace(samples[0], targets=(*samples[0].targets, beyond))
+    _, targets = collate([outside, *samples[1:]])
+    cell = targets.objects[:, 1] % GRID**2
+    corner = torch.stack([cell % GRID, cell // GRID], dim=1)
+    assert ((corner + targets.inside + 0.5) / GRID).allclose(targets.truth["place"])
+    assert targets.inside.abs().max() > 0.5
 
 
 def test_names_end_where_the_text_names_objects(samples, collate, processor) -> None:
@@ -181,21 +204,41 @@ def test_texts_speak_of_the_last_name_and_letter(processor) -> None:
     assert decode(ids[mentions[2].letter_at]).strip() == "B"
 
 
-def test_spoken_states_are_those_of_the_oracle(samples, collate, processor) -> None:
-    _, targets = collate(samples)
+def test_spoken_states_are_those_of_the_oracle(sampler, collate, processor) -> None:
+    samples = (sampler.sample(item, "explain", "test") for item in sampler.items)
+    explained = next(s for s in samples if "Outcome:" in s.sample.response)
+    _, targets = collate([explained])
     assert len(targets.said) == len(targets.spoken) > 20
-    assert not targets.said[:, :2].isnan().all()
-    first = samples[0]
-    mentions, _ = find_mentions(first.sample.response, processor.tokenizer)
-    where = {(t.picture, t.name): t for t in first.targets}
-    compared = 0
+    mentions, _ = find_mentions(explained.sample.response, processor.tokenizer)
+    shown = {(t.picture, t.name): t.place for t in explained.targets}
+    compared = set()
     for m in mentions:
-        said = spoken_state(first, where, m)
-        picture = first.last if m.letter is None else first.last + 1 + "ABCD".index(m.letter)
-        if m.section != "Prediction" and (shown := where.get((picture, m.name))):
-            assert np.add(said[:2], 0.5) == pytest.approx(shown.place)
-            compared += 1
-    assert compared
+        place = np.add(spoken_state(explained, shown_objects(explained), m)[:2], 0.5)
+        if m.letter is not None:
+            expected = shown.get((explained.last + 1 + LETTERS.index(m.letter), m.name))
+        elif m.section in ("Prediction", "Outcome"):
+            before = shown.get((explained.last, m.name))
+            expected = before and np.add(before, explained.future[m.name])
+        else:
+            expected = explained.observed.get(m.name, UNKNOWN)[:2]
+        assert place == pytest.approx(UNKNOWN if expected is None else expected, nan_ok=True)
+        compared.add(m.section)
+    assert compared >= {"Scene parse", "Motion analysis", "Prediction", "Candidate analysis"}
+
+
+def test_observed_states_are_those_of_the_cut(micro_store: Store, items) -> None:
+    earlier = 0
+    for item in items:
+        scene = micro_store.scene(item.scene_id)
+        places = scene.image_positions / scene.image_size
+        cut = find_cut(scene, item.prefix_start, item.prefix_stop)
+        earlier += cut < item.prefix_stop
+        for k, o in enumerate(scene.objects):
+            if state := observed_states(scene, cut).get(o.noun_phrase):
+                assert state[:2] == pytest.approx(places[cut, k])
+                moved = (places[cut, k] - places[cut - 4, k]) * 10 / 4
+                assert np.isnan(state[2:]).all() or state[2:] == pytest.approx(moved)
+    assert earlier
 
 
 def test_vision_tower_alone_gives_what_the_whole_model_embeds(samples, collate, deep_model) -> None:
@@ -279,11 +322,10 @@ def test_headings_are_eighths_of_the_circle() -> None:
 
 
 def test_samples_depend_on_seed_and_step_only(sampler: ItemSampler) -> None:
-    first, again, later = (sampler.batch("words", step, 4) for step in (1, 1, 5))
+    first, again, later = (sampler.batch("words", step, 4) for step in (1, 1, 1 + len(KINDS)))
     assert [s.sample.response for s in first] == [s.sample.response for s in again]
     assert [s.sample.response for s in first] != [s.sample.response for s in later]
     epoch = [
         s.sample.sample_id for k in range(len(sampler.items)) for s in sampler.batch("motion", k, 1)
     ]
     assert sorted(epoch) == sorted(item.item_id for item in sampler.items)
-    assert len(KINDS) == 4
