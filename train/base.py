@@ -31,7 +31,7 @@ def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
     from models.precision import resolve_precision
     from train.common.held_out import shuffled
     from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
-    from train.tiny_base.own_words import measure_own_words
+    from train.tiny_base.generated_answers import measure_generated_answers
     from train.tiny_base.training import build_trainer
 
     compat.keep_freed_memory()
@@ -51,7 +51,9 @@ def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
     trainer.run()
     log.info("measuring the base on %d items of held-out scenes", len(measured))
     metrics = trainer.probe.measure("words")
-    metrics |= measure_own_words(model, processor, sampler, measured, cfg.student, precision)
+    metrics |= measure_generated_answers(
+        model, processor, sampler, measured, cfg.student, precision
+    )
     # A base is saved in bf16, as released bases are, whatever its precision in training.
     loading.save_student(model, processor, run.folder / "student", "bf16")
     log.info("the base is in %s", run.folder / "student")

@@ -3,15 +3,16 @@ rationale of each test item from different places.
 
     python -m benchmarks.experiments.causes checkpoints/sft/exp-cot
 
-The rows are what was given of the true rationale:
+Each row gives the student a longer part of the true rationale:
 
-    nothing                the student writes everything
-    scene and motion       what can be seen in the prefix is given: perception
-    prediction             what will be true at the target is given too: foresight
-    candidate analysis     what the candidates show is given too: comparison
+    nothing               the student writes everything
+    scene                 what can be seen at the end of the prefix: perception
+    motion                how the objects move until the target, too: a part of foresight
+    prediction            what will be true at the target, too: foresight
+    candidate analysis    what each candidate shows, and which of them agrees, too: the student only
+                          has to copy the letter
 
-The last row leaves only the choice of the letter. The true rationale states what decides the item,
-so giving a part also gives away which objects matter.
+The true rationale states what decides the item, so every part also gives away which objects matter.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from conf.compose import compose
-from conf.schema import SelectCommand, SftCommand, TeacherConfig
+from benchmarks.experiments.experiment import open_benchmark
+from conf.schema import SftCommand, TeacherConfig
 from data.parallel import batched
 from data.records import FAMILIES, SelectionItem
 from data.render.frame_cache import FrameReader
-from data.store import Store, open_store
+from data.store import Store
 from evaluation.select import limit_items
 from models import loading
 from models.precision import resolve_precision
@@ -43,7 +44,8 @@ from teacher.vocabulary import choose_vocabulary, describe_item
 
 GIVEN = {
     "nothing": None,
-    "scene and motion": "Motion analysis",
+    "scene": "Scene parse",
+    "motion": "Motion analysis",
     "prediction": "Prediction",
     "candidate analysis": "Candidate analysis",
 }
@@ -59,8 +61,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=32)
     args = parser.parse_args()
     trained = trained_settings(args.student, SftCommand, "student")
-    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={args.benchmark}"]).benchmark
-    store = open_store(args.store / cfg.store_name)
+    store = open_benchmark(args.store, args.benchmark)
     items = limit_items(store.selection("test"), args.items, seed=0)
     truth = {item.item_id: true_rationale(item, store, trained.teacher) for item in items}
     items = [item for item in items if truth[item.item_id]]

@@ -17,6 +17,10 @@ from typing import Any
 
 import pandas as pd
 
+from conf.compose import compose
+from conf.schema import SelectCommand
+from data.store import Store, open_store
+
 Job = tuple[str, int]
 """A variant and a seed."""
 
@@ -49,16 +53,24 @@ class Experiment:
     """Command that evaluates a variant, such as evaluation.select."""
 
     @property
+    def benchmark_overrides(self) -> list[str]:
+        """Overrides that choose the benchmark."""
+        return [f"benchmark={self.args.benchmark}", f"store={self.args.store}"]
+
+    @property
     def shared_overrides(self) -> list[str]:
-        """Overrides of every command."""
-        args = self.args
-        return [
-            f"benchmark={args.benchmark}", f"store={args.store}", f"checkpoints={args.checkpoints}",
-        ]  # fmt: skip
+        """Overrides of every training and evaluation."""
+        return [*self.benchmark_overrides, f"checkpoints={self.args.checkpoints}"]
+
+    def read_record(self) -> pd.DataFrame:
+        """Return the whole record; an empty table if there is no file yet."""
+        if not self.args.record.exists():
+            return pd.DataFrame(columns=[*self.identity, self.variant_column, "seed"])
+        return pd.read_parquet(self.args.record)
 
     def read_results(self, seeds: int | None = None) -> pd.DataFrame:
         """Return the recorded results with seeds below `seeds`; all by default."""
-        table = pd.read_parquet(self.args.record)
+        table = self.read_record()
         for column, value in self.identity.items():
             table = table[table[column] == value]
         return table if seeds is None else table[table.seed < seeds]
@@ -73,13 +85,13 @@ class Experiment:
                 experiment adds: its identity, the variant and the seed.
         """
         if not self.args.table:
-            run_command(["data.build", *self.shared_overrides[:2]])
+            run_command(["data.build", *self.benchmark_overrides])
             recorded = self.read_results()
             done = set(zip(recorded[self.variant_column], recorded.seed, strict=True))
             for variant, seed in (job for job in jobs if job not in done):
                 shared = {**self.identity, self.variant_column: variant, "seed": seed}
                 rows = pd.DataFrame([shared | row for row in evaluate((variant, seed))])
-                table = pd.concat([pd.read_parquet(self.args.record), rows])
+                table = pd.concat([self.read_record(), rows])
                 table.to_parquet(self.args.record, index=False, compression="zstd")
         results = self.read_results(self.args.seeds)
         if results.empty:
@@ -110,6 +122,12 @@ class Experiment:
         if not (folder / "metrics.json").exists():
             run_command([self.evaluator, *evaluation, *self.shared_overrides, f"run={name}"])
         return folder
+
+
+def open_benchmark(store: Path, benchmark: str) -> Store:
+    """Return the built benchmark of a preset."""
+    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
+    return open_store(store / cfg.store_name)
 
 
 def run_command(command: Sequence[str]) -> None:

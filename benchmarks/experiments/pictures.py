@@ -18,18 +18,17 @@ from textwrap import wrap
 from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 
-from conf.compose import compose
+from benchmarks.experiments.experiment import open_benchmark
 from conf.files import read_json_lines
-from conf.schema import SelectCommand
 from data.records import LETTERS, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
-from data.store import Store, open_store
+from data.store import Store
 
 INK, PAPER, GREEN, RED, GRAY = "#222222", "#ffffff", "#1a7f37", "#cf222e", "#8c959f"
 WIDTH, FRAME, GAP, BORDER = 620, 144, 10, 5
 """Sizes of a panel, of a frame's width, of gaps, and of the borders of candidates, in pixels."""
 FONT = ImageFont.truetype(findfont("DejaVu Sans"), 12)
-LINE, LETTERS_A_LINE = 16, 88
+LINE, CHARACTERS_PER_LINE = 16, 88
 PREFIX_FRAMES = 4
 """Number of frames of the prefix in the still picture."""
 DOCS = Path("docs")
@@ -52,11 +51,10 @@ def main() -> None:
     parser.add_argument("--solved", help="id of the solved item")
     parser.add_argument("--unsolved", help="id of the unsolved item")
     args = parser.parse_args()
-    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={args.benchmark}"]).benchmark
-    store = open_store(args.store / cfg.store_name)
+    store = open_benchmark(args.store, args.benchmark)
     solutions = read_solutions(args.run, store)
     solved, unsolved = (
-        choose(solutions, wanted, is_right)
+        find_solution(solutions, wanted, is_right)
         for wanted, is_right in ((args.solved, True), (args.unsolved, False))
     )
     frames = FrameReader(store)
@@ -80,7 +78,7 @@ def read_solutions(folder: Path, store: Store) -> list[Solution]:
     ]
 
 
-def choose(solutions: Sequence[Solution], wanted: str | None, is_right: bool) -> Solution:
+def find_solution(solutions: Sequence[Solution], wanted: str | None, is_right: bool) -> Solution:
     fitting = [
         s
         for s in solutions
@@ -113,7 +111,7 @@ def draw_panel(
         _paste(panel, frames, item.scene_id, frame, position, height)
     draw.text((GAP, 2), "observed", fill=GRAY, font=FONT)
     y = height + LINE + 2 * GAP
-    for line in wrap(item.question, LETTERS_A_LINE):
+    for line in wrap(item.question, CHARACTERS_PER_LINE):
         draw.text((GAP, y), line, fill=INK, font=FONT)
         y += LINE
     y = height + 3 * LINE + 3 * GAP
@@ -136,7 +134,7 @@ def draw_panel(
 
 
 def _wrap(text: str) -> list[str]:
-    return [line for part in text.splitlines() for line in wrap(part, LETTERS_A_LINE)]
+    return [line for part in text.splitlines() for line in wrap(part, CHARACTERS_PER_LINE)]
 
 
 def _frame_height(frames: FrameReader, item: SelectionItem) -> int:

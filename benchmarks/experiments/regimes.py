@@ -13,6 +13,7 @@ percentile intervals of a bootstrap that resamples scenes and seeds.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +22,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.experiments.experiment import Experiment, Job, create_parser
+from benchmarks.experiments.experiment import (
+    Experiment,
+    Job,
+    create_parser,
+    open_benchmark,
+)
 from conf.compose import compose
 from conf.files import read_json_lines
-from conf.schema import SelectCommand, SftCommand
+from conf.schema import SftCommand
 from data.records import FAMILIES, SelectionItem
-from data.store import Store, open_store
+from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR
 from evaluation.metrics.reasons import PARTS, SUPPORTED, read_reasons
 from models.fingerprints import weights_digest
@@ -99,8 +105,9 @@ def main() -> None:
         training = variant.training and [*variant.training, f"seed={seed}", student]
         # The default modes ask a base for a structured record, which the tiny base cannot write.
         modes = f"modes=[{','.join(variant.modes)}]"
-        evaluation = [student, "batch=64", modes]
-        rows = []
+        # A trained student is evaluated with the settings of its training.
+        evaluation = ["batch=64", modes, *([] if training else [student])]
+        store, rows = open_benchmark(Path(args.store), args.benchmark), []
         for control in (UNCHANGED, *(CONTROLS if variant.controls else ())):
             changed = control != UNCHANGED
             run = experiment.train_and_evaluate(
@@ -109,7 +116,6 @@ def main() -> None:
                 [*evaluation, *([f"+exp={control}"] if changed else [])],
                 trained=folder,
             )
-            store = open_benchmark(Path(args.store), args.benchmark)
             rows += read_letters(run, store, control, variant.modes)
         return rows
 
@@ -120,21 +126,15 @@ def main() -> None:
     print_tables(experiment.run(jobs, evaluate))
 
 
-def open_benchmark(store: Path, benchmark: str) -> Store:
-    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
-    return open_store(store / cfg.store_name)
-
-
 def read_letters(
     folder: Path, store: Store, control: str, modes: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Return the rows of a run: the chosen letter for each test item in each mode, and what the
     response claims."""
-    lines = [line for line in read_json_lines(folder / "answers.jsonl") if "item_id" in line]
+    log = [*read_json_lines(folder / "answers.jsonl")]
+    lines = [line for line in log if "item_id" in line]
     keys = {
-        line["key"]: line["asked"].get("control") or UNCHANGED
-        for line in read_json_lines(folder / "answers.jsonl")
-        if "asked" in line
+        line["key"]: line["asked"].get("control") or UNCHANGED for line in log if "asked" in line
     }
     suite = MATCHED_ANCHOR if control == MATCHED_ANCHOR else None
     wanted = UNCHANGED if suite else control
@@ -147,7 +147,8 @@ def read_letters(
                 "mode": mode, "control": control, "item_id": item.item_id, "family": item.family,
                 "scene_id": item.scene_id, "answer": item.letter, "letter": answer["letter"],
             }  # fmt: skip
-            rows.append(row | dict(count_claims(item, answer, store)))
+            claims = count_claims(item, answer, store) if control == UNCHANGED else ()
+            rows.append(row | dict(claims))
     return rows
 
 
@@ -190,7 +191,8 @@ def print_accuracies(
         rows = table[(table.variant == name) & (table["mode"] == mode)]
         seeds = [100 * resampling.means(credits[[seed]])[-1] for seed in credits]
         cells = [
-            f"{m:.1f} [{low:.1f}, {high:.1f}]" for m, low, high in resampling.intervals(credits)
+            f"{m:.1f} [{low:.1f}, {high:.1f}]"
+            for m, low, high in resampling.intervals((name, credits))
         ]
         by_seed = " ".join(f"{s:.1f}" for s in seeds)
         print_row(name, mode, *cells, by_seed, f"{100 * rows.letter.notna().mean():.1f}")
@@ -200,7 +202,9 @@ def print_differences(correct: dict[tuple[str, str], pd.DataFrame], resampling: 
     print_header("difference", *FAMILIES, "macro")
     for first, second in PAIRS:
         if first in correct and second in correct:
-            intervals = resampling.intervals(correct[first], correct[second])
+            intervals = resampling.intervals(
+                (first[0], correct[first]), (second[0], correct[second])
+            )
             title = f"{', '.join(first)} minus {', '.join(second)}"
             print_row(title, *(f"{m:+.1f} [{low:+.1f}, {high:+.1f}]" for m, low, high in intervals))
 
@@ -218,7 +222,7 @@ def print_controls(
         cells = [f"{100 * resampling.means(credits)[-1]:.1f}"]
         for control in controls:
             changed = credit_matrix(table[table.control == control], name, mode)
-            m, low, high = resampling.intervals(changed, credits)[-1]
+            m, low, high = resampling.intervals((name, changed), (name, credits))[-1]
             mean = 100 * resampling.means(changed)[-1]
             cells.append(f"{mean:.1f} ({m:+.1f} [{low:+.1f}, {high:+.1f}])")
         pairs = credit_matrix(table[table.control == MATCHED_ANCHOR], name, mode)
@@ -265,18 +269,19 @@ def credit_matrix(table: pd.DataFrame, variant: str, mode: str) -> pd.DataFrame:
 class Resampling:
     """A bootstrap over scenes and seeds of the accuracy in each family and their mean, the macro.
 
-    All variants share the resampled scenes. Their seeds are resampled independently, since runs of
-    two variants with the same seed have nothing in common but its number.
+    All results share the resampled scenes, and those of the same trained students the resampled
+    seeds. The seeds of different variants are resampled independently, since runs of two variants
+    with the same seed have nothing in common but its number.
     """
 
     def __init__(self, items: pd.MultiIndex) -> None:
         families = items.get_level_values("family")
         self._scene, scenes = pd.factorize(items.get_level_values("scene_id"))
         self._members = [families == family for family in FAMILIES]
-        self._rng = np.random.default_rng(0)
         share = np.full(len(scenes), 1 / len(scenes))
         # (draws, scenes) how often each draw contains each scene.
-        self._weights = self._rng.multinomial(len(scenes), share, size=DRAWS).astype(float)
+        weights = np.random.default_rng(0).multinomial(len(scenes), share, size=DRAWS)
+        self._weights = weights.astype(float)
 
     def means(self, credits: pd.DataFrame) -> np.ndarray:
         """Return (families + 1,) means over all items and seeds: of each family, and the macro."""
@@ -284,20 +289,22 @@ class Resampling:
         return np.array([*means, np.mean(means)])
 
     def intervals(
-        self, first: pd.DataFrame, second: pd.DataFrame | None = None
+        self, first: tuple[str, pd.DataFrame], second: tuple[str, pd.DataFrame] | None = None
     ) -> list[tuple[float, float, float]]:
         """Return the mean and the bounds of its interval, in percent, for each family and the macro
-        of `first`, or of the difference `first` minus `second`."""
-        means, draws = self.means(first), self._draws(first)
+        of `first`, or of the difference `first` minus `second`. Both are a variant and its credits.
+        """
+        means, draws = self.means(first[1]), self._draws(*first)
         if second is not None:
-            means, draws = means - self.means(second), draws - self._draws(second)
+            means, draws = means - self.means(second[1]), draws - self._draws(*second)
         low, high = np.percentile(draws, [2.5, 97.5], axis=0)
         return [tuple(100 * np.array(t)) for t in zip(means, low, high, strict=True)]
 
-    def _draws(self, credits: pd.DataFrame) -> np.ndarray:
+    def _draws(self, variant: str, credits: pd.DataFrame) -> np.ndarray:
         """Return the means of each draw, (draws, families + 1)."""
         seeds = credits.shape[1]
-        seed_shares = self._rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=DRAWS) / seeds
+        rng = np.random.default_rng([0, zlib.crc32(variant.encode())])
+        seed_shares = rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=DRAWS) / seeds
         means = []
         for members in self._members:
             sums = np.zeros((self._weights.shape[1], seeds))

@@ -1,4 +1,4 @@
-"""The report's overview: what the trained models reach, in a line each, and responses in full."""
+"""The report's overview: one line per trained model, and example responses."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def write_overview(
                 for part, summary in reasons.parts.items()
                 if summary.supported is not None
             }
-            said = ", ".join(f"{share} about the {part}" for part, share in shares.items())
+            listed = ", ".join(f"{share} about the {part}" for part, share in shares.items())
             lines.append(
-                f"Its claims that the oracle supports: {said}. Answers that are right for true "
-                f"reasons: {percent(reasons.true)}."
+                f"Its claims that the oracle supports: {listed or 'none, it makes no claims'}. "
+                f"Answers that are right for true reasons: {percent(reasons.true)}."
             )
     lines += _describe_retriever(retrievals)
     if main is not None:
@@ -57,8 +57,8 @@ def _describe_student(
     that does not predict."""
     beside = [f"chance {CHANCE:.0f}%"]
     for m in students:
-        if m.group == main.group and m.regime == "answer_only":
-            beside.append(f"trained on answers alone {percent(m.result.micro)}")
+        if m is not main and m.group == main.group and m.regime == "answer_only":
+            beside.append(f"{m.label}, trained on answers alone, {percent(m.result.micro)}")
     rules = [r for r in browser.baselines.get(main.group, []) if r.name != TITLES["velocity"]]
     if rules:
         best = max(rules, key=lambda rule: rule.micro.value)
@@ -81,7 +81,7 @@ def _describe_retriever(retrievals: Sequence[Measurement]) -> Iterator[str]:
 
 
 def _show_responses(main: Measurement, browser: ItemBrowser) -> Iterator[str]:
-    """Yield responses of a student, in turn to items that it solves and to others."""
+    """Yield responses of a student: first to items that it solves, then to others."""
     shown = [
         (entry, response)
         for entry in browser.entries

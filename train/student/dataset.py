@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from conf.schema import SftCommand, TeacherConfig
-from data.records import LETTERS, Rationale, SelectionItem
+from data.records import LETTERS, Rationale, SelectionItem, original_scene_id
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.prompts import (
@@ -137,8 +137,10 @@ def load_datasets(
 
 
 def uses_only(item: SelectionItem, scenes: set[str]) -> bool:
-    """Whether the prefix and all candidates of an item are frames of these scenes."""
-    return {item.scene_id, *(c.scene_id for c in item.candidates)} <= scenes
+    """Whether the prefix and all candidates of an item are frames of these scenes or of their
+    alternative futures."""
+    shown = (item.scene_id, *(c.scene_id for c in item.candidates))
+    return {original_scene_id(scene) for scene in shown} <= scenes
 
 
 def tokenizer_corpus(store: Store, rationales: list[Rationale]) -> list[str]:

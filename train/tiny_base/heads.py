@@ -67,7 +67,7 @@ class OracleTargets:
         places: (M, 2 * PICTURES) its places, NaN where it is not visible.
         future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
         spoken: (S, 2) row and position of the tokens from each name to the next.
-        said: (S, 4) place and velocity of the object there, or NaN.
+        spoken_state: (S, 4) place and velocity of the object there, or NaN.
         subjects: (_, 3) row, position after a name, and position of the name.
         letters: (_, 3) row, position that speaks of a candidate, and position of its letter.
     """
@@ -84,7 +84,7 @@ class OracleTargets:
     places: Tensor
     future: Tensor
     spoken: Tensor
-    said: Tensor
+    spoken_state: Tensor
     subjects: Tensor
     letters: Tensor
 
@@ -222,7 +222,7 @@ class OracleHeads(nn.Module):
         `SPEAKING`, (B, L, H)."""
         row, at = targets.spoken.T
         spoken = self.norms["spoken"](hidden[row, at])
-        truth = dict(zip(("place", "velocity"), targets.said.split(2, dim=1), strict=True))
+        truth = dict(zip(("place", "velocity"), targets.spoken_state.split(2, dim=1), strict=True))
         return {
             name: distance(head(spoken), truth[name], SCALES[name])
             for name, head in self.spoken.items()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,7 +11,14 @@ from torch import Tensor
 from transformers import PreTrainedModel
 
 from train.tiny_base.heads import OracleHeads
-from train.tiny_base.trace import MIDDLE, NAMING, see, select_tokens, trace_forward, trace_states
+from train.tiny_base.trace import (
+    MIDDLE,
+    NAMING,
+    encode_pictures,
+    select_tokens,
+    trace_forward,
+    trace_states,
+)
 
 if TYPE_CHECKING:
     from train.tiny_base.samples import OracleCollator, OracleSample
@@ -58,14 +65,14 @@ class Probe:
         for k in range(0, len(self.samples), BATCH):
             batch, targets = self.collate(self.samples[k : k + BATCH])
             if not with_motion:
-                tokens, hidden = see(self.model, batch), None
+                tokens, hidden = encode_pictures(self.model, batch), None
             else:
                 trace = trace_states(self.model, batch)
                 tokens = select_tokens(trace.embedded, targets.visual)
                 hidden = select_tokens(trace.outputs[MIDDLE], targets.visual)
             for name, values in self.heads.measures(tokens, hidden, targets).items():
                 found[name].append(values.float())
-        return {name: torch.cat(values).mean().item() for name, values in found.items()}
+        return average(found)
 
     def _follow_words(self) -> dict[str, float]:
         """Return the share of words of each kind that the model predicts, given the correct words
@@ -85,5 +92,10 @@ class Probe:
                 measures = self.heads.named_measures(trace.outputs[NAMING], targets)
                 for name, values in measures.items():
                     found[f"{name}/{kind}"].append(values)
-        joined = {name: torch.cat(values) for name, values in found.items()}
-        return {name: values.mean().item() for name, values in joined.items() if len(values)}
+        return average(found)
+
+
+def average(found: Mapping[str, Sequence[Tensor]]) -> dict[str, float]:
+    """Return the mean of the values of each measure that has any."""
+    joined = {name: torch.cat([*values]) for name, values in found.items()}
+    return {name: values.mean().item() for name, values in joined.items() if len(values)}

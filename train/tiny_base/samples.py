@@ -197,7 +197,7 @@ def stack_samples(
         places=torch.tensor([m.places for m in mentions]).reshape(-1, 2 * PICTURES) - 0.5,
         future=torch.tensor([m.future for m in mentions]).reshape(-1, 2),
         spoken=integers([(m.row, k) for m in mentions for k in m.spoken], 2),
-        said=torch.tensor([m.state for m in mentions for _ in m.spoken]).reshape(-1, 4),
+        spoken_state=torch.tensor([m.state for m in mentions for _ in m.spoken]).reshape(-1, 4),
         subjects=integers([(m.row, k, m.position) for m in mentions for k in m.spoken[1:]], 3),
         letters=integers(
             [

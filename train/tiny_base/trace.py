@@ -98,7 +98,7 @@ def trace_states(model: PreTrainedModel, batch: Mapping[str, Tensor]) -> Trace:
     return trace
 
 
-def see(model: PreTrainedModel, batch: Mapping[str, Tensor]) -> Tensor:
+def encode_pictures(model: PreTrainedModel, batch: Mapping[str, Tensor]) -> Tensor:
     """Return the vision tower's output (B, T, H) at the visual tokens of each sample."""
     rows = len(batch["input_ids"])
     encoders = {"video": model.get_video_features, "image": model.get_image_features}

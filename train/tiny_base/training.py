@@ -33,6 +33,7 @@ from train.common.curves import plot_curves
 from train.common.journal import CURVES, JOURNAL, read_journal
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import OracleHeads, OracleTargets, pointing_losses
+from train.tiny_base.oracle_targets import WORDS
 from train.tiny_base.probe import Probe
 from train.tiny_base.questions import KINDS
 from train.tiny_base.samples import OracleCollator
@@ -40,7 +41,8 @@ from train.tiny_base.trace import (
     MIDDLE,
     NAMING,
     SPEAKING,
-    see,
+    Trace,
+    encode_pictures,
     select_tokens,
     trace_forward,
     trace_states,
@@ -58,18 +60,14 @@ tokens and names show, those of attention, and those of places and motion in tex
 def eyes_losses(
     model: PreTrainedModel, heads: OracleHeads, batch: dict[str, Tensor], targets: OracleTargets
 ) -> dict[str, Tensor]:
-    return heads.seen_losses(see(model, batch), targets)
+    return heads.seen_losses(encode_pictures(model, batch), targets)
 
 
 def motion_losses(
     model: PreTrainedModel, heads: OracleHeads, batch: dict[str, Tensor], targets: OracleTargets
 ) -> dict[str, Tensor]:
     trace = trace_states(model, batch)
-    return {
-        **heads.seen_losses(select_tokens(trace.embedded, targets.visual), targets),
-        **heads.known_losses(select_tokens(trace.outputs[MIDDLE], targets.visual), targets),
-        **pointing_losses(trace, targets),
-    }
+    return dense_losses(trace, heads, targets) | pointing_losses(trace, targets)
 
 
 def words_losses(
@@ -79,10 +77,7 @@ def words_losses(
     inputs = {k: v for k, v in batch.items() if k != "labels"}
     with trace_forward(model.model.language_model, batch["attention_mask"]) as trace:
         logits = model(**inputs, use_cache=False).logits
-    dense = {
-        **heads.seen_losses(select_tokens(trace.embedded, targets.visual), targets),
-        **heads.known_losses(select_tokens(trace.outputs[MIDDLE], targets.visual), targets),
-    }
+    dense = dense_losses(trace, heads, targets)
     losses = {name: DENSE * loss for name, loss in dense.items()}
     pointing = pointing_losses(trace, targets)
     losses |= {name: POINTING * loss for name, loss in pointing.items()}
@@ -96,6 +91,14 @@ def words_losses(
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()
     losses["words"] = cross_entropy(predicted, following, ignore_index=IGNORED)
     return losses
+
+
+def dense_losses(trace: Trace, heads: OracleHeads, targets: OracleTargets) -> dict[str, Tensor]:
+    """Return the losses at the visual tokens of the whole model."""
+    return {
+        **heads.seen_losses(select_tokens(trace.embedded, targets.visual), targets),
+        **heads.known_losses(select_tokens(trace.outputs[MIDDLE], targets.visual), targets),
+    }
 
 
 LOSSES: dict[str, Callable[..., dict[str, Tensor]]] = {
@@ -242,7 +245,7 @@ def build_trainer(
         held_out: Items on which the base is measured.
     """
     words = first_tokens(processor)
-    objects = {kind: words[kind] for kind in ("color", "material", "shape")}
+    objects = {kind: words[kind] for kind in WORDS}
     heads = OracleHeads(model.get_input_embeddings(), objects)
     collate = OracleCollator(processor, cfg.student.max_length)
     samples = [sampler.sample(item, None, "held out") for item in held_out]

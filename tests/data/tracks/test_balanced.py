@@ -49,6 +49,7 @@ from data.world.physics import shared_simulator
 from data.world.shapes import RADIUS, rotation_matrix
 from teacher.predicates.extraction import extract_predicates
 from tests.data.simulated import CLEVRER, simulate_scene
+from train.student.dataset import uses_only
 
 QUOTAS = {"future_match_gap10": 2, "future_cross_gap10": 2, "contact_offset": 2}
 
@@ -129,6 +130,17 @@ def test_alternatives_share_the_past_of_their_scene(
                 np.testing.assert_array_equal(getattr(other, name)[: until + 1], own)
             assert np.abs(other.velocities[until + 1] - scene.velocities[until + 1]).max() > 0
             assert (other.split, other.objects) == (scene.split, scene.objects)
+
+
+@pytest.mark.slow
+def test_items_belong_to_the_scene_whose_futures_they_show(store: Store) -> None:
+    """Training leaves out the futures of held-out scenes, and no others."""
+    scenes = set(store.scene_ids("train"))
+    training = store.selection("train")
+    assert training
+    for item in training:
+        assert uses_only(item, {item.scene_id})
+        assert not uses_only(item, scenes - {item.scene_id})
 
 
 @pytest.mark.slow

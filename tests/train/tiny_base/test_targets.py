@@ -38,7 +38,7 @@ from train.tiny_base.trace import (
     RECALLING,
     SPEAKING,
     TRACKING,
-    see,
+    encode_pictures,
     select_tokens,
     trace_forward,
 )
@@ -208,7 +208,7 @@ def test_spoken_states_are_those_of_the_oracle(sampler, collate, processor) -> N
     samples = (sampler.sample(item, "explain", "test") for item in sampler.items)
     explained = next(s for s in samples if "Outcome:" in s.sample.response)
     _, targets = collate([explained])
-    assert len(targets.said) == len(targets.spoken) > 20
+    assert len(targets.spoken_state) == len(targets.spoken) > 20
     mentions, _ = find_mentions(explained.sample.response, processor.tokenizer)
     shown = {(t.picture, t.name): t.place for t in explained.targets}
     compared = set()
@@ -247,7 +247,7 @@ def test_vision_tower_alone_gives_what_the_whole_model_embeds(samples, collate, 
     with torch.no_grad():
         with trace_forward(deep_model.model.language_model, batch["attention_mask"]) as trace:
             deep_model.model(**inputs)
-        alone = see(deep_model, batch)
+        alone = encode_pictures(deep_model, batch)
     torch.testing.assert_close(alone, select_tokens(trace.embedded, targets.visual))
 
 

@@ -7,7 +7,7 @@ import pytest
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.responses import GeneratedText
-from train.tiny_base import own_words
+from train.tiny_base import generated_answers
 from train.tiny_base.data import ItemSampler, split_items
 
 pytestmark = pytest.mark.slow
@@ -23,17 +23,22 @@ def measure(micro_store: Store, model, processor, student_cfg, monkeypatch: pyte
     def measure_answers(change) -> dict[str, float]:
         true = [
             sampler.ask(item, kind, "held out")[1].answer
-            for kind in own_words.SECTIONS
-            for item in items[: own_words.BATCH]
+            for kind in generated_answers.SECTIONS
+            for item in items[: generated_answers.BATCH]
         ]
         batches = iter(
-            [true[k : k + own_words.BATCH] for k in range(0, len(true), own_words.BATCH)]
+            [
+                true[k : k + generated_answers.BATCH]
+                for k in range(0, len(true), generated_answers.BATCH)
+            ]
         )
         monkeypatch.setattr(
-            own_words, "generate", lambda *_: [GeneratedText(change(t)) for t in next(batches)]
+            generated_answers,
+            "generate",
+            lambda *_: [GeneratedText(change(t)) for t in next(batches)],
         )
-        return own_words.measure_own_words(
-            model, processor, sampler, items[: own_words.BATCH], student_cfg, "fp32"
+        return generated_answers.measure_generated_answers(
+            model, processor, sampler, items[: generated_answers.BATCH], student_cfg, "fp32"
         )
 
     return measure_answers
@@ -41,14 +46,18 @@ def measure(micro_store: Store, model, processor, student_cfg, monkeypatch: pyte
 
 def test_true_answers_are_right_in_every_respect(measure) -> None:
     measures = measure(lambda text: text)
-    assert {"said_region/predict", "said_color/parse", "said_name/describe"} <= measures.keys()
+    assert {
+        "generated_region/predict",
+        "generated_color/parse",
+        "generated_name/describe",
+    } <= measures.keys()
     assert {k: v for k, v in measures.items() if v < 1} == {}
 
 
 def test_false_words_are_noticed(measure) -> None:
     metal = measure(lambda text: text.replace(" rubber ", " metal "))
     # Another object may have the false material, and then seems to be meant.
-    assert metal["said_material/parse"] < metal["said_color/parse"]
-    assert metal["said_name/parse"] < 0.8
+    assert metal["generated_material/parse"] < metal["generated_color/parse"]
+    assert metal["generated_name/parse"] < 0.8
     regions = measure(lambda text: text.replace("near the ", "not near the "))
-    assert regions["said_region/predict"] == 0
+    assert regions["generated_region/predict"] == 0

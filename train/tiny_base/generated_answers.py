@@ -1,12 +1,12 @@
-"""Measure what the tiny base says in its own words: its answers are generated, and their claims
-are compared with the oracle.
+"""Generate answers of the tiny base, and compare their claims with the oracle.
 
-    said_name/parse         share of the names in answers to `parse` that a shown object has
-    said_color/parse        share of the names whose colour is that of the shown object with which
-                            the name shares most words; likewise for material and shape
-    said_region/predict     share of the claims about regions in answers to `predict` that the
-                            oracle supports, of those that it can decide; likewise for other
-                            kinds of claims
+    generated_name/parse       share of the names in answers to `parse` that an object of the scene
+                               has
+    generated_color/parse      share of the names whose colour is that of the object with which the
+                               name shares most words; likewise for material and shape
+    generated_region/predict   share of the claims about regions in answers to `predict` that the
+                               oracle supports, of those that it can decide; likewise for other
+                               kinds of claims
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ from train.tiny_base.oracle_targets import WORDS
 
 SECTIONS = {"parse": "", "predict": "", "describe": "Candidate analysis: "}
 """The kinds of questions whose answers are read, and what they lack to be read as sections of a
-rationale. Answers to `compare` state predictions that need not be true."""
+rationale. Answers to `compare` state predictions that need not be true, and `explain` repeats what
+the other kinds ask for."""
 BATCH = 32
 
 
-def measure_own_words(
+def measure_generated_answers(
     model: PreTrainedModel,
     processor: ProcessorMixin,
     sampler: ItemSampler,
@@ -50,11 +51,14 @@ def measure_own_words(
     for kind, section in SECTIONS.items():
         for k in range(0, len(items), BATCH):
             asked = [sampler.ask(item, kind, "held out") for item in items[k : k + BATCH]]
-            samples = [replace(sampler.make(*question).sample, response=None) for question in asked]
+            samples = [
+                replace(sampler.make(item, question).sample, response=None)
+                for item, question in asked
+            ]
             texts = generate(model, processor, collate(samples), limit, precision)
             for (item, _), text in zip(asked, texts, strict=True):
                 for name, right in _read(section + text.text, item, kind, sampler):
-                    found[f"said_{name}/{kind}"].append(right)
+                    found[f"generated_{name}/{kind}"].append(right)
     return {name: sum(values) / len(values) for name, values in found.items()}
 
 
@@ -67,7 +71,7 @@ def _read(
     claims = [c for c in extract_claims(text, predicates) if c.kind != "mention"]
     decided = [c for c in claims if c.verdict != "unknown"]
     read = [(claim.kind, claim.verdict == "supported") for claim in decided]
-    objects = _shown_names(item, kind, sampler)
+    objects = _scene_names(item, kind, sampler)
     for match in NAME.finditer(text):
         said = match.group().split()
         # The object with most words in common is the one that is meant.
@@ -77,7 +81,7 @@ def _read(
     return read
 
 
-def _shown_names(item: SelectionItem, kind: str, sampler: ItemSampler) -> list[list[str]]:
+def _scene_names(item: SelectionItem, kind: str, sampler: ItemSampler) -> list[list[str]]:
     """Return the words of the names of all objects in the scenes that a kind of question shows."""
     shows_candidates = kind == "describe"
     scenes = {c.scene_id for c in item.candidates} if shows_candidates else {item.scene_id}
