@@ -1,12 +1,12 @@
 """Generate answers of the tiny base, and compare their claims with the oracle.
 
-    generated_name/parse       share of the names in answers to `parse` that an object of the scene
-                               has
-    generated_color/parse      share of the names whose colour is that of the object with which the
-                               name shares most words; likewise for material and shape
-    generated_region/predict   share of the claims about regions in answers to `predict` that the
-                               oracle supports, of those that it can decide; likewise for other
-                               kinds of claims
+generated_name/parse       share of the names in answers to `parse` that an object of the scene
+                           has
+generated_color/parse      share of the names whose colour is that of the object with which the
+                           name shares most words; likewise for material and shape
+generated_region/predict   share of the claims about regions in answers to `predict` that the
+                           oracle supports, of those that it can decide; likewise for other
+                           kinds of claims
 """
 
 from __future__ import annotations

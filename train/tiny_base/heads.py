@@ -20,7 +20,9 @@ A text attends to what earlier layers stored at the visual tokens, so static pro
 at the tower's output and motion in the middle layers. Further losses teach attention heads where
 to look: at a visual token of a candidate, the same object at the end of the clip (layer
 `TRACKING`); at an object's name in a text, the object in each picture (layer `NAMING`); after a
-name, this name and the letter of the candidate that the text speaks of (layer `RECALLING`).
+name, this name and the letter of the candidate that the text speaks of, and before a name that is
+repeated, its last mention (layer `RECALLING`); before a letter in an outcome, the word that says
+that this candidate agrees (layer `SPEAKING`).
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy,
 
 from data.records import LETTERS
 from train.tiny_base.oracle_targets import AHEAD
-from train.tiny_base.trace import NAMING, RECALLING, TRACKING, Trace
+from train.tiny_base.trace import NAMING, RECALLING, SPEAKING, TRACKING, Trace
 
 PICTURES = 1 + len(LETTERS)
 """Pictures in which a named object is found: the last one of the clip, and the candidates."""
@@ -70,6 +72,10 @@ class OracleTargets:
         spoken_state: (S, 4) place and velocity of the object there, or NaN.
         subjects: (_, 3) row, position after a name, and position of the name.
         letters: (_, 3) row, position that speaks of a candidate, and position of its letter.
+        repeats: (_, 3) row, position before a name that the text has mentioned before, and position
+            of the first token of its last mention.
+        verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
+            of the word that says that the candidate agrees.
     """
 
     visual: Tensor
@@ -87,6 +93,8 @@ class OracleTargets:
     spoken_state: Tensor
     subjects: Tensor
     letters: Tensor
+    repeats: Tensor
+    verdicts: Tensor
 
 
 class OracleHeads(nn.Module):
@@ -253,7 +261,9 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
 
     At a visual token, head 0 of layer `TRACKING` finds the object at the end of the clip. At a
     name, head k of layer `NAMING` finds the object in picture k. After a name, heads 0 and 1 of
-    layer `RECALLING` find this name and the letter of the candidate.
+    layer `RECALLING` find this name and the letter of the candidate; before a repeated name, head 2
+    finds its last mention. Before a letter in an outcome, head 0 of layer `SPEAKING` finds the word
+    that says that the candidate agrees.
     """
     losses = {}
     row, start, end = targets.tracked.T
@@ -266,12 +276,15 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         if len(row):
             key = targets.visual[row, found[found >= 0]]
             losses[f"find {head}"] = -trace.log_attention(NAMING, head, row, query, key).mean()
-    for head, (name, pairs) in enumerate(
-        {"subject": targets.subjects, "letter": targets.letters}.items()
+    for name, layer, head, pairs in (
+        ("subject", RECALLING, 0, targets.subjects),
+        ("letter", RECALLING, 1, targets.letters),
+        ("repeat", RECALLING, 2, targets.repeats),
+        ("verdict", SPEAKING, 0, targets.verdicts),
     ):
         row, query, key = pairs.T
         if len(row):
-            losses[name] = -trace.log_attention(RECALLING, head, row, query, key).mean()
+            losses[name] = -trace.log_attention(layer, head, row, query, key).mean()
     return losses
 
 

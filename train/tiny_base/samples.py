@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from transformers import PreTrainedTokenizerBase, ProcessorMixin
+from transformers import ProcessorMixin
 
 from data.records import (
     LETTERS,
@@ -26,7 +26,7 @@ from models.student.collator import Collator
 from models.student.prompts import Sample, conversation, load_clip
 from teacher.predicates.motion import find_cut
 from train.tiny_base.heads import PICTURES, OracleTargets
-from train.tiny_base.mentions import Mention, find_mentions
+from train.tiny_base.mentions import Mention, TokenizedText
 from train.tiny_base.oracle_targets import (
     UNKNOWN,
     ObjectTarget,
@@ -100,12 +100,20 @@ class OracleCollator:
         media = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
         visual = torch.isin(ids, media).nonzero()[:, 1].reshape(len(samples), -1)
         grid = round((visual.shape[1] // samples[0].sample.pictures) ** 0.5)
+        texts = [TokenizedText(s.sample.response or "", self._processor.tokenizer) for s in samples]
+        # The token that ends the turn follows the response.
+        starts = [ids.shape[1] - len(text) - 1 for text in texts]
         mentions = [
             mention
             for row, s in enumerate(samples)
-            for mention in locate_mentions(s, row, grid, self._processor.tokenizer, ids.shape[1])
+            for mention in locate_mentions(s, texts[row], row, starts[row], grid)
         ]
-        return batch, stack_samples(samples, mentions, visual, grid)
+        verdicts = [
+            (row, start + letter - 1, start + agrees)
+            for row, (text, start) in enumerate(zip(texts, starts, strict=True))
+            for letter, agrees in text.verdicts()
+        ]
+        return batch, stack_samples(samples, mentions, verdicts, visual, grid)
 
 
 @dataclass(frozen=True)
@@ -113,7 +121,7 @@ class LocatedMention:
     """A mention of an object, with the oracle's targets. Positions are those of the batch.
 
     Attributes:
-        row, position: Row of the batch, and position of the name's last token.
+        row, first, position: Row of the batch, and positions of the name's first and last token.
         spoken: Positions from the name's last token to the next name.
         state: Place (from -0.5 to 0.5) and velocity of the object in the picture that the text
             speaks of; NaN where the oracle does not determine them.
@@ -125,6 +133,7 @@ class LocatedMention:
 
     name: str
     row: int
+    first: int
     position: int
     spoken: range
     state: tuple[float, ...]
@@ -135,26 +144,20 @@ class LocatedMention:
 
 
 def locate_mentions(
-    sample: OracleSample, row: int, grid: int, tokenizer: PreTrainedTokenizerBase, length: int
+    sample: OracleSample, text: TokenizedText, row: int, start: int, grid: int
 ) -> Iterator[LocatedMention]:
-    """Yield the mentions of objects in a sample's response.
-
-    Args:
-        length: Number of tokens of a row of the batch.
-    """
+    """Yield the mentions of objects in a sample's response, whose first token is at `start`."""
     shown = shown_objects(sample)
-    mentions, tokens = find_mentions(sample.sample.response or "", tokenizer)
-    # The token that ends the turn follows the response.
-    first = length - tokens - 1
-    for m in mentions:
+    for m in text.mentions():
         pictures = [shown.get((sample.last + k, m.name)) for k in range(PICTURES)]
         yield LocatedMention(
             m.name,
             row,
-            first + m.last,
-            range(first + m.last, first + m.stop),
+            start + m.first,
+            start + m.last,
+            range(start + m.last, start + m.stop),
             spoken_state(sample, shown, m),
-            None if m.letter_at is None else first + m.letter_at,
+            None if m.letter_at is None else start + m.letter_at,
             tuple(t.token(grid) if t else -1 for t in pictures),
             tuple(x for t in pictures for x in (t.place if t else UNKNOWN)),
             sample.future.get(m.name, UNKNOWN),
@@ -164,12 +167,14 @@ def locate_mentions(
 def stack_samples(
     samples: Sequence[OracleSample],
     mentions: Sequence[LocatedMention],
+    verdicts: list[tuple[int, int, int]],
     visual: Tensor,
     grid: int,
 ) -> OracleTargets:
     """Return the targets of a batch.
 
     Args:
+        verdicts: See `OracleTargets`.
         visual: (B, T) positions of the visual tokens, grid x grid for each picture.
     """
     objects = [
@@ -208,7 +213,19 @@ def stack_samples(
             ],
             3,
         ),
+        repeats=integers([*find_repeats(mentions)], 3),
+        verdicts=integers(verdicts, 3),
     )
+
+
+def find_repeats(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
+    """Yield the row, the position before a name that the text has mentioned before, and the
+    position of the first token of its last mention."""
+    mentioned: dict[tuple[int, str], int] = {}
+    for m in mentions:
+        if (m.row, m.name) in mentioned:
+            yield m.row, m.first - 1, mentioned[m.row, m.name]
+        mentioned[m.row, m.name] = m.first
 
 
 def track_objects(

@@ -45,14 +45,23 @@ class Trace:
         """Return the logarithms (K,) of the attention weights of a head between K pairs of
         positions in the rows `row` of the batch."""
         cosine, sine = self.rotary
+        # All pairs of positions from the first query on: gathering the keys of each pair of a text
+        # would copy them some hundred times.
+        start = int(query.min())
         queries, keys = apply_rotary_pos_emb(
-            self.queries[layer].transpose(1, 2), self.keys[layer].transpose(1, 2), cosine, sine
+            self.queries[layer][:, :, None, head].transpose(1, 2),
+            self.keys[layer][:, :, None, head].transpose(1, 2),
+            cosine,
+            sine,
         )
-        chosen = queries[row, head, query]
-        scores = (keys[row, head] @ chosen[:, :, None])[:, :, 0] / math.sqrt(chosen.shape[-1])
-        later = torch.arange(scores.shape[1], device=scores.device) > query[:, None]
-        scores = scores.float().masked_fill(later | (self.mask[row] == 0), -torch.inf)
-        return scores.log_softmax(dim=-1).gather(1, key[:, None])[:, 0]
+        queries, keys = queries[:, 0, start:], keys[:, 0]
+        scores = (queries @ keys.mT).float() / math.sqrt(keys.shape[-1])
+        position = torch.arange(keys.shape[1], device=keys.device)
+        hidden = (position > position[start:, None]) | (self.mask[:, None] == 0)
+        # A position of the padding sees nothing; its weights are not asked for.
+        hidden = hidden & (self.mask[:, start:, None] == 1)
+        logarithms = scores.masked_fill(hidden, -torch.inf).log_softmax(dim=-1)
+        return logarithms[row, query - start, key]
 
 
 @contextmanager
@@ -79,7 +88,7 @@ def trace_forward(language_model: nn.Module, mask: Tensor) -> Iterator[Trace]:
         layers[k].register_forward_hook(keeper(trace.outputs, k))
         for k in (MIDDLE, NAMING, SPEAKING)
     ]
-    for k in (TRACKING, NAMING, RECALLING):
+    for k in (TRACKING, NAMING, RECALLING, SPEAKING):
         attention = layers[k].self_attn
         hooks.append(attention.q_norm.register_forward_hook(keeper(trace.queries, k)))
         hooks.append(attention.k_norm.register_forward_hook(keeper(trace.keys, k)))

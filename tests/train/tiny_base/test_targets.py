@@ -14,7 +14,7 @@ from data.store import Store
 from teacher.predicates.motion import find_cut
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import PICTURES, OracleHeads, distance, octant, pointing_losses
-from train.tiny_base.mentions import find_mentions
+from train.tiny_base.mentions import TokenizedText
 from train.tiny_base.oracle_targets import (
     AHEAD,
     RATE,
@@ -188,8 +188,9 @@ def test_texts_speak_of_the_last_name_and_letter(processor) -> None:
         "Candidate analysis: Candidate B shows the red metal cube near the top."
     )
     ids = processor.tokenizer(text, add_special_tokens=False)["input_ids"]
-    mentions, tokens = find_mentions(text, processor.tokenizer)
-    assert tokens == len(ids)
+    tokenized = TokenizedText(text, processor.tokenizer)
+    mentions = [*tokenized.mentions()]
+    assert len(tokenized) == len(ids)
     decode = processor.tokenizer.decode
     assert [decode(ids[m.last : m.stop]).split()[1:] for m in mentions] == [
         ["will", "be", "left", "of", "the"],
@@ -202,6 +203,33 @@ def test_texts_speak_of_the_last_name_and_letter(processor) -> None:
         ("Candidate analysis", "B"),
     ]
     assert decode(ids[mentions[2].letter_at]).strip() == "B"
+    for m in mentions:
+        assert decode(ids[m.first : m.last + 1]).strip() == m.name
+
+
+def test_outcomes_refer_to_the_candidates_that_agree(processor) -> None:
+    text = (
+        "Candidate analysis: Candidate A shows the red metal cube near the top, and agrees. "
+        "Candidate B lacks the red metal cube. Candidate C shows the red metal cube near the left, "
+        "not near the top. Candidate D shows the red metal cube near the top, and agrees.\n"
+        "Outcome: Candidates A and D agree."
+    )
+    ids = processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+    decode = processor.tokenizer.decode
+    verdicts = [*TokenizedText(text, processor.tokenizer).verdicts()]
+    assert [decode(ids[at]).strip() for at, _ in verdicts] == ["A", "D"]
+    for (_, agrees), letter in zip(verdicts, "AD", strict=True):
+        before = decode(ids[: agrees + 1])
+        assert before[before.rindex("Candidate ") :].startswith(f"Candidate {letter} shows")
+
+
+def test_repeated_names_refer_to_their_last_mention(samples, collate, processor) -> None:
+    batch, targets = collate(samples)
+    assert len(targets.repeats) > 20
+    for row, before, last in targets.repeats.tolist():
+        ids = batch["input_ids"][row]
+        assert last < before
+        assert ids[before + 1 : before + 4].equal(ids[last : last + 3])
 
 
 def test_spoken_states_are_those_of_the_oracle(sampler, collate, processor) -> None:
@@ -209,10 +237,10 @@ def test_spoken_states_are_those_of_the_oracle(sampler, collate, processor) -> N
     explained = next(s for s in samples if "Outcome:" in s.sample.response)
     _, targets = collate([explained])
     assert len(targets.spoken_state) == len(targets.spoken) > 20
-    mentions, _ = find_mentions(explained.sample.response, processor.tokenizer)
+    text = TokenizedText(explained.sample.response, processor.tokenizer)
     shown = {(t.picture, t.name): t.place for t in explained.targets}
     compared = set()
-    for m in mentions:
+    for m in text.mentions():
         place = np.add(spoken_state(explained, shown_objects(explained), m)[:2], 0.5)
         if m.letter is not None:
             expected = shown.get((explained.last + 1 + LETTERS.index(m.letter), m.name))
@@ -251,7 +279,7 @@ def test_vision_tower_alone_gives_what_the_whole_model_embeds(samples, collate, 
     torch.testing.assert_close(alone, select_tokens(trace.embedded, targets.visual))
 
 
-@pytest.mark.parametrize("layer", [TRACKING, NAMING, RECALLING])
+@pytest.mark.parametrize("layer", [TRACKING, NAMING, RECALLING, SPEAKING])
 def test_traced_attention_is_that_of_the_model(samples, collate, deep_model, layer: int) -> None:
     batch, targets = collate(samples)
     inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
@@ -286,7 +314,8 @@ def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, hea
     for _ in range(8):
         losses = words_losses(deep_model, heads, batch, targets)
         assert {"words", "track", "find 0", "named places", "color", "since"} <= losses.keys()
-        assert {"subject", "letter", "spoken place", "spelled color"} <= losses.keys()
+        assert {"subject", "letter", "repeat", "verdict"} <= losses.keys()
+        assert {"spoken place", "spelled color"} <= losses.keys()
         total = sum(losses.values())
         optimizer.zero_grad()
         total.backward()
@@ -302,7 +331,9 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate
 
     _, targets = collate(samples)
     losses = pointing_losses(Certain(), targets)
-    assert len(losses) == 8
+    assert losses.keys() == {
+        "track", *(f"find {k}" for k in range(PICTURES)), "subject", "letter", "repeat", "verdict"
+    }  # fmt: skip
     assert not any(loss.item() for loss in losses.values())
 
 
