@@ -149,7 +149,7 @@ class BaseTrainConfig(Settings):
     adam_beta2: float = setting(0.98, least=0, below=1)
     """Decay rate of AdamW's second moment."""
     max_grad_norm: float = setting(1.0, above=0)
-    """Maximum norm of the gradient, to which it is clipped."""
+    """Maximum norm of the gradient of the model's weights, to which it is clipped."""
     precision: str = setting("auto", ("auto", "bf16", "fp32"))
     """Precision of the forward and backward pass, as in `train.sft`."""
     evaluations: int = setting(20, least=1)

@@ -163,8 +163,8 @@ def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
     return Question(EXPLAIN, "\n".join(lines))
 
 
-Kind = Callable[[RelationalPredicates, SelectionItem, np.random.Generator], Question]
-KINDS: dict[str, Kind] = {
+MakeQuestion = Callable[[RelationalPredicates, SelectionItem, np.random.Generator], Question]
+KINDS: dict[str, MakeQuestion] = {
     "parse": parse, "predict": predict, "describe": describe, "compare": compare,
     "explain": explain,
 }  # fmt: skip
