@@ -18,11 +18,11 @@ picture. The heads are linear, so the base itself has to represent what they pre
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
 at the tower's output and motion in the middle layers. Further losses teach attention heads where
-to look: at a visual token of a candidate, the same object at the end of the clip (layer
-`TRACKING`); at an object's name in a text, the object in each picture (layer `NAMING`); after a
-name, this name and the letter of the candidate that the text speaks of, and before a name that is
-repeated, its last mention (layer `RECALLING`); before a letter in an outcome, the word that says
-that this candidate agrees (layer `SPEAKING`).
+to look: at a token of a text, the two tokens before it (layer `PRECEDING`); at a visual token of a
+candidate, the same object at the end of the clip (layer `TRACKING`); at an object's name in a text,
+the object in each picture (layer `NAMING`); after a name, this name and the letter of the candidate
+that the text speaks of, and before a name that is repeated, its last mention (layer `RECALLING`);
+before a letter in an outcome, the word that says that this candidate agrees (layer `SPEAKING`).
 """
 
 from __future__ import annotations
@@ -37,7 +37,14 @@ from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy,
 
 from data.records import LETTERS
 from train.tiny_base.oracle_targets import AHEAD
-from train.tiny_base.trace import NAMING, RECALLING, SPEAKING, TRACKING, Trace
+from train.tiny_base.trace import (
+    NAMING,
+    PRECEDING,
+    RECALLING,
+    SPEAKING,
+    TRACKING,
+    Trace,
+)
 
 PICTURES = 1 + len(LETTERS)
 """Pictures in which a named object is found: the last one of the clip, and the candidates."""
@@ -74,6 +81,7 @@ class OracleTargets:
         letters: (_, 3) row, position that speaks of a candidate, and position of its letter.
         repeats: (_, 3) row, position before a name that the text has mentioned before, and position
             of the first token of its last mention.
+        preceding: (_, 2) row and position of the tokens of texts.
         verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
             of the word that says that the candidate agrees.
     """
@@ -94,6 +102,7 @@ class OracleTargets:
     subjects: Tensor
     letters: Tensor
     repeats: Tensor
+    preceding: Tensor
     verdicts: Tensor
 
 
@@ -259,8 +268,10 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     """Return the losses of the attention heads that find objects: the negative logarithm of the
     attention weight on the object's token.
 
-    At a visual token, head 0 of layer `TRACKING` finds the object at the end of the clip. At a
-    name, head k of layer `NAMING` finds the object in picture k. After a name, heads 0 and 1 of
+    At a token of a text, heads 0 and 1 of layer `PRECEDING` find the token before it and the one
+    before that, without which later layers cannot find what followed an earlier use of the same
+    words. At a visual token, head 0 of layer `TRACKING` finds the object at the end of the clip. At
+    a name, head k of layer `NAMING` finds the object in picture k. After a name, heads 0 and 1 of
     layer `RECALLING` find this name and the letter of the candidate; before a repeated name, head 2
     finds its last mention. Before a letter in an outcome, head 0 of layer `SPEAKING` finds the word
     that says that the candidate agrees.
@@ -276,7 +287,11 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         if len(row):
             key = targets.visual[row, found[found >= 0]]
             losses[f"find {head}"] = -trace.log_attention(NAMING, head, row, query, key).mean()
+    row, position = targets.preceding.T
+    before, second_before = (torch.stack([row, position, position - k], dim=1) for k in (1, 2))
     for name, layer, head, pairs in (
+        ("before", PRECEDING, 0, before),
+        ("second before", PRECEDING, 1, second_before),
         ("subject", RECALLING, 0, targets.subjects),
         ("letter", RECALLING, 1, targets.letters),
         ("repeat", RECALLING, 2, targets.repeats),

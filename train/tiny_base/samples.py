@@ -113,7 +113,12 @@ class OracleCollator:
             for row, (text, start) in enumerate(zip(texts, starts, strict=True))
             for letter, agrees in text.verdicts()
         ]
-        return batch, stack_samples(samples, mentions, verdicts, visual, grid)
+        preceding = [
+            (row, start + k)
+            for row, (text, start) in enumerate(zip(texts, starts, strict=True))
+            for k in range(len(text))
+        ]
+        return batch, stack_samples(samples, mentions, verdicts, preceding, visual, grid)
 
 
 @dataclass(frozen=True)
@@ -168,13 +173,14 @@ def stack_samples(
     samples: Sequence[OracleSample],
     mentions: Sequence[LocatedMention],
     verdicts: list[tuple[int, int, int]],
+    preceding: list[tuple[int, int]],
     visual: Tensor,
     grid: int,
 ) -> OracleTargets:
     """Return the targets of a batch.
 
     Args:
-        verdicts: See `OracleTargets`.
+        verdicts, preceding: See `OracleTargets`.
         visual: (B, T) positions of the visual tokens, grid x grid for each picture.
     """
     objects = [
@@ -214,6 +220,7 @@ def stack_samples(
             3,
         ),
         repeats=integers([*find_repeats(mentions)], 3),
+        preceding=integers(preceding, 2),
         verdicts=integers(verdicts, 3),
     )
 

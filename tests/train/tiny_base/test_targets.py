@@ -35,6 +35,7 @@ from train.tiny_base.samples import (
 )
 from train.tiny_base.trace import (
     NAMING,
+    PRECEDING,
     RECALLING,
     SPEAKING,
     TRACKING,
@@ -279,7 +280,7 @@ def test_vision_tower_alone_gives_what_the_whole_model_embeds(samples, collate, 
     torch.testing.assert_close(alone, select_tokens(trace.embedded, targets.visual))
 
 
-@pytest.mark.parametrize("layer", [TRACKING, NAMING, RECALLING, SPEAKING])
+@pytest.mark.parametrize("layer", [PRECEDING, TRACKING, NAMING, RECALLING, SPEAKING])
 def test_traced_attention_is_that_of_the_model(samples, collate, deep_model, layer: int) -> None:
     batch, targets = collate(samples)
     inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
@@ -332,7 +333,8 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate
     _, targets = collate(samples)
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
-        "track", *(f"find {k}" for k in range(PICTURES)), "subject", "letter", "repeat", "verdict"
+        "before", "second before", "track", *(f"find {k}" for k in range(PICTURES)), "subject",
+        "letter", "repeat", "verdict",
     }  # fmt: skip
     assert not any(loss.item() for loss in losses.values())
 
