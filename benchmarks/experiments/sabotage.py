@@ -1,12 +1,11 @@
-"""Shows that the accuracy of a short training reveals a broken pipeline: trains a student on
+"""Measures whether the accuracy of a short training reveals a broken pipeline: trains a student on
 `benchmark=short`, once as it is and once with each of several mistakes.
 
     python -m benchmarks.experiments.sabotage                  # all, a minute each
     python -m benchmarks.experiments.sabotage intact           # only the unchanged pipeline
 
 Each row has the accuracy on held-out items, and how many standard errors it is above chance. A
-mistake that a command refuses is listed as refused. The end-to-end test of `make test` demands five
-standard errors of the intact pipeline.
+mistake that a command refuses is listed as refused.
 """
 
 from __future__ import annotations

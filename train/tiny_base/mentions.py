@@ -18,8 +18,8 @@ EVENTS = re.compile(
     rf"(?P<name>{NAME.pattern})|[Cc]andidate (?P<letter>[{''.join(LETTERS)}])\b"
     rf"|(?P<section>{'|'.join(SECTIONS)}):|(?P<end>\.(?=\s|$))"
 )
-
-
+"""Matches where a text begins to speak of an object, a candidate or a section, and where a sentence
+ends."""
 AGREES = re.compile(r"[Cc]andidate (?P<letter>\w) [^.]*, and (?P<word>agrees)(?=\.)")
 """Matches the sentence of a candidate that agrees with a prediction."""
 OUTCOME = re.compile(r"Candidates? (?P<letters>\w(?:, \w)*(?: and \w)?) agrees?\.")
