@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import replace
 from importlib.resources import files
 
 import yaml
 
 from teacher.deciding import Decision
-from teacher.predicates.facts import CandidateFacts, Relation, RelationalPredicates, View
+from teacher.predicates.facts import (
+    OUT_OF_VIEW,
+    CandidateFacts,
+    Relation,
+    RelationalPredicates,
+    View,
+)
 from teacher.predicates.relations import (
     CHANGES,
     SYMMETRIC,
@@ -20,11 +28,32 @@ from teacher.writers.paper import Detail, Writer
 PHRASES = yaml.safe_load((files("teacher") / "templates" / "relations.yaml").read_text())
 
 
+def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> RelationalPredicates:
+    """Leave out what is said of objects that are out of view at the cut, unless all are: a model
+    that sees the frames could only guess their names.
+
+    Args:
+        named: Objects that are kept.
+    """
+    kept = {o.object for o in p.objects if o.sight != OUT_OF_VIEW or o.object in named}
+    if not kept:
+        return p
+    return replace(
+        p,
+        objects=tuple(o for o in p.objects if o.object in kept),
+        # Without any, the writer would deny that there are collision courses.
+        courses=tuple(m for m in p.courses if kept.issuperset(m.objects)) or p.courses,
+        contacts=tuple(m for m in p.contacts if kept.issuperset(m.objects)),
+        close=tuple(c for c in p.close if kept.issuperset(c.objects)),
+    )
+
+
 class RelationalWriter(Writer):
     """Writes the sections of a rationale from relational predicates.
 
     The prediction begins with the statements that decide the item (see `teacher.deciding`), and the
-    candidate analysis holds each candidate against just these.
+    candidate analysis holds each candidate against just these. Other objects that are out of view
+    at the cut are left out.
     """
 
     facts: RelationalPredicates
@@ -37,10 +66,10 @@ class RelationalWriter(Writer):
         *keys: int | str,
         padded: bool = False,
     ) -> None:
-        super().__init__(facts, detail, *keys, padded=padded)
+        named = {name for s in decision.statements for name in s.objects}
+        super().__init__(leave_out_unseen(facts, named), detail, *keys, padded=padded)
         self.rank = {o.object: k for k, o in enumerate(self.ranked)}
         self.statements = [self.orient(s) for s in decision.statements]
-        named = {name for s in self.statements for name in s.objects}
         # The objects of the deciding statements come first in every section.
         self.ranked = sorted(self.ranked, key=lambda o: o.object not in named)
         self.view_of = {view.letter: view for view in facts.views}

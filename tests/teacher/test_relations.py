@@ -236,6 +236,22 @@ def test_wrong_candidates_are_excluded_by_a_deciding_statement() -> None:
             assert all(c.verdict != "contradicted" for c in about)
 
 
+def test_objects_out_of_view_at_the_cut_are_named_only_if_they_decide() -> None:
+    unseen = 0
+    for item, predicates in random_cases(250, BOUNDS):
+        decision = choose_statements(predicates, item.item_id)
+        deciding = {name for s in decision.statements for name in s.objects}
+        names = {o.object for o in predicates.objects if o.sight == "out of view"} - deciding
+        # A course with an unseen object is stated if it is the only one, rather than denied.
+        names -= {name for course in predicates.courses for name in course.objects}
+        if len(names) == len(predicates.objects):
+            continue
+        unseen += len(names)
+        text = write_rationale(predicates, item, 0).split("Candidate analysis:")[0]
+        assert not [name for name in names if name in text]
+    assert unseen
+
+
 def test_match_lines_rest_on_the_statements_of_the_rationale() -> None:
     item, predicates = next(
         (i, p) for i, p in random_cases(60, BOUNDS) if not choose_statements(p, i.item_id).rivals

@@ -4,6 +4,8 @@ generated_name/parse       share of the names in answers to `parse` that an obje
                            has
 generated_color/parse      share of the names whose colour is that of the object with which the
                            name shares most words; likewise for material and shape
+generated_named/parse      share of the objects named in the true answers to `parse` that the
+                           generated ones name too
 generated_region/predict   share of the claims about regions in answers to `predict` that the
                            oracle supports, of those that it can decide; likewise for other
                            kinds of claims
@@ -56,7 +58,11 @@ def measure_generated_answers(
                 for item, question in asked
             ]
             texts = generate(model, processor, collate(samples), limit, precision)
-            for (item, _), text in zip(asked, texts, strict=True):
+            for (item, question), text in zip(asked, texts, strict=True):
+                names = set(NAME.findall(text.text))
+                found[f"generated_named/{kind}"] += [
+                    name in names for name in set(NAME.findall(question.answer))
+                ]
                 for name, right in _read(section + text.text, item, kind, sampler):
                     found[f"generated_{name}/{kind}"].append(right)
     return {name: sum(values) / len(values) for name, values in found.items()}

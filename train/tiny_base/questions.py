@@ -23,7 +23,7 @@ import numpy as np
 
 from data.records import SelectionItem
 from teacher.deciding import Decision
-from teacher.predicates.facts import OUT_OF_VIEW, Relation, RelationalPredicates, View
+from teacher.predicates.facts import Relation, RelationalPredicates, View
 from teacher.predicates.relations import (
     CHANGES,
     SYMMETRIC,
@@ -32,7 +32,7 @@ from teacher.predicates.relations import (
     normalize_relation,
 )
 from teacher.writers.paper import Detail, join_sentences
-from teacher.writers.relational import RelationalWriter
+from teacher.writers.relational import RelationalWriter, leave_out_unseen
 
 PARSE = "Describe the scene, and how its objects move."
 PREDICT = "Say what will be true of the scene."
@@ -168,22 +168,6 @@ KINDS: dict[str, MakeQuestion] = {
     "parse": parse, "predict": predict, "describe": describe, "compare": compare,
     "explain": explain,
 }  # fmt: skip
-
-
-def leave_out_unseen(p: RelationalPredicates) -> RelationalPredicates:
-    """Leave out what is said of objects that are out of view at the cut, unless all are: a model
-    could only guess their names."""
-    seen = {o.object for o in p.objects if o.sight != OUT_OF_VIEW}
-    if not seen:
-        return p
-    return replace(
-        p,
-        objects=tuple(o for o in p.objects if o.object in seen),
-        # Without any, the writer would deny that there are collision courses.
-        courses=tuple(m for m in p.courses if seen.issuperset(m.objects)) or p.courses,
-        contacts=tuple(m for m in p.contacts if seen.issuperset(m.objects)),
-        close=tuple(c for c in p.close if seen.issuperset(c.objects)),
-    )
 
 
 def make_writer(

@@ -61,3 +61,9 @@ def test_false_words_are_noticed(measure) -> None:
     assert metal["generated_name/parse"] < 0.8
     regions = measure(lambda text: text.replace("near the ", "not near the "))
     assert regions["generated_region/predict"] == 0
+
+
+def test_objects_that_an_answer_lacks_are_noticed(measure) -> None:
+    repeated = measure(lambda text: text.split(".")[0] + ".")
+    assert repeated["generated_named/parse"] < 0.8
+    assert repeated["generated_name/parse"] == 1
