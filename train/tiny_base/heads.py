@@ -67,13 +67,15 @@ class OracleTargets:
         visual: (B, T) positions of the visual tokens in the sequence.
         presence: (B, T) 1 where the centre of an object is in the token, otherwise 0.
         objects: (N, 2) row of the batch and token.
-        truth: Properties of the N objects, see `oracle_targets.stack_targets`.
+        truth: Properties of the N objects, see `oracle_targets.stack_targets`; places are relative
+            to the centre of the picture.
         inside: (N, 2) place in the token, from -0.5 to 0.5, or beyond at the border of the picture.
         tracked: (K, 3) row, token of a candidate, and token of the same object in the clip.
         names: (M, 2) row and position of a name's last token.
         named: (M,) the named object's colour, material and shape, by kind.
         found: (M, PICTURES) token of the named object in each picture, or -1.
-        places: (M, 2 * PICTURES) its places, NaN where it is not visible.
+        places: (M, 2 * PICTURES) its places relative to the centre of each picture, NaN where it is
+            not visible.
         future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
         spoken: (S, 2) row and position of the tokens from each name to the next.
         spoken_state: (S, 4) place and velocity of the object there, or NaN.
@@ -146,8 +148,7 @@ class OracleHeads(nn.Module):
         losses = {"presence": 2 * binary_cross_entropy_with_logits(presence, targets.presence)}
         for kind, logits in self.word_logits(seen).items():
             losses[kind] = cross_entropy(logits, targets.truth[kind])
-        place = targets.truth["place"] - 0.5
-        truth = targets.truth | {"inside": targets.inside, "place": place}
+        truth = targets.truth | {"inside": targets.inside}
         for name in ("inside", "shift", "place"):
             losses[f"seen {name}"] = distance(self.seen[name](seen), truth[name], SCALES[name])
         return losses
@@ -160,7 +161,7 @@ class OracleHeads(nn.Module):
     def known_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the losses at all visual tokens after the layer `MIDDLE`, (B, T, H)."""
         known = self.norms["known"](hidden[targets.objects[:, 0], targets.objects[:, 1]])
-        truth = targets.truth | {"place": targets.truth["place"] - 0.5}
+        truth = targets.truth
         losses = {
             name: distance(self.known[name](known), truth[name], SCALES[name])
             for name in ("place", *DISPLACEMENTS)
@@ -205,7 +206,7 @@ class OracleHeads(nn.Module):
         observed = ~truth["velocity"][:, 0].isnan()
         found["moving"] = ((self.known["moving"](known)[:, 0] > 0) == moves)[observed]
         found["heading"] = (octant(read["velocity"]) == octant(truth["velocity"]))[moves]
-        found["place_error"] = (read["place"] - (truth["place"] - 0.5)).norm(dim=1)
+        found["place_error"] = (read["place"] - truth["place"]).norm(dim=1)
         for name in (*AHEADS, "since"):
             distances = truth[name].norm(dim=1)
             # An image has no velocity; an object may have moved since the clip.

@@ -191,6 +191,7 @@ def stack_samples(
     presence[at[:, 0], at[:, 1]] = 1
     truth = stack_targets([t for _, t in objects])
     scaled = truth["place"] * grid
+    truth["place"] = truth["place"] - 0.5
 
     def integers(rows: list[tuple[int, ...]], columns: int) -> Tensor:
         return torch.tensor(rows, dtype=torch.long).reshape(-1, columns)

@@ -7,13 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import one_hot
 
 from data.records import LETTERS, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from teacher.predicates.motion import find_cut
 from train.tiny_base.data import ItemSampler
-from train.tiny_base.heads import PICTURES, OracleHeads, distance, octant, pointing_losses
+from train.tiny_base.heads import (
+    PICTURES,
+    SCALES,
+    OracleHeads,
+    distance,
+    octant,
+    pointing_losses,
+)
 from train.tiny_base.mentions import TokenizedText
 from train.tiny_base.oracle_targets import (
     AHEAD,
@@ -155,7 +163,8 @@ def test_places_in_tokens_and_in_pictures_agree(samples, collate) -> None:
     _, targets = collate([outside, *samples[1:]])
     cell = targets.objects[:, 1] % GRID**2
     corner = torch.stack([cell % GRID, cell // GRID], dim=1)
-    assert ((corner + targets.inside + 0.5) / GRID).allclose(targets.truth["place"])
+    places = targets.truth["place"] + 0.5
+    assert ((corner + targets.inside + 0.5) / GRID).allclose(places)
     assert targets.inside.abs().max() > 0.5
 
 
@@ -306,6 +315,49 @@ def test_losses_train_the_layers_that_they_refer_to(samples, collate, deep_model
     losses["color"].backward()
     assert layers[0].mlp.down_proj.weight.grad is None
     assert deep_model.model.visual.blocks[0].attn.qkv.weight.grad is not None
+
+
+def test_measures_of_what_is_right_and_of_staying_put(samples, collate, deep_model) -> None:
+    # The small tokenizer splits words, and some have the same first token.
+    tokens = {"color": [*range(20, 28)], "material": [28, 29], "shape": [30, 31, 32]}
+    heads = OracleHeads(deep_model.get_input_embeddings(), tokens)
+    _, targets = collate(samples)
+    truth, (row, token) = targets.truth, targets.objects.T
+    hidden = heads.known["place"].in_features
+    heads.norms["seen"] = heads.norms["known"] = torch.nn.Identity()
+    moves = truth["velocity"].norm(dim=1) > 0.012
+
+    # Each head of the middle layers reads two numbers of its own.
+    known = torch.zeros(*targets.visual.shape, hidden)
+    for k, (name, head) in enumerate(heads.known.items()):
+        torch.nn.init.zeros_(head.weight)
+        torch.nn.init.zeros_(head.bias)
+        width = head.out_features
+        head.weight.data[:, 2 * k : 2 * k + width] = torch.eye(width)
+        values = moves[:, None].float() - 0.5 if name == "moving" else truth[name] * SCALES[name]
+        known[row, token, 2 * k : 2 * k + width] = values.nan_to_num()
+    # Tokens whose products with the embeddings of the right words are 1, and with others 0.
+    right = torch.cat([one_hot(truth[kind], len(ids)) for kind, ids in tokens.items()], dim=1)
+    words = deep_model.get_input_embeddings().weight[20:33]
+    seen = torch.zeros_like(known)
+    seen[row, token] = right.float() @ torch.linalg.pinv(words.detach()).T
+
+    measures = heads.measures(seen, known, targets)
+    for name in ("color", "material", "shape", "moving", "heading"):
+        assert len(measures[name])
+        assert measures[name].float().mean() == 1
+    errors = [name for name in measures if name.endswith("_error")]
+    assert len(errors) == 2 + len(AHEAD)
+    for name in errors:
+        assert measures[name].max() < 1e-5
+
+    still = heads.measures(-seen, torch.zeros_like(known), targets)
+    assert still["color"].float().mean() < 1
+    observed = ~truth["velocity"][:, 0].isnan()
+    assert still["moving"].tolist() == (~moves[observed]).tolist()
+    for name in errors[1:]:
+        unmoved = still[name.replace("_error", "_still")]
+        torch.testing.assert_close(still[name], unmoved)
 
 
 def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, heads) -> None:
