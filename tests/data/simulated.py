@@ -9,7 +9,7 @@ from data.world.sampling import format_scene_id, record_scene, sample_scene
 
 CLEVRER = WorldConfig()
 WORLDS = [
-    "clevrer", "dusk", "falling", "masses", "movi_a", "near", "physion", "ramp", "screen",
+    "above", "clevrer", "dusk", "falling", "masses", "movi_a", "near", "physion", "ramp", "screen",
     "settling",
 ]  # fmt: skip
 """Names of the presets in conf/world."""
