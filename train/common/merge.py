@@ -48,13 +48,13 @@ def root_mean_square(tensors: Sequence[torch.Tensor]) -> float:
     return (total / sum(t.numel() for t in tensors)) ** 0.5
 
 
-def open_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
+def require_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
     """Open the benchmark on which a merged model is compared with the trained model.
 
     Raises:
         UserError: The benchmark is missing. An export does not build it.
     """
-    if not (folder := root / cfg.name).exists():
+    if not (folder := root / cfg.store_name).exists():
         raise UserError(
             f"{folder} is missing, and the export compares the merged with the trained model on "
             "its held-out scenes: build it with python -m data.build, or set verify=false",

@@ -19,7 +19,7 @@ from models.retriever.embedder import (
     load_retriever,
     load_trained,
 )
-from train.common.merge import ModelOutputs, open_benchmark
+from train.common.merge import ModelOutputs, require_benchmark
 from train.retriever.batches import split_queries
 
 MAX_QUERIES = 64
@@ -51,7 +51,7 @@ class RetrieverMerge:
     def held_out(self, root: Path, workers: int) -> HeldOut:
         """Return some validation queries of the run, and a reader of the benchmark's frames."""
         settings, train = self.settings, self.settings.train
-        store = open_benchmark(settings.benchmark, root, workers)
+        store = require_benchmark(settings.benchmark, root, workers)
         _, queries = split_queries(
             store, train.batch, train.hard_negatives, train.validation_queries, settings.seed
         )

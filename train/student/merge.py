@@ -13,7 +13,7 @@ from conf.schema import SftCommand
 from models import compat, loading
 from models.student.collator import Collator, letter_ids
 from teacher.narrate import JOURNAL_FILE, ensure_rationales
-from train.common.merge import ModelOutputs, open_benchmark
+from train.common.merge import ModelOutputs, require_benchmark
 from train.student.dataset import load_datasets
 from train.student.lazy_samples import StudentDataset
 from train.student.metrics import LetterAccuracy
@@ -44,7 +44,7 @@ class StudentMerge:
     def held_out(self, root: Path, workers: int) -> Items:
         """Return the run's validation samples, from a benchmark and rationales that must exist."""
         settings = self.settings
-        store = open_benchmark(settings.benchmark, root, workers)
+        store = require_benchmark(settings.benchmark, root, workers)
         if settings.train.regime == "answer_only":
             return load_datasets(settings, store, [])[1]
         if not (journal := store.folder / JOURNAL_FILE).exists():

@@ -28,6 +28,7 @@ from tests.children import run_child
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import export
+from train.common.merge import require_benchmark
 
 METRICS = {"recall@10_at_start": 0.25, "recall@10": 0.5}
 
@@ -145,6 +146,9 @@ def test_a_missing_benchmark_is_not_built(settings, runs, tmp_path) -> None:
         exported(elsewhere, runs, "fp32", tmp_path / "into")
     assert list((tmp_path / "into").iterdir()) == []
     assert not (tmp_path / "store").exists()
+    other_world = replace(settings.benchmark, world=replace(settings.benchmark.world, name="near"))
+    with raises_user_error("missing-benchmark", "micro-near"):
+        require_benchmark(other_world, tmp_path, 1)
     measured, folder = exported(elsewhere, runs, "fp32", tmp_path / "into", verify=False)
     assert measured == {}
     assert (folder / "model.safetensors").exists()
