@@ -123,6 +123,7 @@ def resolve_model(
     """Return the folder that `cfg.model` names and the settings of its run.
 
     If `cfg.model` is None, return None and `cfg` itself, which has the settings of a preset.
+    Neither the run nor its base may have been trained on test scenes of the benchmark.
 
     Args:
         benchmark: The benchmark on which the model is evaluated.
@@ -134,12 +135,24 @@ def resolve_model(
             of the model or its training, which the run has fixed.
     """
     if cfg.model is None:
+        _check_base_unseen(getattr(cfg, product).model, benchmark)
         return None, cfg
     folder = Path(cfg.model)
     settings = trained_settings(folder, schema, product, key)
     check_unseen(f"{key}={folder}", settings.benchmark, benchmark)
+    _check_base_unseen(getattr(settings, product).model, benchmark)
     _apply_overrides(settings, cfg, product, overrides, key)
     return folder, settings
+
+
+def _check_base_unseen(base: str | None, tested: BenchmarkConfig) -> None:
+    """As `check_unseen`, for a base whose folder records the settings of its training."""
+    if base is None or not (config := Path(base) / "config.yaml").exists():
+        return
+    saved = OmegaConf.load(config)
+    schema = OmegaConf.structured(BenchmarkConfig)
+    trained = OmegaConf.to_object(OmegaConf.merge(schema, saved.benchmark))
+    check_unseen(f"the base {base}", trained, tested)
 
 
 def _apply_overrides(

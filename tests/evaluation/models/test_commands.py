@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from omegaconf import OmegaConf
 
 from conf.schema import (
     ContrastiveCommand,
@@ -129,6 +130,15 @@ def test_a_model_is_not_tested_on_its_training_scenes(trained_student, micro) ->
     # With another seed, the same release is split differently.
     with raises_user_error("training-scenes-tested", contains="seed=1"):
         check_unseen("model", release, replace(release, seed=1))
+
+
+def test_a_base_is_not_tested_on_its_training_scenes(micro, tmp_path) -> None:
+    trained = OmegaConf.structured(replace(micro, test_share=0.01))
+    OmegaConf.save({"benchmark": trained}, tmp_path / "config.yaml")
+    cfg = SelectCommand(student=StudentConfig(name="x", model=str(tmp_path)))
+    resolve_model(cfg, replace(micro, seed=1), SftCommand, "student")
+    with raises_user_error("training-scenes-tested", contains=str(tmp_path)):
+        resolve_model(cfg, micro, SftCommand, "student")
 
 
 def test_settings_that_a_trained_model_cannot_use_are_refused(
