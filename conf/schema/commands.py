@@ -15,9 +15,9 @@ from conf.schema.settings import Settings, check_run, setting
 from conf.schema.training import BaseTrainConfig, ContrastiveTrainConfig, SftTrainConfig
 
 PARALLEL_BACKENDS = ("loky", "ray")
-BASE_LAYERS, BASE_HEADS = 5, 5
+BASE_LAYERS, BASE_HEADS = 6, 5
 """Minimum numbers of language layers and of attention heads of a base that `train.base` trains: its
-targets refer to the first four layers, and to one head for the clip and one for each candidate."""
+targets refer to the first six layers, and to one head for the clip and one for each candidate."""
 
 
 @dataclass
@@ -148,11 +148,10 @@ class BaseCommand(CommandConfig):
                 f"student.model={self.student.model}: a base is trained from random weights; "
                 "choose student=tiny_scratch or set student.architecture"
             )
-        elif sizes.layers < BASE_LAYERS or min(sizes.heads, sizes.kv_heads) < BASE_HEADS:
+        elif sizes.layers < BASE_LAYERS or sizes.heads < BASE_HEADS:
             yield (
-                f"student.architecture.layers={sizes.layers}, heads={sizes.heads} and kv_heads="
-                f"{sizes.kv_heads}: the training of a base needs {BASE_LAYERS} layers with "
-                f"{BASE_HEADS} heads or more"
+                f"student.architecture.layers={sizes.layers} and heads={sizes.heads}: the training "
+                f"of a base needs {BASE_LAYERS} layers with {BASE_HEADS} heads or more"
             )
 
 

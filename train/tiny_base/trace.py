@@ -48,9 +48,11 @@ class Trace:
         # All pairs of positions from the first query on: gathering the keys of each pair of a text
         # would copy them some hundred times.
         start = int(query.min())
+        heads, key_heads = self.queries[layer].shape[2], self.keys[layer].shape[2]
+        key_head = head * key_heads // heads
         queries, keys = apply_rotary_pos_emb(
             self.queries[layer][:, :, None, head].transpose(1, 2),
-            self.keys[layer][:, :, None, head].transpose(1, 2),
+            self.keys[layer][:, :, None, key_head].transpose(1, 2),
             cosine,
             sine,
         )

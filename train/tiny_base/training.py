@@ -10,6 +10,7 @@ on the seed and the step, so that a resumed run continues as if it had never sto
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import math
@@ -111,6 +112,8 @@ class BaseTrainer:
 
     Args:
         folder: The run's folder, for the checkpoint, the journal and the curves.
+        texts: A digest of the tokenizer. The tokenizer is trained at every start, on texts that
+            only another version of the recipe changes.
     """
 
     def __init__(
@@ -122,9 +125,11 @@ class BaseTrainer:
         sampler: ItemSampler,
         probe: Probe,
         folder: Path,
+        texts: str,
     ) -> None:
         self.cfg, self.model, self.heads = cfg, model, heads
         self.collate, self.sampler, self.probe, self.folder = collate, sampler, probe, folder
+        self.texts = texts
         self.stage, self.step = 0, 0
 
     def run(self) -> None:
@@ -197,6 +202,7 @@ class BaseTrainer:
         state = {
             "stage": self.stage,
             "step": self.step,
+            "texts": self.texts,
             "model": self.model.state_dict(),
             "heads": self.heads.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -214,6 +220,12 @@ class BaseTrainer:
             journal.unlink(missing_ok=True)
             return
         state = torch.load(path, weights_only=True)
+        if state["texts"] != self.texts:
+            raise UserError(
+                f"{path} is of another version of the recipe, whose texts give another tokenizer: "
+                "delete the run, or give run=NAME",
+                code="other-recipe",
+            )
         self.stage, self.step = state["stage"], state["step"]
         self.model.load_state_dict(state["model"])
         self.heads.load_state_dict(state["heads"])
@@ -251,7 +263,9 @@ def build_trainer(
     samples = [sampler.sample(item, None, "held out") for item in held_out]
     worded = {kind: [sampler.sample(i, kind, "held out") for i in held_out[::2]] for kind in KINDS}
     probe = Probe(model, heads, collate, samples, worded, words, cfg.train.precision == "bf16")
-    return BaseTrainer(cfg.train, model, heads, collate, sampler, probe, run.folder)
+    tokenizer = processor.tokenizer.backend_tokenizer.to_str()
+    texts = hashlib.sha256(tokenizer.encode()).hexdigest()[:16]
+    return BaseTrainer(cfg.train, model, heads, collate, sampler, probe, run.folder, texts)
 
 
 def first_tokens(processor: ProcessorMixin) -> dict[str, list[int]]:

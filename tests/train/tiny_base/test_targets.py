@@ -81,14 +81,14 @@ def collate(processor) -> OracleCollator:
     return OracleCollator(processor, 1500)
 
 
-@pytest.fixture
-def deep_model(model):
-    """A model with enough layers for all targets."""
+@pytest.fixture(params=[PICTURES, 1], ids=["", "grouped"])
+def deep_model(model, request: pytest.FixtureRequest):
+    """A model with enough layers for all targets, without and with grouped-query attention."""
     from models.tiny_qwen3_vl import build_model
     from tests.tiny_models import SMALL
 
     model = build_model(
-        replace(SMALL, layers=SPEAKING + 1, heads=PICTURES, kv_heads=PICTURES),
+        replace(SMALL, layers=SPEAKING + 1, heads=PICTURES, kv_heads=request.param),
         model.config.text_config.vocab_size,
     )
     return model.eval()

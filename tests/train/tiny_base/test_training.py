@@ -19,6 +19,7 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from models import loading
 from tests.tiny_models import SMALL
+from tests.user_errors import raises_user_error
 from train.base import main
 from train.common.held_out import held_out_scenes
 from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
@@ -88,6 +89,16 @@ def test_killed_run_resumes_as_if_it_had_never_stopped(
     assert {r["stage"] for r in records} == {"eyes", "motion", "words"}
 
 
+def test_checkpoints_of_another_tokenizer_are_refused(cfg, micro_store: Store, tmp_path) -> None:
+    trainer = start(cfg, micro_store, tmp_path)
+    trainer.optimizer = trainer._new_optimizer()
+    (tmp_path / "metrics.jsonl").touch()
+    trainer._save()
+    other = replace(cfg.student, architecture=replace(SIZES, vocabulary=400))
+    with raises_user_error("other-recipe", contains=str(tmp_path)):
+        start(replace(cfg, student=other), micro_store, tmp_path).run()
+
+
 def test_eyes_train_the_vision_tower_alone(cfg, micro_store: Store, tmp_path: Path) -> None:
     trainer = start(cfg, micro_store, tmp_path / "run")
     trainer.optimizer = trainer._new_optimizer()
@@ -124,8 +135,8 @@ def test_no_held_out_scene_is_trained_on(micro_store: Store, frames: FrameReader
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("student.architecture.layers=3", "needs 5 layers with 5 heads or more"),
-        ("student.architecture.kv_heads=2", "needs 5 layers with 5 heads or more"),
+        ("student.architecture.layers=5", "needs 6 layers with 5 heads or more"),
+        ("student.architecture.heads=4", "needs 6 layers with 5 heads or more"),
         ("student.architecture=null", "a base is trained from random weights"),
     ],
 )
