@@ -10,7 +10,8 @@ Each row gives the student a longer part of the true rationale:
     motion                how the objects move until the target, too: a part of foresight
     prediction            what will be true at the target, too: foresight
     candidate analysis    what each candidate shows, and which of them agrees, too: the student only
-                          has to copy the letter
+                          has to copy the letter (a section that students of the regime
+                          cot_no_candidate_analysis have not seen)
 
 The true rationale states what decides the item, so every part also gives away which objects matter.
 """
@@ -23,7 +24,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks.experiments.experiment import open_benchmark
+from benchmarks.experiments.experiment import compose_benchmark, open_benchmark
 from conf.schema import SftCommand, TeacherConfig
 from data.parallel import batched
 from data.records import FAMILIES, SelectionItem
@@ -32,12 +33,12 @@ from data.store import Store
 from evaluation.select import limit_items
 from models import loading
 from models.precision import resolve_precision
+from models.resolved import check_base
 from models.student.answer_parser import parse_choice
 from models.student.collator import Collator
 from models.student.generation import generate
 from models.student.prompts import Sample, selection_sample
-from models.student.responses import GeneratedText
-from models.trained_runs import product_folder, trained_settings
+from models.trained_runs import check_modes, check_unseen, product_folder, trained_settings
 from teacher.narrator import write_rationale
 from teacher.sections import split_sections
 from teacher.vocabulary import choose_vocabulary, describe_item
@@ -61,6 +62,9 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=32)
     args = parser.parse_args()
     trained = trained_settings(args.student, SftCommand, "student")
+    check_base(args.student, trained.student)
+    check_modes(args.student, trained.train.regime, ["reasoning"])
+    check_unseen(str(args.student), trained.benchmark, compose_benchmark(args.benchmark))
     store = open_benchmark(args.store, args.benchmark)
     items = limit_items(store.selection("test"), args.items, seed=0)
     truth = {item.item_id: true_rationale(item, store, trained.teacher) for item in items}
@@ -119,8 +123,7 @@ class Student:
         limit = self._settings.student.max_new_tokens
         texts = generate(self._model, self._processor, inputs, limit, self._precision)
         for start, text in zip(given, texts, strict=True):
-            whole = GeneratedText(start + text.text, text.cut)
-            yield parse_choice(whole.text, cut=whole.cut).letter
+            yield parse_choice(start + text.text, cut=text.cut).letter
 
     def _sample(self, item: SelectionItem, given: str) -> Sample:
         regime, frame_count = self._settings.train.regime, self._settings.student.frames

@@ -18,7 +18,7 @@ from typing import Any
 import pandas as pd
 
 from conf.compose import compose
-from conf.schema import SelectCommand
+from conf.schema import BenchmarkConfig, SelectCommand
 from data.store import Store, open_store
 
 Job = tuple[str, int]
@@ -92,7 +92,10 @@ class Experiment:
                 shared = {**self.identity, self.variant_column: variant, "seed": seed}
                 rows = pd.DataFrame([shared | row for row in evaluate((variant, seed))])
                 table = pd.concat([self.read_record(), rows])
-                table.to_parquet(self.args.record, index=False, compression="zstd")
+                # A kill while the record is written loses no results.
+                part = self.args.record.with_suffix(".tmp")
+                table.to_parquet(part, index=False, compression="zstd")
+                part.replace(self.args.record)
         results = self.read_results(self.args.seeds)
         if results.empty:
             raise SystemExit("error: no results are recorded: run without --table")
@@ -118,16 +121,19 @@ class Experiment:
             run_command([self.trainer, *training, *self.shared_overrides, f"run={trained}"])
             kind = self.trainer.partition(".")[2]
             evaluation = [*evaluation, f"model={self.args.checkpoints / kind / trained}"]
-        folder = self.args.checkpoints / self.evaluator.partition(".")[2] / name
-        if not (folder / "metrics.json").exists():
-            run_command([self.evaluator, *evaluation, *self.shared_overrides, f"run={name}"])
-        return folder
+        # The command itself reuses the answers of the same model.
+        run_command([self.evaluator, *evaluation, *self.shared_overrides, f"run={name}"])
+        return self.args.checkpoints / self.evaluator.partition(".")[2] / name
+
+
+def compose_benchmark(benchmark: str) -> BenchmarkConfig:
+    """Return the settings of a preset."""
+    return compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
 
 
 def open_benchmark(store: Path, benchmark: str) -> Store:
     """Return the built benchmark of a preset."""
-    cfg = compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
-    return open_store(store / cfg.store_name)
+    return open_store(store / compose_benchmark(benchmark).store_name)
 
 
 def run_command(command: Sequence[str]) -> None:

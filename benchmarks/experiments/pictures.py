@@ -2,7 +2,7 @@
 that it does not, with its own words (`docs/item.webp`), and the solved one as an animation
 (`docs/reasoning.webp`).
 
-    python -m benchmarks.experiments.pictures checkpoints/select/exp-cot
+    python -m benchmarks.experiments.pictures checkpoints/select/model-checkpoints-sft-exp-cot
 
 By default, the items are the first solved and the first unsolved one whose response is not cut.
 """
@@ -66,10 +66,18 @@ def main() -> None:
 
 def read_solutions(folder: Path, store: Store) -> list[Solution]:
     """Return the responses of a run in reasoning mode, in the order of the items."""
+    if not (folder / "answers.jsonl").exists():
+        raise SystemExit(f"error: {folder} is not the folder of a run of evaluation.select")
+    log = [*read_json_lines(folder / "answers.jsonl")]
+    # The last key is that of the last evaluation without a control.
+    key = [r["key"] for r in log if "asked" in r and not r["asked"].get("control")][-1]
     rows = {
         row["item_id"]: row
-        for row in read_json_lines(folder / "answers.jsonl")
-        if row.get("mode") == "reasoning" and "item_id" in row and not row["cut"]
+        for row in log
+        if row["key"] == key
+        and row.get("mode") == "reasoning"
+        and "item_id" in row
+        and not row["cut"]
     }
     return [
         Solution(item, rows[item.item_id]["letter"], rows[item.item_id]["text"])

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +34,10 @@ from conf.schema import SftCommand
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR
+from data.tracks.selection.distractors import BUILDERS_VERSION
 from evaluation.metrics.reasons import PARTS, SUPPORTED, read_reasons
-from models.fingerprints import weights_digest
+from models.fingerprints import settings_key, weights_digest
+from teacher.narrator import NARRATOR_VERSION
 
 LETTERS = Path(__file__).with_name("letters.parquet")
 BOTH = ("reasoning", "answer")
@@ -93,15 +95,20 @@ def main() -> None:
     parser.add_argument("--student", default="tiny")
     parser.add_argument("--variants", nargs="+", choices=[*VARIANTS], default=[*VARIANTS])
     args = parser.parse_args()
-    preset = compose("train.sft", SftCommand, [f"student={args.student}"]).student
-    base = weights_digest(preset.model)
-    identity = {"base": base, "benchmark": args.benchmark}
+    overrides = [f"student={args.student}", f"benchmark={args.benchmark}"]
+    preset = compose("train.sft", SftCommand, overrides)
+    base = weights_digest(preset.student.model)
+    # Results of other settings, other items or other rationales are not reused.
+    versions = {"builders": BUILDERS_VERSION, "narrator": NARRATOR_VERSION}
+    groups = {name: asdict(getattr(preset, name)) for name in ("student", "train", "benchmark")}
+    settings = settings_key(groups | versions)
+    identity = {"base": base, "benchmark": args.benchmark, "settings": settings}
     experiment = Experiment(args, identity, "variant", "train.sft", "evaluation.select")
 
     def evaluate(job: Job) -> list[dict[str, Any]]:
         name, seed = job
         variant, student = VARIANTS[name], f"student={args.student}"
-        folder = f"{args.benchmark}-{base[:8]}-{name.replace(' ', '_')}-{seed}"
+        folder = f"{args.benchmark}-{base[:8]}-{settings[:8]}-{name.replace(' ', '_')}-{seed}"
         training = variant.training and [*variant.training, f"seed={seed}", student]
         # The default modes ask a base for a structured record, which the tiny base cannot write.
         modes = f"modes=[{','.join(variant.modes)}]"
@@ -234,6 +241,8 @@ def print_controls(
 def print_claims(table: pd.DataFrame) -> None:
     """Print how many claims the responses in reasoning mode make, and the shares of them that the
     oracle supports."""
+    if "follows" not in table:
+        return
     reasoning = table[(table["mode"] == "reasoning") & table.follows.notna()]
     columns = [f"{part}: claims, true" for part in PARTS]
     print_header("claims", *columns, "answer follows", "right for true reasons")

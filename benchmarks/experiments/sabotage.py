@@ -40,6 +40,8 @@ TRAINING = (
 )  # fmt: skip
 EVALUATION = ("benchmark=short", "modes=[reasoning]", "batch=64")
 CHANCE = 1 / len(LETTERS)
+INTERRUPTED = 130
+"""Exit status of a command that Ctrl-C interrupts."""
 INTACT = "intact"
 Loaded = tuple[PreTrainedModel, ProcessorMixin]
 
@@ -159,9 +161,8 @@ def main() -> None:
         parser.error(f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(SABOTAGES)}")
     print("| | right, % | standard errors above chance |\n|---|---|---|", flush=True)
     for name in args.names or SABOTAGES:
-        try:
-            result = train_and_measure(SABOTAGES[name], name, args.store, args.checkpoints)
-        except SystemExit:
+        result = train_and_measure(SABOTAGES[name], name, args.store, args.checkpoints)
+        if result is None:
             print(f"| {name} | refused | |", flush=True)
         else:
             share, errors = 100 * result.right / result.total, result.errors_above_chance
@@ -181,16 +182,27 @@ class Result(NamedTuple):
         return (self.right - CHANCE * self.total) / math.sqrt(variance)
 
 
-def train_and_measure(sabotage: Sabotage, name: str, store: str, checkpoints: Path) -> Result:
+def train_and_measure(
+    sabotage: Sabotage, name: str, store: str, checkpoints: Path
+) -> Result | None:
     """Train a student with a mistake, and measure it on held-out items with the same mistake. The
-    runs of an earlier measurement are deleted."""
+    runs of an earlier measurement are deleted.
+
+    Returns:
+        None if the training refuses the mistake.
+    """
     run = f"sabotage-{re.sub('[^a-z]+', '_', name)}"
     for kind in ("sft", "select"):
         shutil.rmtree(checkpoints / kind / run, ignore_errors=True)
     shared = [f"store={store}", f"checkpoints={checkpoints}", f"run={run}"]
     student = checkpoints / "sft" / run
     with sabotage.active():
-        run_command("train.sft", [*TRAINING, *sabotage.overrides, *shared])
+        try:
+            run_command("train.sft", [*TRAINING, *sabotage.overrides, *shared])
+        except SystemExit as error:
+            if sabotage == SABOTAGES[INTACT] or error.code == INTERRUPTED:
+                raise
+            return None
         run_command("evaluation.select", [*EVALUATION, f"model={student}", *shared])
     lines = list(read_json_lines(checkpoints / "select" / run / "answers.jsonl"))
     answers = [line for line in lines if "item_id" in line]
