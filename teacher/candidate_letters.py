@@ -5,9 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
+from operator import add
 
 from data.records import LETTERS, SelectionItem
 
+ANALYSIS = re.compile(r"(?<=Candidate analysis:).*?(?=^\w[\w ]*:|\Z)", re.MULTILINE | re.DOTALL)
+CANDIDATE = re.compile(r"(?:\A|[.!?\n])\s*(?P<start>Candidate (?P<letter>[A-Z])\b)")
+"""Matches where a sentence begins to describe a candidate."""
 LETTER = re.compile(rf"\b[{''.join(LETTERS)}]\b")
 SENTENCE_START = re.compile(r"(?:\A|[.!?:;\n(\"“—–-])\s*\Z")
 NEXT_WORD = re.compile(r"[ \n]+([A-Za-z]+)")
@@ -29,6 +34,9 @@ def find_letters(text: str) -> list[tuple[int, int]]:
 def relabel_text(text: str, order: Sequence[int]) -> str:
     """Return a rationale whose letters name the same candidates after these are reordered.
 
+    If the candidate analysis describes the candidates in the order of their letters, so does that
+    of the result. Otherwise, a student would have to remember which letters are left.
+
     Args:
         text: A rationale for the old order that the validator accepts.
         order: `order[new]` is the old position of the candidate at the position `new`.
@@ -38,7 +46,21 @@ def relabel_text(text: str, order: Sequence[int]) -> str:
     for start, stop in find_letters(text):
         pieces += [text[end:start], letter_of[text[start:stop]]]
         end = stop
-    return "".join([*pieces, text[end:]])
+    analysis = ANALYSIS.search(text)
+    letters = [m["letter"] for m in CANDIDATE.finditer(analysis[0])] if analysis else []
+    text = "".join([*pieces, text[end:]])
+    return ANALYSIS.sub(_sort_by_letter, text) if letters == list(LETTERS) else text
+
+
+def _sort_by_letter(analysis: re.Match[str]) -> str:
+    """Return a candidate analysis with its candidates in the order of their letters. The white
+    space between them stays where it is."""
+    text = analysis[0]
+    starts = [m.start("start") for m in CANDIDATE.finditer(text)]
+    parts = [text[a:b] for a, b in pairwise([*starts, len(text)])]
+    described = sorted(part.rstrip() for part in parts)
+    spaces = [part[len(part.rstrip()) :] for part in parts]
+    return text[: starts[0]] + "".join(map(add, described, spaces))
 
 
 def reorder_candidates(item: SelectionItem, order: Sequence[int]) -> SelectionItem:

@@ -45,6 +45,30 @@ def test_relabelling_composes():
             assert relabel_text(relabel_text(text, first), second) == relabel_text(text, both)
 
 
+@pytest.mark.parametrize("space", [" ", "\n"])
+def test_candidates_stay_in_the_order_of_their_letters(space: str) -> None:
+    shown = ["a cube. It rests.", "no cube.", "a sphere.", "a cube, and agrees."]
+
+    def write(shown: list[str], answer: str) -> str:
+        sentences = [f"Candidate {k} shows {s}" for k, s in zip("ABCD", shown, strict=True)]
+        outcome = f"Candidate {answer} agrees.\nAnswer: {answer}"
+        return (
+            f"Prediction: A cube.\nCandidate analysis: {space.join(sentences)}\nOutcome: {outcome}"
+        )
+
+    for order in ORDERS:
+        reordered = write([shown[old] for old in order], "ABCD"[order.index(3)])
+        assert relabel_text(write(shown, "D"), order) == reordered
+
+
+def test_an_analysis_that_jumps_between_candidates_keeps_its_order() -> None:
+    text = "Candidate analysis: Candidate A agrees. Candidate A fits. Unlike it, B, C and D differ."
+    swapped = (
+        "Candidate analysis: Candidate B agrees. Candidate B fits. Unlike it, A, C and D differ."
+    )
+    assert relabel_text(text, [1, 0, 2, 3]) == swapped
+
+
 def test_relabelled_rationale_is_valid_for_the_reordered_item(micro_store):
     cfg, rng = TeacherConfig(name="template"), np.random.default_rng(0)
     answers_moved = 0
