@@ -98,8 +98,13 @@ def extract_predicates(
         return Predicates(**vars(facts), candidates=candidates)
     cut = find_cut(scene, item.prefix_start, item.prefix_stop)
     observed, views = _describe_views(item, scene, scene_of, cut, bounds)
+    order = np.argsort(scene.image_positions[cut, :, 0], kind="stable")
     return RelationalPredicates(
-        **vars(facts), candidates=candidates, observed=observed, views=views
+        **vars(facts),
+        candidates=candidates,
+        left_to_right=tuple(scene.objects[k].noun_phrase for k in order),
+        observed=observed,
+        views=views,
     )
 
 

@@ -181,9 +181,14 @@ class View:
 
 @dataclass(frozen=True)
 class RelationalPredicates(Predicates):
-    """Predicates with relations: those at the cut, and a view of each candidate. That of the
-    answer is the view of the target."""
+    """Predicates with relations.
 
+    `left_to_right` are the names of the objects in the order of their places along the image's
+    width at the cut, `observed` are the relations at the cut, and `views` are the candidates as a
+    reader sees them. That of the answer is the view of the target.
+    """
+
+    left_to_right: tuple[str, ...]
     observed: tuple[Relation, ...]
     views: tuple[View, ...]
 

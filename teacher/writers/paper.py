@@ -131,11 +131,15 @@ class Writer:
         return sections
 
     def scene_parse(self) -> list[str]:
-        parts = [self.observed(o) for o in self.ranked[: self.detail.parsed]]
+        parts = [self.observed(o) for o in self.order(self.ranked[: self.detail.parsed])]
         parts[0] = f"{self.facts.instant}, {parts[0]}"
         courses = self.facts.courses[: self.detail.pairs]
         parts += [f"{name_pair(course.objects)} are on a collision course" for course in courses]
         return parts if courses else [*parts, self.say("no_course")]
+
+    def order(self, objects: list[ObjectFacts]) -> list[ObjectFacts]:
+        """Return objects in the order in which a section mentions them."""
+        return objects
 
     def observed(self, o: ObjectFacts) -> str:
         if o.sight != "shown":
@@ -153,7 +157,8 @@ class Writer:
         still = ("stays", "unseen")
         movers = [o for o in ranked if o.extent not in still or o.enters or o.leaves]
         struck = {name for m in facts.contacts for name in m.objects}
-        parts += [self.travel(o, o.object in struck) for o in movers[: self.detail.analysed]]
+        moving = self.order(movers[: self.detail.analysed])
+        parts += [self.travel(o, o.object in struck) for o in moving]
         if not movers:
             parts.append("the objects remain where they are")
         elif any(o.extent == "stays" for o in ranked) and len(movers) <= self.detail.analysed:

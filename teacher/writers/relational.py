@@ -12,6 +12,7 @@ from teacher.deciding import Decision
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
+    ObjectFacts,
     Relation,
     RelationalPredicates,
     View,
@@ -121,6 +122,10 @@ class RelationalWriter(Writer):
         return " and ".join(parts)
 
     # Sections.
+
+    def order(self, objects: list[ObjectFacts]) -> list[ObjectFacts]:
+        """Return objects from left to right, so that a reader of the frame knows which is next."""
+        return sorted(objects, key=lambda o: self.facts.left_to_right.index(o.object))
 
     def scene_parse(self) -> list[str]:
         parts = super().scene_parse()

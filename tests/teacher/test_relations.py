@@ -252,6 +252,13 @@ def test_objects_out_of_view_at_the_cut_are_named_only_if_they_decide() -> None:
     assert unseen
 
 
+def test_scene_parses_name_objects_from_left_to_right() -> None:
+    for item, predicates in random_cases(60, BOUNDS):
+        parse = write_rationale(predicates, item, 0).split("Motion analysis:")[0]
+        found = {name: parse.find(name) for name in predicates.left_to_right if name in parse}
+        assert sorted(found, key=found.get) == [*found]
+
+
 def test_match_lines_rest_on_the_statements_of_the_rationale() -> None:
     item, predicates = next(
         (i, p) for i, p in random_cases(60, BOUNDS) if not choose_statements(p, i.item_id).rivals

@@ -96,5 +96,4 @@ def tokenizer_corpus(sampler: ItemSampler) -> list[str]:
     answers = [
         sampler.ask(item, kind, "tokenizer")[1].answer for item in items[::step] for kind in KINDS
     ]
-    outcome = ["Outcome: This layout is that of candidate", "shows this layout."]
-    return prompt_corpus(items, [*QUESTIONS, *outcome]) + answers
+    return prompt_corpus(items, QUESTIONS) + answers

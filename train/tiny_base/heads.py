@@ -21,8 +21,10 @@ at the tower's output and motion in the middle layers. Further losses teach atte
 to look: at a token of a text, the two tokens before it (layer `PRECEDING`); at a visual token of a
 candidate, the same object at the end of the clip (layer `TRACKING`); at an object's name in a text,
 the object in each picture (layer `NAMING`); after a name, this name and the letter of the candidate
-that the text speaks of, and before a name that is repeated, its last mention (layer `RECALLING`);
-before a letter in an outcome, the word that says that this candidate agrees (layer `SPEAKING`).
+that the text speaks of, before a name that is repeated, its last mention, and after an object's
+place in a candidate, its predicted place (layer `RECALLING`); before a letter in an outcome, the
+word that says that this candidate agrees, and before a name in a scene parse, the object (layer
+`SPEAKING`).
 """
 
 from __future__ import annotations
@@ -86,6 +88,10 @@ class OracleTargets:
         preceding: (_, 2) row and position of the tokens of texts.
         verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
             of the word that says that the candidate agrees.
+        comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
+            and position of the end of the predicted place of the same object.
+        following: (_, 3) row, position before the first mention of an object in a scene parse, and
+            token of the object at the end of the clip.
     """
 
     visual: Tensor
@@ -106,6 +112,8 @@ class OracleTargets:
     repeats: Tensor
     preceding: Tensor
     verdicts: Tensor
+    comparisons: Tensor
+    following: Tensor
 
 
 class OracleHeads(nn.Module):
@@ -274,8 +282,10 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     words. At a visual token, head 0 of layer `TRACKING` finds the object at the end of the clip. At
     a name, head k of layer `NAMING` finds the object in picture k. After a name, heads 0 and 1 of
     layer `RECALLING` find this name and the letter of the candidate; before a repeated name, head 2
-    finds its last mention. Before a letter in an outcome, head 0 of layer `SPEAKING` finds the word
-    that says that the candidate agrees.
+    finds its last mention; after the place of an object in a candidate, head 3 finds its predicted
+    place. Before a letter in an outcome, head 0 of layer `SPEAKING` finds the word that says that
+    the candidate agrees; before the first mention of an object in a scene parse, head 1 finds the
+    object at the end of the clip.
     """
     losses = {}
     row, start, end = targets.tracked.T
@@ -290,13 +300,17 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
             losses[f"find {head}"] = -trace.log_attention(NAMING, head, row, query, key).mean()
     row, position = targets.preceding.T
     before, second_before = (torch.stack([row, position, position - k], dim=1) for k in (1, 2))
+    row, query, token = targets.following.T
+    following = torch.stack([row, query, targets.visual[row, token]], dim=1)
     for name, layer, head, pairs in (
         ("before", PRECEDING, 0, before),
         ("second before", PRECEDING, 1, second_before),
         ("subject", RECALLING, 0, targets.subjects),
         ("letter", RECALLING, 1, targets.letters),
         ("repeat", RECALLING, 2, targets.repeats),
+        ("comparison", RECALLING, 3, targets.comparisons),
         ("verdict", SPEAKING, 0, targets.verdicts),
+        ("following", SPEAKING, 1, following),
     ):
         row, query, key = pairs.T
         if len(row):

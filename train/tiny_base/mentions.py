@@ -20,10 +20,26 @@ EVENTS = re.compile(
 )
 """Matches where a text begins to speak of an object, a candidate or a section, and where a sentence
 ends."""
-AGREES = re.compile(r"[Cc]andidate (?P<letter>\w) [^.]*, and (?P<word>agrees)(?=\.)")
+AGREES = re.compile(
+    r"[Cc]andidate (?P<letter>\w) [^.]*,? and (?P<word>agrees)(?=\.| with the prediction\.)"
+)
 """Matches the sentence of a candidate that agrees with a prediction."""
-OUTCOME = re.compile(r"Candidates? (?P<letters>\w(?:, \w)*(?: and \w)?) agrees?\.")
-"""Matches the sentence that names the candidates that agree."""
+OUTCOME = re.compile(
+    r"(?:[Cc]andidates?|Answer:) (?P<letters>\w(?:, \w)*(?: and \w)?)"
+    r"(?= agrees?\.| shows this layout\.|\.|$)",
+    re.MULTILINE,
+)
+"""Matches where a text names the candidates that agree."""
+PREDICTED = re.compile(
+    rf"[Tt]he (?P<name>{NAME.pattern}) (?:will be|should be|remains|stays) (?P<place>[^.]+)\."
+)
+"""Matches a sentence that says where an object will be."""
+CLAIMED = re.compile(
+    rf"(?:[Cc]andidate \w|it) shows the (?P<name>{NAME.pattern}) (?P<place>[^.]+?)"
+    r"(?P<comma>,?)(?= not |,? and agrees| but |,? and not | and the |\.)"
+)
+"""Matches what a text says that a candidate shows of an object."""
+PREDICTION = re.compile("Prediction:")
 
 
 @dataclass(frozen=True)
@@ -79,17 +95,39 @@ class TokenizedText:
                 section, letter, letter_at = event["section"], None, None
 
     def verdicts(self) -> Iterator[tuple[int, int]]:
-        """Yield the index of each letter's token in an outcome, and that of the word "agrees" in
-        the sentence of this candidate."""
+        """Yield the index of each letter's token in an outcome or answer, and that of the word
+        "agrees" in the sentence of this candidate."""
         agreeing: dict[str, int] = {}
-        events = sorted(
-            [*AGREES.finditer(self.text), *OUTCOME.finditer(self.text)], key=lambda e: e.start()
-        )
-        for event in events:
-            if event.re is AGREES:
+        for event in self._find(PREDICTION, AGREES, OUTCOME):
+            if event.re is PREDICTION:
+                agreeing.clear()
+            elif event.re is AGREES:
                 agreeing[event["letter"]] = self.token_at(event.start("word"))
+            else:
+                for letter in re.finditer(r"[A-Z]", event["letters"]):
+                    if letter.group() in agreeing:
+                        at = event.start("letters") + letter.start()
+                        yield self.token_at(at), agreeing[letter.group()]
+
+    def comparisons(self) -> Iterator[tuple[int, int]]:
+        """Yield the index of the last token of each place that a candidate is said to show, also of
+        a comma after it, and that of the last token of the place that the same object was predicted
+        to have: after these tokens, the text says whether both are the same. Objects with several
+        predictions are left out."""
+        predicted: dict[str, list[int]] = {}
+        for event in self._find(PREDICTION, PREDICTED, CLAIMED):
+            if event.re is PREDICTION:
+                predicted.clear()
                 continue
-            for letter in re.finditer(r"[A-Z]", event["letters"]):
-                at = event.start("letters") + letter.start()
-                yield self.token_at(at), agreeing[letter.group()]
-            agreeing.clear()
+            last = self.token_at(event.end("place") - 1)
+            if event.re is PREDICTED:
+                predicted.setdefault(event["name"], []).append(last)
+            elif len(places := predicted.get(event["name"], [])) == 1:
+                yield last, places[0]
+                if event["comma"]:
+                    yield self.token_at(event.start("comma")), places[0]
+
+    def _find(self, *patterns: re.Pattern[str]) -> list[re.Match[str]]:
+        """Return the matches of all patterns in the order of the text."""
+        found = [m for pattern in patterns for m in pattern.finditer(self.text)]
+        return sorted(found, key=lambda m: m.start())

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from data.records import COLORS, MATERIALS, SHAPES, Scene
-from teacher.predicates.motion import COURSE_FRAMES
+from teacher.predicates.motion import motion_start
 
 WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
 """The words of a noun phrase, in their order."""
@@ -112,11 +112,10 @@ def future_displacements(scene: Scene, frame: int, later: int) -> dict[str, tupl
 def observed_states(scene: Scene, frame: int) -> dict[str, tuple[float, ...]]:
     """Return the places and velocities (4 numbers), by name, of a frame's clearly visible objects.
     The velocity is that of the frames from which the predicates derive headings."""
-    start = max(frame - COURSE_FRAMES + 1, 0)
     return {
         scene.objects[k].noun_phrase: (
             *_place(scene, frame, k),
-            *_velocity(scene, k, start, frame),
+            *_velocity(scene, k, max(motion_start(scene, k, frame), 0), frame),
         )
         for k in visible_objects(scene, frame)
     }

@@ -8,10 +8,12 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     describe   where each candidate shows each object, and how they lie to each other
     compare    for each of two statements, which candidates agree with it
     explain    the steps of a rationale about a statement that is true of the target
+    narrate    a whole rationale with its answer, without any picture
 
-None of them is the selection task: no answer says which candidate is the target. Statements are
-chosen at random, not because they decide the item; those of `explain` are true of at least two
-candidates.
+None of them is the selection task: no answer about pictures says which candidate is the target.
+Statements about pictures are chosen at random, not because they decide the item; those of `explain`
+are true of at least two candidates. `narrate` teaches the language of rationales, in both
+vocabularies, and how an answer follows from what a text says of the candidates.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data.records import SelectionItem
+from models.student.prompts import response
 from teacher.deciding import Decision
+from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.facts import Relation, RelationalPredicates, View
 from teacher.predicates.relations import (
     CHANGES,
@@ -42,7 +46,8 @@ EXPLAIN = (
     "Check a prediction step by step: scene parse, motion analysis, prediction, candidate analysis "
     "and outcome. Then say of each candidate, in a line of its own, whether it matches and why."
 )
-QUESTIONS = (PARSE, PREDICT, DESCRIBE, COMPARE, EXPLAIN)
+NARRATE = "Write an example of a rationale."
+QUESTIONS = (PARSE, PREDICT, DESCRIBE, COMPARE, EXPLAIN, NARRATE)
 FULL = Detail(parsed=6, analysed=4, predicted=6, pairs=2, relations=2)
 SPARSE = Detail(parsed=3, analysed=2, predicted=1, pairs=1)
 PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
@@ -90,7 +95,7 @@ def predict(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
     """Ask for the place of each object at the target, and for relations."""
     p = leave_out_unseen(p)
     writer = make_writer(p, item, rng)
-    parts = [writer.expected(o) for o in writer.ranked]
+    parts = [writer.expected(o) for o in writer.order(writer.ranked)]
     relations = sample_statements(p, p.target, rng, PREDICTED, without=PLACES)
     parts += [writer.statement(s, "will be") for s in relations]
     parts[0] = f"{p.moment}, {parts[0]}"
@@ -122,16 +127,16 @@ def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Genera
 def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask which candidates agree with statements, each true of some candidate and, if possible, not
     of all."""
-    blocks: dict[Relation, str] = {}
+    blocks: dict[Relation, str] = {}  # by normalized statement
     for k in rng.permutation(len(p.views))[:COMPARED]:
         options = sample_statements(p, p.views[k], rng, 12)
-        options = [s for s in options if s not in blocks]
+        options = [s for s in options if normalize_relation(s) not in blocks]
         options = [s for s in options if len(agreeing(p, [s])) < len(p.views)] or options
         if not options:
             continue
         writer = make_writer(p, item, rng, options[:1])
         parts = [f"candidate {view.letter} {judge(writer, view)}" for view in p.views]
-        blocks[options[0]] = (
+        blocks[normalize_relation(options[0])] = (
             f"Prediction: {join_sentences([writer.statement(writer.statements[0], 'will be')])}\n"
             f"Candidate analysis: {join_sentences(parts)}\n"
             f"Outcome: {join_sentences([name_agreeing(p, options[:1])])}"
@@ -163,10 +168,19 @@ def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
     return Question(EXPLAIN, "\n".join(lines))
 
 
+def narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+    """Ask for a rationale, in one of the vocabularies, and its answer. No picture is shown."""
+    predicates = p if rng.random() < 0.5 else p.without_relations()
+    rationale = write_rationale(predicates, item, int(rng.integers(2**31)))
+    lines = write_match_lines(predicates, item)
+    answer = response(rationale, lines, item.letter, "reasoning", "cot")
+    return Question(NARRATE, answer, clip=False, candidates=False)
+
+
 MakeQuestion = Callable[[RelationalPredicates, SelectionItem, np.random.Generator], Question]
 KINDS: dict[str, MakeQuestion] = {
     "parse": parse, "predict": predict, "describe": describe, "compare": compare,
-    "explain": explain,
+    "explain": explain, "narrate": narrate,
 }  # fmt: skip
 
 

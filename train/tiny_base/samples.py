@@ -99,7 +99,7 @@ class OracleCollator:
         ids = batch["input_ids"]
         media = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
         visual = torch.isin(ids, media).nonzero()[:, 1].reshape(len(samples), -1)
-        grid = round((visual.shape[1] // samples[0].sample.pictures) ** 0.5)
+        grid = round((visual.shape[1] // max(samples[0].sample.pictures, 1)) ** 0.5)
         texts = [TokenizedText(s.sample.response or "", self._processor.tokenizer) for s in samples]
         # The token that ends the turn follows the response.
         starts = [ids.shape[1] - len(text) - 1 for text in texts]
@@ -113,12 +113,19 @@ class OracleCollator:
             for row, (text, start) in enumerate(zip(texts, starts, strict=True))
             for letter, agrees in text.verdicts()
         ]
+        comparisons = [
+            (row, start + claimed, start + predicted)
+            for row, (text, start) in enumerate(zip(texts, starts, strict=True))
+            for claimed, predicted in text.comparisons()
+        ]
         preceding = [
             (row, start + k)
             for row, (text, start) in enumerate(zip(texts, starts, strict=True))
             for k in range(len(text))
         ]
-        return batch, stack_samples(samples, mentions, verdicts, preceding, visual, grid)
+        return batch, stack_samples(
+            samples, mentions, verdicts, comparisons, preceding, visual, grid
+        )
 
 
 @dataclass(frozen=True)
@@ -128,6 +135,7 @@ class LocatedMention:
     Attributes:
         row, first, position: Row of the batch, and positions of the name's first and last token.
         spoken: Positions from the name's last token to the next name.
+        section: Title of the section of the rationale; None before the first.
         state: Place (from -0.5 to 0.5) and velocity of the object in the picture that the text
             speaks of; NaN where the oracle does not determine them.
         letter_at: Position of the letter of the candidate that the text speaks of, if any.
@@ -141,6 +149,7 @@ class LocatedMention:
     first: int
     position: int
     spoken: range
+    section: str | None
     state: tuple[float, ...]
     letter_at: int | None
     found: tuple[int, ...]
@@ -161,6 +170,7 @@ def locate_mentions(
             start + m.first,
             start + m.last,
             range(start + m.last, start + m.stop),
+            m.section,
             spoken_state(sample, shown, m),
             None if m.letter_at is None else start + m.letter_at,
             tuple(t.token(grid) if t else -1 for t in pictures),
@@ -173,6 +183,7 @@ def stack_samples(
     samples: Sequence[OracleSample],
     mentions: Sequence[LocatedMention],
     verdicts: list[tuple[int, int, int]],
+    comparisons: list[tuple[int, int, int]],
     preceding: list[tuple[int, int]],
     visual: Tensor,
     grid: int,
@@ -180,21 +191,22 @@ def stack_samples(
     """Return the targets of a batch.
 
     Args:
-        verdicts, preceding: See `OracleTargets`.
+        verdicts, comparisons, preceding: See `OracleTargets`.
         visual: (B, T) positions of the visual tokens, grid x grid for each picture.
     """
     objects = [
         (row, t) for row, s in enumerate(samples) for t in most_visible_per_token(s.targets, grid)
     ]
-    at = torch.tensor([(row, t.token(grid)) for row, t in objects]).reshape(-1, 2)
+
+    def integers(rows: list[tuple[int, ...]], columns: int) -> Tensor:
+        return torch.tensor(rows, dtype=torch.long).reshape(-1, columns)
+
+    at = integers([(row, t.token(grid)) for row, t in objects], 2)
     presence = torch.zeros(visual.shape)
     presence[at[:, 0], at[:, 1]] = 1
     truth = stack_targets([t for _, t in objects])
     scaled = truth["place"] * grid
     truth["place"] = truth["place"] - 0.5
-
-    def integers(rows: list[tuple[int, ...]], columns: int) -> Tensor:
-        return torch.tensor(rows, dtype=torch.long).reshape(-1, columns)
 
     return OracleTargets(
         visual=visual,
@@ -223,6 +235,8 @@ def stack_samples(
         repeats=integers([*find_repeats(mentions)], 3),
         preceding=integers(preceding, 2),
         verdicts=integers(verdicts, 3),
+        comparisons=integers(comparisons, 3),
+        following=integers([*find_following(mentions)], 3),
     )
 
 
@@ -234,6 +248,16 @@ def find_repeats(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int,
         if (m.row, m.name) in mentioned:
             yield m.row, m.first - 1, mentioned[m.row, m.name]
         mentioned[m.row, m.name] = m.first
+
+
+def find_following(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
+    """Yield the row, the position before the first mention of an object in a scene parse, and the
+    object's visual token at the end of the clip."""
+    mentioned = set()
+    for m in mentions:
+        if m.section == "Scene parse" and (m.row, m.name) not in mentioned and m.found[0] >= 0:
+            yield m.row, m.first - 1, m.found[0]
+        mentioned.add((m.row, m.name))
 
 
 def track_objects(

@@ -78,15 +78,18 @@ def words_losses(
     inputs = {k: v for k, v in batch.items() if k != "labels"}
     with trace_forward(model.model.language_model, batch["attention_mask"]) as trace:
         logits = model(**inputs, use_cache=False).logits
-    dense = dense_losses(trace, heads, targets)
-    losses = {name: DENSE * loss for name, loss in dense.items()}
+    losses = {}
+    if len(targets.objects):
+        dense = dense_losses(trace, heads, targets)
+        losses |= {name: DENSE * loss for name, loss in dense.items()}
     pointing = pointing_losses(trace, targets)
     losses |= {name: POINTING * loss for name, loss in pointing.items()}
-    if len(targets.names):
+    if len(targets.names) and len(targets.objects):
         named = heads.named_losses(trace.outputs[NAMING], targets)
         losses |= {f"named {name}": NAMED * loss for name, loss in named.items()}
         spoken = heads.spoken_losses(trace.outputs[SPEAKING], targets)
         losses |= {f"spoken {name}": NAMED * loss for name, loss in spoken.items()}
+    if len(targets.names):
         spelled = heads.spelled_losses(trace.outputs[MIDDLE], targets)
         losses |= {f"spelled {kind}": DENSE * loss for kind, loss in spelled.items()}
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()

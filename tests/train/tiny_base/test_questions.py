@@ -123,7 +123,16 @@ def test_questions_show_what_they_ask_about(described: Described) -> None:
         "describe": (False, True),
         "compare": (True, True),
         "explain": (True, True),
+        # Only without pictures does an answer say which candidate is the target.
+        "narrate": (False, False),
     }
+
+
+def test_narrated_rationales_have_both_vocabularies(described: Described) -> None:
+    texts = [ask("narrate", item, p, k).answer for k, (item, p) in enumerate(described)]
+    assert {t[-9:] for t in texts} == {f"Answer: {letter}" for letter in LETTERS}
+    decided = [", and agrees." in text for text in texts]
+    assert 0.2 < np.mean(decided) < 0.8
 
 
 def test_sampled_statements_are_different_and_true(described: Described) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch.nn.functional import one_hot
 from data.records import LETTERS, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
-from teacher.predicates.motion import find_cut
+from teacher.predicates.motion import find_cut, motion_start
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import (
     PICTURES,
@@ -233,6 +234,45 @@ def test_outcomes_refer_to_the_candidates_that_agree(processor) -> None:
         assert before[before.rindex("Candidate ") :].startswith(f"Candidate {letter} shows")
 
 
+def test_places_in_candidates_are_compared_with_the_predicted_ones(processor) -> None:
+    text = TokenizedText(
+        "Prediction: At the end, the red metal cube will be near the top-left. The gray metal cube "
+        "should be near the top. The gray metal cube will be left of the red metal cube.\n"
+        "Candidate analysis: Candidate A shows the red metal cube near the top, not near the "
+        "top-left. Candidate B shows the gray metal cube near the top, and agrees. Candidate C "
+        "shows the red metal cube near the left and agrees with the prediction.\n"
+        "Candidate A does not match: it shows the red metal cube near the center, not near the "
+        "top.",
+        processor.tokenizer,
+    )
+    ends = [text.token_at(m.end() - 1) for m in re.finditer("near the [a-z-]+", text.text)]
+    commas = [text.token_at(m.start()) for m in re.finditer(", not", text.text)]
+    # The gray cube has two predictions.
+    assert [*text.comparisons()] == [
+        (ends[2], ends[0]), (commas[0], ends[0]),
+        (ends[5], ends[0]),
+        (ends[6], ends[0]), (commas[1], ends[0]),
+    ]  # fmt: skip
+
+
+def test_scene_parses_refer_to_the_object_that_they_name_next(sampler, collate) -> None:
+    samples = [sampler.sample(item, "parse", "test") for item in sampler.items[:6]]
+    _, targets = collate(samples)
+    assert len(targets.following) > 10
+    positions = {(row, at): m for m, (row, at) in enumerate(targets.names.tolist())}
+    for row, before, token in targets.following.tolist():
+        name = min(at for r, at in positions if r == row and at > before)
+        assert targets.found[positions[row, name], 0] == token
+
+
+def test_texts_without_pictures_have_losses(sampler, collate, deep_model, heads) -> None:
+    batch, targets = collate([sampler.sample(i, "narrate", "test") for i in sampler.items[:3]])
+    losses = words_losses(deep_model, heads, batch, targets)
+    assert {"words", "spelled color", "verdict", "repeat"} <= losses.keys()
+    assert not {"color", "place", "named places", "find 0"} & losses.keys()
+    assert sum(losses.values()).isfinite()
+
+
 def test_repeated_names_refer_to_their_last_mention(samples, collate, processor) -> None:
     batch, targets = collate(samples)
     assert len(targets.repeats) > 20
@@ -274,7 +314,8 @@ def test_observed_states_are_those_of_the_cut(micro_store: Store, items) -> None
         for k, o in enumerate(scene.objects):
             if state := observed_states(scene, cut).get(o.noun_phrase):
                 assert state[:2] == pytest.approx(places[cut, k])
-                moved = (places[cut, k] - places[cut - 4, k]) * 10 / 4
+                start = motion_start(scene, k, cut)
+                moved = (places[cut, k] - places[start, k]) * 10 / max(cut - start, 1)
                 assert np.isnan(state[2:]).all() or state[2:] == pytest.approx(moved)
     assert earlier
 
@@ -386,7 +427,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
         "before", "second before", "track", *(f"find {k}" for k in range(PICTURES)), "subject",
-        "letter", "repeat", "verdict",
+        "letter", "repeat", "verdict", "comparison",
     }  # fmt: skip
     assert not any(loss.item() for loss in losses.values())
 
