@@ -39,7 +39,7 @@ from evaluation.metrics.reasons import PARTS, SUPPORTED, read_reasons
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
 
-LETTERS = Path(__file__).with_name("letters.parquet")
+RECORD = Path(__file__).with_name("letters.parquet")
 BOTH = ("reasoning", "answer")
 RELATIONAL = "teacher.predicates=relational"
 ZERO_SHOT = "zero-shot"
@@ -91,7 +91,7 @@ DRAWS = 4000
 
 
 def main() -> None:
-    parser = create_parser(__doc__, "comparison", LETTERS)
+    parser = create_parser(__doc__, "comparison", RECORD)
     parser.add_argument("--student", default="tiny")
     parser.add_argument("--variants", nargs="+", choices=[*VARIANTS], default=[*VARIANTS])
     args = parser.parse_args()

@@ -198,18 +198,18 @@ def train_and_measure(
     student = checkpoints / "sft" / run
     with sabotage.active():
         try:
-            run_command("train.sft", [*TRAINING, *sabotage.overrides, *shared])
+            run_in_process("train.sft", [*TRAINING, *sabotage.overrides, *shared])
         except SystemExit as error:
             if sabotage == SABOTAGES[INTACT] or error.code == INTERRUPTED:
                 raise
             return None
-        run_command("evaluation.select", [*EVALUATION, f"model={student}", *shared])
+        run_in_process("evaluation.select", [*EVALUATION, f"model={student}", *shared])
     lines = list(read_json_lines(checkpoints / "select" / run / "answers.jsonl"))
     answers = [line for line in lines if "item_id" in line]
     return Result(sum(line["right"] for line in answers), len(answers))
 
 
-def run_command(name: str, overrides: Sequence[str]) -> None:
+def run_in_process(name: str, overrides: Sequence[str]) -> None:
     """Run a command of the project in this process."""
     with patch.object(sys, "argv", [name, *overrides]):
         import_module(name).main()

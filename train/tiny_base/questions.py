@@ -83,7 +83,7 @@ def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator
     """Ask for the scene at the end of the clip, and for the motion."""
     p = leave_out_unseen(p)
     statements = sample_statements(p, p.target, rng, FULL.relations)
-    writer = make_writer(p, item, rng, statements)
+    writer = make_statement_writer(p, item, rng, statements)
     answer = (
         f"Scene parse: {join_sentences(writer.scene_parse())}\n"
         f"Motion analysis: {join_sentences(writer.motion_analysis())}"
@@ -94,7 +94,7 @@ def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator
 def predict(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the place of each object at the target, and for relations."""
     p = leave_out_unseen(p)
-    writer = make_writer(p, item, rng)
+    writer = make_statement_writer(p, item, rng)
     parts = [writer.expected(o) for o in writer.order(writer.ranked)]
     relations = sample_statements(p, p.target, rng, PREDICTED, without=PLACES)
     parts += [writer.statement(s, "will be") for s in relations]
@@ -105,7 +105,7 @@ def predict(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
 def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the place of each object in each candidate, and for relations. Those of the first
     candidate are chosen at random; the others follow it in the same respects."""
-    writer = make_writer(p, item, rng)
+    writer = make_statement_writer(p, item, rng)
     shown = {s.objects[0] for v in p.views for s in v.statements if s.kind == "region"}
     subjects = rng.permutation([o.object for o in p.objects if o.object in shown]).tolist()
     topics = sample_statements(p, p.views[0], rng, DESCRIBED, without=PLACES)
@@ -134,7 +134,7 @@ def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
         options = [s for s in options if len(agreeing(p, [s])) < len(p.views)] or options
         if not options:
             continue
-        writer = make_writer(p, item, rng, options[:1])
+        writer = make_statement_writer(p, item, rng, options[:1])
         parts = [f"candidate {view.letter} {judge(writer, view)}" for view in p.views]
         blocks[normalize_relation(options[0])] = (
             f"Prediction: {join_sentences([writer.statement(writer.statements[0], 'will be')])}\n"
@@ -151,7 +151,7 @@ def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
     statements = sample_shared_statements(p, rng)
     if not statements:
         return replace(parse(p, item, rng), text=EXPLAIN, candidates=True)
-    writer = make_writer(p, item, rng, statements, SPARSE)
+    writer = make_statement_writer(p, item, rng, statements, SPARSE)
     shortest = min(writer.statements, key=lambda s: len(s.objects))
     sections = {
         "Scene parse": writer.scene_parse(),
@@ -184,7 +184,7 @@ KINDS: dict[str, MakeQuestion] = {
 }  # fmt: skip
 
 
-def make_writer(
+def make_statement_writer(
     p: RelationalPredicates,
     item: SelectionItem,
     rng: np.random.Generator,
