@@ -149,9 +149,19 @@ def _check_base_unseen(base: str | None, tested: BenchmarkConfig) -> None:
     """As `check_unseen`, for a base whose folder records the settings of its training."""
     if base is None or not (config := Path(base) / "config.yaml").exists():
         return
-    saved = OmegaConf.load(config)
-    schema = OmegaConf.structured(BenchmarkConfig)
-    trained = OmegaConf.to_object(OmegaConf.merge(schema, saved.benchmark))
+    try:
+        saved = OmegaConf.load(config)
+        if not OmegaConf.is_dict(saved) or "benchmark" not in saved:
+            return
+        schema = OmegaConf.structured(BenchmarkConfig)
+        trained = OmegaConf.to_object(OmegaConf.merge(schema, saved.benchmark))
+    except (YAMLError, OmegaConfBaseException) as error:
+        first = str(error).partition("\n")[0]
+        raise UserError(
+            f"{config} is damaged or of another version of DynaPix ({first}), so that the scenes "
+            "on which the base was trained are unknown: restore the file, or delete it",
+            code="damaged-file",
+        ) from error
     check_unseen(f"the base {base}", trained, tested)
 
 
@@ -199,7 +209,8 @@ def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) 
             f"{model} was trained with benchmark.seed={trained.seed} and "
             f"benchmark.test_share={trained.test_share}; with benchmark.seed={tested.seed} and "
             f"benchmark.test_share={tested.test_share}, the test split may contain scenes that it "
-            "was trained on: set both as in training",
+            "was trained on: set both as in training, or simulate other scenes with another "
+            "benchmark.seed",
             code="training-scenes-tested",
         )
 

@@ -69,15 +69,16 @@ def read_solutions(folder: Path, store: Store) -> list[Solution]:
     if not (folder / "answers.jsonl").exists():
         raise SystemExit(f"error: {folder} is not the folder of a run of evaluation.select")
     log = [*read_json_lines(folder / "answers.jsonl")]
-    # The last key is that of the last evaluation without a control.
-    key = [r["key"] for r in log if "asked" in r and not r["asked"].get("control")][-1]
+    # The last key is that of the last evaluation in reasoning mode without a control.
+    keys = [
+        row["key"]
+        for row in log
+        if "asked" in row and row["mode"] == "reasoning" and not row["asked"].get("control")
+    ]
     rows = {
         row["item_id"]: row
         for row in log
-        if row["key"] == key
-        and row.get("mode") == "reasoning"
-        and "item_id" in row
-        and not row["cut"]
+        if "item_id" in row and row["key"] in keys[-1:] and not row["cut"]
     }
     return [
         Solution(item, rows[item.item_id]["letter"], rows[item.item_id]["text"])

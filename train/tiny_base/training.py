@@ -115,8 +115,8 @@ class BaseTrainer:
 
     Args:
         folder: The run's folder, for the checkpoint, the journal and the curves.
-        texts: A digest of the tokenizer. The tokenizer is trained at every start, on texts that
-            only another version of the recipe changes.
+        tokenizer: Digest of the tokenizer. Every start trains it on the texts of the recipe, so
+            another digest means another version of the recipe.
     """
 
     def __init__(
@@ -128,11 +128,11 @@ class BaseTrainer:
         sampler: ItemSampler,
         probe: Probe,
         folder: Path,
-        texts: str,
+        tokenizer: str,
     ) -> None:
         self.cfg, self.model, self.heads = cfg, model, heads
         self.collate, self.sampler, self.probe, self.folder = collate, sampler, probe, folder
-        self.texts = texts
+        self.tokenizer = tokenizer
         self.stage, self.step = 0, 0
 
     def run(self) -> None:
@@ -205,7 +205,7 @@ class BaseTrainer:
         state = {
             "stage": self.stage,
             "step": self.step,
-            "texts": self.texts,
+            "tokenizer": self.tokenizer,
             "model": self.model.state_dict(),
             "heads": self.heads.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -223,9 +223,9 @@ class BaseTrainer:
             journal.unlink(missing_ok=True)
             return
         state = torch.load(path, weights_only=True)
-        if state["texts"] != self.texts:
+        if state["tokenizer"] != self.tokenizer:
             raise UserError(
-                f"{path} is of another version of the recipe, whose texts give another tokenizer: "
+                f"{path} has another tokenizer: the texts of the recipe have changed since; "
                 "delete the run, or give run=NAME",
                 code="other-recipe",
             )
@@ -267,8 +267,8 @@ def build_trainer(
     worded = {kind: [sampler.sample(i, kind, "held out") for i in held_out[::2]] for kind in KINDS}
     probe = Probe(model, heads, collate, samples, worded, words, cfg.train.precision == "bf16")
     tokenizer = processor.tokenizer.backend_tokenizer.to_str()
-    texts = hashlib.sha256(tokenizer.encode()).hexdigest()[:16]
-    return BaseTrainer(cfg.train, model, heads, collate, sampler, probe, run.folder, texts)
+    digest = hashlib.sha256(tokenizer.encode()).hexdigest()[:16]
+    return BaseTrainer(cfg.train, model, heads, collate, sampler, probe, run.folder, digest)
 
 
 def first_tokens(processor: ProcessorMixin) -> dict[str, list[int]]:

@@ -139,6 +139,12 @@ def test_a_base_is_not_tested_on_its_training_scenes(micro, tmp_path) -> None:
     resolve_model(cfg, replace(micro, seed=1), SftCommand, "student")
     with raises_user_error("training-scenes-tested", contains=str(tmp_path)):
         resolve_model(cfg, micro, SftCommand, "student")
+    (tmp_path / "config.yaml").write_text("benchmark: {scenes: [")
+    with raises_user_error("damaged-file", contains=str(tmp_path)):
+        resolve_model(cfg, micro, SftCommand, "student")
+    # A file of another project.
+    (tmp_path / "config.yaml").write_text("hidden: 64")
+    resolve_model(cfg, micro, SftCommand, "student")
 
 
 def test_settings_that_a_trained_model_cannot_use_are_refused(

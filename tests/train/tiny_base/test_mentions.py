@@ -1,0 +1,69 @@
+"""Where a text names objects and candidates, and which words refer to which."""
+
+from __future__ import annotations
+
+import re
+
+from train.tiny_base.mentions import TokenizedText
+
+
+def test_texts_speak_of_the_last_name_and_letter(processor) -> None:
+    text = (
+        "Prediction: The red metal cube will be left of the blue metal cube. It is so.\n"
+        "Candidate analysis: Candidate B shows the red metal cube near the top."
+    )
+    ids = processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+    tokenized = TokenizedText(text, processor.tokenizer)
+    mentions = [*tokenized.mentions()]
+    assert len(tokenized) == len(ids)
+    decode = processor.tokenizer.decode
+    assert [decode(ids[m.last : m.stop]).split()[1:] for m in mentions] == [
+        ["will", "be", "left", "of", "the"],
+        [],
+        ["near", "the", "top"],
+    ]
+    assert [(m.section, m.letter) for m in mentions] == [
+        ("Prediction", None),
+        ("Prediction", None),
+        ("Candidate analysis", "B"),
+    ]
+    assert decode(ids[mentions[2].letter_at]).strip() == "B"
+    for m in mentions:
+        assert decode(ids[m.first : m.last + 1]).strip() == m.name
+
+
+def test_outcomes_refer_to_the_candidates_that_agree(processor) -> None:
+    text = (
+        "Candidate analysis: Candidate A shows the red metal cube near the top, and agrees. "
+        "Candidate B lacks the red metal cube. Candidate C shows the red metal cube near the left, "
+        "not near the top. Candidate D shows the red metal cube near the top, and agrees.\n"
+        "Outcome: Candidates A and D agree."
+    )
+    ids = processor.tokenizer(text, add_special_tokens=False)["input_ids"]
+    decode = processor.tokenizer.decode
+    verdicts = [*TokenizedText(text, processor.tokenizer).verdicts()]
+    assert [decode(ids[at]).strip() for at, _ in verdicts] == ["A", "D"]
+    for (_, agrees), letter in zip(verdicts, "AD", strict=True):
+        before = decode(ids[: agrees + 1])
+        assert before[before.rindex("Candidate ") :].startswith(f"Candidate {letter} shows")
+
+
+def test_places_in_candidates_are_compared_with_the_predicted_ones(processor) -> None:
+    text = TokenizedText(
+        "Prediction: At the end, the red metal cube will be near the top-left. The gray metal cube "
+        "should be near the top. The gray metal cube will be left of the red metal cube.\n"
+        "Candidate analysis: Candidate A shows the red metal cube near the top, not near the "
+        "top-left. Candidate B shows the gray metal cube near the top, and agrees. Candidate C "
+        "shows the red metal cube near the left and agrees with the prediction.\n"
+        "Candidate A does not match: it shows the red metal cube near the center, not near the "
+        "top.",
+        processor.tokenizer,
+    )
+    ends = [text.token_at(m.end() - 1) for m in re.finditer("near the [a-z-]+", text.text)]
+    commas = [text.token_at(m.start()) for m in re.finditer(", not", text.text)]
+    # The gray cube has two predictions.
+    assert [*text.comparisons()] == [
+        (ends[2], ends[0]), (commas[0], ends[0]),
+        (ends[5], ends[0]),
+        (ends[6], ends[0]), (commas[1], ends[0]),
+    ]  # fmt: skip
