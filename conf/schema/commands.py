@@ -15,7 +15,7 @@ from conf.schema.settings import Settings, check_run, setting
 from conf.schema.training import BaseTrainConfig, ContrastiveTrainConfig, SftTrainConfig
 
 PARALLEL_BACKENDS = ("loky", "ray")
-BASE_LAYERS, BASE_HEADS = 6, 5
+BASE_LAYERS, BASE_HEADS = 6, 6
 """Minimum numbers of language layers and of attention heads of a base that `train.base` trains: its
 targets refer to the first six layers, and to one head for the clip and one for each candidate."""
 

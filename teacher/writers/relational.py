@@ -179,12 +179,12 @@ class RelationalWriter(Writer):
         facts = {o.object: o for o in view.objects}
         if s.kind == "sight":
             return f"shows the {s.objects[0]}, which should not be seen"
-        for name in s.objects:
-            if facts[name].target_sight != "shown":
-                return f"lacks the {name}"
+        unseen = [name for name in s.objects if facts[name].target_sight != "shown"]
         if s.kind == "region":
-            actual = facts[s.objects[0]].target_region
+            actual = "out of sight" if unseen else facts[s.objects[0]].target_region
             return f"shows the {s.objects[0]} {actual}, not {s.value}"
+        if unseen:
+            return f"shows the {unseen[0]} out of sight"
         if actual := find_topic(s, view.relations):
             wanted = f", not {self.place(s, pronoun=True)}" if s.kind in SYMMETRIC else ""
             return f"shows {self.shown(actual)}{wanted}"

@@ -14,11 +14,14 @@ from teacher.predicates.relations import Bounds
 from train.common.held_out import check_not_empty, held_out_scenes
 from train.student.dataset import prompt_corpus, uses_only
 from train.student.lazy_samples import seeded_rng
-from train.tiny_base.questions import KINDS, QUESTIONS, Question
+from train.tiny_base.questions import KINDS, QUESTIONS, WITHOUT_PICTURES, Question
 from train.tiny_base.samples import OracleSample, make_sample
 
 SILENT = Question("", "")
 """The question of the stages without words."""
+TEXT_FACTOR = 3
+"""How many times as many questions without pictures as others a step asks; they take about a third
+of the time."""
 CORPUS_ITEMS = 800
 """Number of items whose texts the tokenizer is trained on."""
 
@@ -53,13 +56,15 @@ class ItemSampler:
     seed: int
 
     def batch(self, stage: str, step: int, size: int) -> list[OracleSample]:
-        """Return the samples of a step. All ask the same kind of question, so that they show the
-        same number of pictures."""
+        """Return the samples of a step, `size` of them if they show pictures. All ask the same kind
+        of question, so that they show the same number of pictures."""
         samples = []
+        kind = [*KINDS][step % len(KINDS)] if stage == "words" else None
+        if kind in WITHOUT_PICTURES:
+            size *= TEXT_FACTOR
         for position in range(step * size, (step + 1) * size):
             epoch, index = divmod(position, len(self.items))
             order = seeded_rng(self.seed, stage, epoch).permutation(len(self.items))
-            kind = [*KINDS][step % len(KINDS)] if stage == "words" else None
             samples.append(self.sample(self.items[order[index]], kind, f"{stage} {epoch}"))
         return samples
 

@@ -19,12 +19,13 @@ picture. The heads are linear, so the base itself has to represent what they pre
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
 at the tower's output and motion in the middle layers. Further losses teach attention heads where
 to look: at a token of a text, the two tokens before it (layer `PRECEDING`); at a visual token of a
-candidate, the same object at the end of the clip (layer `TRACKING`); at an object's name in a text,
-the object in each picture (layer `NAMING`); after a name, this name and the letter of the candidate
-that the text speaks of, before a name that is repeated, its last mention, and after an object's
-place in a candidate, its predicted place (layer `RECALLING`); before a letter in an outcome, the
-word that says that this candidate agrees, and before a name in a scene parse, the object (layer
-`SPEAKING`).
+candidate, the letter of the candidate (layer `PRECEDING`) and the same object at the end of the
+clip (layer `TRACKING`); at an object's name in a text, the letter of the candidate that the text
+speaks of (layer `TRACKING`), the object in each picture, and the object in the picture that the
+text speaks of (layer `NAMING`); after a name, this name, before a name that is repeated, its last
+mention, and after an object's place in a candidate, its predicted place if both are the same (layer
+`RECALLING`); before a letter in an outcome, the word that says that this candidate agrees, and
+before a name in a scene parse, the object (layer `SPEAKING`).
 """
 
 from __future__ import annotations
@@ -76,20 +77,26 @@ class OracleTargets:
         names: (M, 2) row and position of a name's last token.
         named: (M,) the named object's colour, material and shape, by kind.
         found: (M, PICTURES) token of the named object in each picture, or -1.
+        shown: (_, 3) row, position of a name, and token of the object in the picture that the text
+            speaks of.
         places: (M, 2 * PICTURES) its places relative to the centre of each picture, NaN where it is
             not visible.
         future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
         spoken: (S, 2) row and position of the tokens from each name to the next.
         spoken_state: (S, 4) place and velocity of the object there, or NaN.
         subjects: (_, 3) row, position after a name, and position of the name.
-        letters: (_, 3) row, position that speaks of a candidate, and position of its letter.
+        letters: (_, 3) row, position of a name where the text speaks of a candidate, and position
+            of the candidate's letter in the text.
+        labels: (_, 3) row, position of a visual token of a candidate, and position of its letter
+            in the prompt.
         repeats: (_, 3) row, position before a name that the text has mentioned before, and position
             of the first token of its last mention.
         preceding: (_, 2) row and position of the tokens of texts.
         verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
             of the word that says that the candidate agrees.
         comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
-            and position of the end of the predicted place of the same object.
+            and position of the end of the predicted place of the same object if both are the same,
+            otherwise of the word "shows".
         following: (_, 3) row, position before the first mention of an object in a scene parse, and
             token of the object at the end of the clip.
     """
@@ -103,12 +110,14 @@ class OracleTargets:
     names: Tensor
     named: dict[str, Tensor]
     found: Tensor
+    shown: Tensor
     places: Tensor
     future: Tensor
     spoken: Tensor
     spoken_state: Tensor
     subjects: Tensor
     letters: Tensor
+    labels: Tensor
     repeats: Tensor
     preceding: Tensor
     verdicts: Tensor
@@ -279,13 +288,16 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
 
     At a token of a text, heads 0 and 1 of layer `PRECEDING` find the token before it and the one
     before that, without which later layers cannot find what followed an earlier use of the same
-    words. At a visual token, head 0 of layer `TRACKING` finds the object at the end of the clip. At
-    a name, head k of layer `NAMING` finds the object in picture k. After a name, heads 0 and 1 of
-    layer `RECALLING` find this name and the letter of the candidate; before a repeated name, head 2
-    finds its last mention; after the place of an object in a candidate, head 3 finds its predicted
-    place. Before a letter in an outcome, head 0 of layer `SPEAKING` finds the word that says that
-    the candidate agrees; before the first mention of an object in a scene parse, head 1 finds the
-    object at the end of the clip.
+    words. At a visual token of a candidate, head 2 of layer `PRECEDING` finds the letter of the
+    candidate, without which a text that speaks of a candidate cannot find its visual tokens, and
+    head 0 of layer `TRACKING` finds the object at the end of the clip. At a name, head 1 of layer
+    `TRACKING` finds the letter of the candidate that the text speaks of; head k of layer `NAMING`
+    finds the object in picture k, and the head after these the object in the picture that the text
+    speaks of. After a name, head 0 of layer `RECALLING` finds this name; before a repeated name,
+    head 1 finds its last mention; after the place of an object in a candidate, head 2 finds its
+    predicted place if both are the same, otherwise the word "shows". Before a letter in an outcome,
+    head 0 of layer `SPEAKING` finds the word that says that the candidate agrees; before the first
+    mention of an object in a scene parse, head 1 finds the object at the end of the clip.
     """
     losses = {}
     row, start, end = targets.tracked.T
@@ -302,13 +314,17 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     before, second_before = (torch.stack([row, position, position - k], dim=1) for k in (1, 2))
     row, query, token = targets.following.T
     following = torch.stack([row, query, targets.visual[row, token]], dim=1)
+    row, query, token = targets.shown.T
+    shown = torch.stack([row, query, targets.visual[row, token]], dim=1)
     for name, layer, head, pairs in (
         ("before", PRECEDING, 0, before),
         ("second before", PRECEDING, 1, second_before),
+        ("label", PRECEDING, 2, targets.labels),
+        ("letter", TRACKING, 1, targets.letters),
+        ("find shown", NAMING, PICTURES, shown),
         ("subject", RECALLING, 0, targets.subjects),
-        ("letter", RECALLING, 1, targets.letters),
-        ("repeat", RECALLING, 2, targets.repeats),
-        ("comparison", RECALLING, 3, targets.comparisons),
+        ("repeat", RECALLING, 1, targets.repeats),
+        ("comparison", RECALLING, 2, targets.comparisons),
         ("verdict", SPEAKING, 0, targets.verdicts),
         ("following", SPEAKING, 1, following),
     ):

@@ -35,10 +35,11 @@ PREDICTED = re.compile(
 )
 """Matches a sentence that says where an object will be."""
 CLAIMED = re.compile(
-    rf"(?:[Cc]andidate \w|it) shows the (?P<name>{NAME.pattern}) (?P<place>[^.]+?)"
-    r"(?P<comma>,?)(?= not |,? and agrees| but |,? and not | and the |\.)"
+    rf"(?:[Cc]andidate \w|it) (?P<verb>shows) the (?P<name>{NAME.pattern}) (?P<place>[^.]+?)"
+    r"(?P<comma>,?)(?=(?P<agrees>,? and agrees| and the )| not | but |,? and not |\.)"
 )
-"""Matches what a text says that a candidate shows of an object."""
+"""Matches what a text says that a candidate shows of an object. The group `agrees` matches if it
+was predicted."""
 PREDICTION = re.compile("Prediction:")
 
 
@@ -111,9 +112,10 @@ class TokenizedText:
 
     def comparisons(self) -> Iterator[tuple[int, int]]:
         """Yield the index of the last token of each place that a candidate is said to show, also of
-        a comma after it, and that of the last token of the place that the same object was predicted
-        to have: after these tokens, the text says whether both are the same. Objects with several
-        predictions are left out."""
+        a comma after it, and an index that says whether the place was predicted: that of the last
+        token of the predicted place if both are the same, otherwise that of the word "shows". After
+        these tokens, the text says whether both are the same. Objects with several predictions are
+        left out."""
         predicted: dict[str, list[int]] = {}
         for event in self._find(PREDICTION, PREDICTED, CLAIMED):
             if event.re is PREDICTION:
@@ -123,9 +125,10 @@ class TokenizedText:
             if event.re is PREDICTED:
                 predicted.setdefault(event["name"], []).append(last)
             elif len(places := predicted.get(event["name"], [])) == 1:
-                yield last, places[0]
+                key = places[0] if event["agrees"] else self.token_at(event.start("verb"))
+                yield last, key
                 if event["comma"]:
-                    yield self.token_at(event.start("comma")), places[0]
+                    yield self.token_at(event.start("comma")), key
 
     def _find(self, *patterns: re.Pattern[str]) -> list[re.Match[str]]:
         """Return the matches of all patterns in the order of the text."""

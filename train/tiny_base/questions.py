@@ -8,12 +8,14 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     describe   where each candidate shows each object, and how they lie to each other
     compare    for each of two statements, which candidates agree with it
     explain    the steps of a rationale about a statement that is true of the target
+    match      as `compare`, without any picture
     narrate    a whole rationale with its answer, without any picture
 
 None of them is the selection task: no answer about pictures says which candidate is the target.
 Statements about pictures are chosen at random, not because they decide the item; those of `explain`
-are true of at least two candidates. `narrate` teaches the language of rationales, in both
-vocabularies, and how an answer follows from what a text says of the candidates.
+are true of at least two candidates. `match` teaches to compare what a text says of a candidate with
+what it has predicted. `narrate` teaches the language of rationales, in both vocabularies, and how
+an answer follows from what a text says of the candidates.
 """
 
 from __future__ import annotations
@@ -46,8 +48,9 @@ EXPLAIN = (
     "Check a prediction step by step: scene parse, motion analysis, prediction, candidate analysis "
     "and outcome. Then say of each candidate, in a line of its own, whether it matches and why."
 )
+MATCH = "Write examples of candidates that are compared with predictions."
 NARRATE = "Write an example of a rationale."
-QUESTIONS = (PARSE, PREDICT, DESCRIBE, COMPARE, EXPLAIN, NARRATE)
+QUESTIONS = (PARSE, PREDICT, DESCRIBE, COMPARE, EXPLAIN, MATCH, NARRATE)
 FULL = Detail(parsed=6, analysed=4, predicted=6, pairs=2, relations=2)
 SPARSE = Detail(parsed=3, analysed=2, predicted=1, pairs=1)
 PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
@@ -168,6 +171,11 @@ def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
     return Question(EXPLAIN, "\n".join(lines))
 
 
+def match(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+    """Ask for comparisons as in `compare`. No picture is shown."""
+    return replace(compare(p, item, rng), text=MATCH, clip=False, candidates=False)
+
+
 def narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for a rationale, in one of the vocabularies, and its answer. No picture is shown."""
     predicates = p if rng.random() < 0.5 else p.without_relations()
@@ -180,8 +188,9 @@ def narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
 MakeQuestion = Callable[[RelationalPredicates, SelectionItem, np.random.Generator], Question]
 KINDS: dict[str, MakeQuestion] = {
     "parse": parse, "predict": predict, "describe": describe, "compare": compare,
-    "explain": explain, "narrate": narrate,
+    "explain": explain, "match": match, "narrate": narrate,
 }  # fmt: skip
+WITHOUT_PICTURES = ("match", "narrate")
 
 
 def make_statement_writer(

@@ -100,6 +100,7 @@ class OracleCollator:
         media = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
         visual = torch.isin(ids, media).nonzero()[:, 1].reshape(len(samples), -1)
         grid = round((visual.shape[1] // max(samples[0].sample.pictures, 1)) ** 0.5)
+        labels = [*self._find_labels(ids, visual, samples, grid)]
         texts = [TokenizedText(s.sample.response or "", self._processor.tokenizer) for s in samples]
         # The token that ends the turn follows the response.
         starts = [ids.shape[1] - len(text) - 1 for text in texts]
@@ -124,8 +125,21 @@ class OracleCollator:
             for k in range(len(text))
         ]
         return batch, stack_samples(
-            samples, mentions, verdicts, comparisons, preceding, visual, grid
+            samples, mentions, labels, verdicts, comparisons, preceding, visual, grid
         )
+
+    def _find_labels(
+        self, ids: Tensor, visual: Tensor, samples: Sequence[OracleSample], grid: int
+    ) -> Iterator[tuple[int, int, int]]:
+        """Yield the row and the position of each visual token of a candidate, and the position of
+        the letter before the candidate."""
+        encode = self._processor.tokenizer.encode
+        letters = [encode(f" {letter}", add_special_tokens=False)[0] for letter in LETTERS]
+        for row, sample in enumerate(samples if grid else ()):
+            tokens = visual[row].reshape(-1, grid**2)
+            for letter, picture in zip(letters, tokens[sample.last + 1 :], strict=False):
+                before = (ids[row, : picture[0]] == letter).nonzero()
+                yield from ((row, int(token), int(before[-1])) for token in picture)
 
 
 @dataclass(frozen=True)
@@ -139,6 +153,7 @@ class LocatedMention:
         state: Place (from -0.5 to 0.5) and velocity of the object in the picture that the text
             speaks of; NaN where the oracle does not determine them.
         letter_at: Position of the letter of the candidate that the text speaks of, if any.
+        picture: Index in `PICTURES` of the picture that the text speaks of.
         found: Visual token of the object in each of `PICTURES`, or -1.
         places: The object's places in these pictures, NaN where it is not visible.
         future: Its displacement to the moment that the item asks for, or NaN.
@@ -152,6 +167,7 @@ class LocatedMention:
     section: str | None
     state: tuple[float, ...]
     letter_at: int | None
+    picture: int
     found: tuple[int, ...]
     places: tuple[float, ...]
     future: tuple[float, float]
@@ -173,6 +189,7 @@ def locate_mentions(
             m.section,
             spoken_state(sample, shown, m),
             None if m.letter_at is None else start + m.letter_at,
+            0 if m.letter is None else 1 + LETTERS.index(m.letter),
             tuple(t.token(grid) if t else -1 for t in pictures),
             tuple(x for t in pictures for x in (t.place if t else UNKNOWN)),
             sample.future.get(m.name, UNKNOWN),
@@ -182,6 +199,7 @@ def locate_mentions(
 def stack_samples(
     samples: Sequence[OracleSample],
     mentions: Sequence[LocatedMention],
+    labels: list[tuple[int, int, int]],
     verdicts: list[tuple[int, int, int]],
     comparisons: list[tuple[int, int, int]],
     preceding: list[tuple[int, int]],
@@ -191,7 +209,7 @@ def stack_samples(
     """Return the targets of a batch.
 
     Args:
-        verdicts, comparisons, preceding: See `OracleTargets`.
+        labels, verdicts, comparisons, preceding: See `OracleTargets`.
         visual: (B, T) positions of the visual tokens, grid x grid for each picture.
     """
     objects = [
@@ -218,20 +236,19 @@ def stack_samples(
         names=integers([(m.row, m.position) for m in mentions], 2),
         named=name_words([m.name for m in mentions]),
         found=integers([m.found for m in mentions], PICTURES),
+        shown=integers(
+            [(m.row, m.position, m.found[m.picture]) for m in mentions if m.found[m.picture] >= 0],
+            3,
+        ),
         places=torch.tensor([m.places for m in mentions]).reshape(-1, 2 * PICTURES) - 0.5,
         future=torch.tensor([m.future for m in mentions]).reshape(-1, 2),
         spoken=integers([(m.row, k) for m in mentions for k in m.spoken], 2),
         spoken_state=torch.tensor([m.state for m in mentions for _ in m.spoken]).reshape(-1, 4),
         subjects=integers([(m.row, k, m.position) for m in mentions for k in m.spoken[1:]], 3),
         letters=integers(
-            [
-                (m.row, k, m.letter_at)
-                for m in mentions
-                if m.letter_at is not None
-                for k in m.spoken
-            ],
-            3,
+            [(m.row, m.position, m.letter_at) for m in mentions if m.letter_at is not None], 3
         ),
+        labels=integers(labels, 3),
         repeats=integers([*find_repeats(mentions)], 3),
         preceding=integers(preceding, 2),
         verdicts=integers(verdicts, 3),

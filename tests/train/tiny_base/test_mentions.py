@@ -35,8 +35,9 @@ def test_texts_speak_of_the_last_name_and_letter(processor) -> None:
 def test_outcomes_refer_to_the_candidates_that_agree(processor) -> None:
     text = (
         "Candidate analysis: Candidate A shows the red metal cube near the top, and agrees. "
-        "Candidate B lacks the red metal cube. Candidate C shows the red metal cube near the left, "
-        "not near the top. Candidate D shows the red metal cube near the top, and agrees.\n"
+        "Candidate B shows the red metal cube out of sight. Candidate C shows the red metal cube "
+        "near the left, not near the top. Candidate D shows the red metal cube near the top, and "
+        "agrees.\n"
         "Outcome: Candidates A and D agree."
     )
     ids = processor.tokenizer(text, add_special_tokens=False)["input_ids"]
@@ -54,16 +55,17 @@ def test_places_in_candidates_are_compared_with_the_predicted_ones(processor) ->
         "should be near the top. The gray metal cube will be left of the red metal cube.\n"
         "Candidate analysis: Candidate A shows the red metal cube near the top, not near the "
         "top-left. Candidate B shows the gray metal cube near the top, and agrees. Candidate C "
-        "shows the red metal cube near the left and agrees with the prediction.\n"
+        "shows the red metal cube near the top-left and agrees with the prediction.\n"
         "Candidate A does not match: it shows the red metal cube near the center, not near the "
         "top.",
         processor.tokenizer,
     )
     ends = [text.token_at(m.end() - 1) for m in re.finditer("near the [a-z-]+", text.text)]
+    shows = [text.token_at(m.start()) for m in re.finditer("shows", text.text)]
     commas = [text.token_at(m.start()) for m in re.finditer(", not", text.text)]
     # The gray cube has two predictions.
     assert [*text.comparisons()] == [
-        (ends[2], ends[0]), (commas[0], ends[0]),
+        (ends[2], shows[0]), (commas[0], shows[0]),
         (ends[5], ends[0]),
-        (ends[6], ends[0]), (commas[1], ends[0]),
+        (ends[6], shows[3]), (commas[1], shows[3]),
     ]  # fmt: skip

@@ -13,7 +13,7 @@ from data.records import LETTERS, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from teacher.predicates.motion import find_cut, motion_start
-from train.tiny_base.data import ItemSampler
+from train.tiny_base.data import TEXT_FACTOR, ItemSampler
 from train.tiny_base.heads import (
     PICTURES,
     SCALES,
@@ -34,7 +34,7 @@ from train.tiny_base.oracle_targets import (
     most_visible_per_token,
     observed_states,
 )
-from train.tiny_base.questions import KINDS
+from train.tiny_base.questions import KINDS, WITHOUT_PICTURES
 from train.tiny_base.samples import (
     OracleCollator,
     OracleSample,
@@ -81,14 +81,14 @@ def collate(processor) -> OracleCollator:
     return OracleCollator(processor, 1500)
 
 
-@pytest.fixture(params=[PICTURES, 1], ids=["", "grouped"])
+@pytest.fixture(params=[PICTURES + 1, 1], ids=["", "grouped"])
 def deep_model(model, request: pytest.FixtureRequest):
     """A model with enough layers for all targets, without and with grouped-query attention."""
     from models.tiny_qwen3_vl import build_model
     from tests.tiny_models import SMALL
 
     model = build_model(
-        replace(SMALL, layers=SPEAKING + 1, heads=PICTURES, kv_heads=request.param),
+        replace(SMALL, layers=SPEAKING + 1, heads=PICTURES + 1, kv_heads=request.param),
         model.config.text_config.vocab_size,
     )
     return model.eval()
@@ -202,11 +202,38 @@ def test_scene_parses_refer_to_the_object_that_they_name_next(sampler, collate) 
         assert targets.found[positions[row, name], 0] == token
 
 
+def test_pictures_refer_to_the_letters_of_their_candidates(sampler, collate, processor) -> None:
+    samples = [sampler.sample(item, "describe", "test") for item in sampler.items[:3]]
+    samples += [sampler.sample(sampler.items[3], "explain", "test")]
+    for some in (samples[:3], samples[3:]):
+        batch, targets = collate(some)
+        assert len(targets.labels) == len(some) * 4 * GRID**2
+        for row, token, letter in targets.labels.tolist():
+            picture = targets.visual[row].tolist().index(token) // GRID**2 - some[row].last - 1
+            text = processor.tokenizer.decode(batch["input_ids"][row, letter - 1 : letter + 1])
+            assert text == f"Candidate {LETTERS[picture]}"
+
+
+def test_names_refer_to_the_picture_that_the_text_speaks_of(sampler, collate, processor) -> None:
+    samples = [sampler.sample(item, "explain", "test") for item in sampler.items[:8]]
+    batch, targets = collate(samples)
+    letters = {(row, at): letter for row, at, letter in targets.letters.tolist()}
+    names = {(row, at): m for m, (row, at) in enumerate(targets.names.tolist())}
+    assert len(letters) > 20
+    assert len(targets.shown) > 40
+    for row, at, token in targets.shown.tolist():
+        picture = 0
+        if letter := letters.get((row, at)):
+            word = processor.tokenizer.decode(batch["input_ids"][row, letter]).strip()
+            picture = 1 + LETTERS.index(word)
+        assert token == targets.found[names[row, at], picture]
+
+
 def test_texts_without_pictures_have_losses(sampler, collate, deep_model, heads) -> None:
     batch, targets = collate([sampler.sample(i, "narrate", "test") for i in sampler.items[:3]])
     losses = words_losses(deep_model, heads, batch, targets)
     assert {"words", "spelled color", "verdict", "repeat"} <= losses.keys()
-    assert not {"color", "place", "named places", "find 0"} & losses.keys()
+    assert not {"color", "place", "named places", "find 0", "label", "find shown"} & losses.keys()
     assert sum(losses.values()).isfinite()
 
 
@@ -364,7 +391,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
         "before", "second before", "track", *(f"find {k}" for k in range(PICTURES)), "subject",
-        "letter", "repeat", "verdict", "comparison",
+        "find shown", "label", "letter", "repeat", "verdict", "comparison",
     }  # fmt: skip
     assert not any(loss.item() for loss in losses.values())
 
@@ -392,3 +419,9 @@ def test_samples_depend_on_seed_and_step_only(sampler: ItemSampler) -> None:
         s.sample.sample_id for k in range(len(sampler.items)) for s in sampler.batch("motion", k, 1)
     ]
     assert sorted(epoch) == sorted(item.item_id for item in sampler.items)
+
+
+def test_steps_ask_more_questions_without_pictures(sampler: ItemSampler) -> None:
+    for step, kind in enumerate(KINDS):
+        expected = 2 * TEXT_FACTOR if kind in WITHOUT_PICTURES else 2
+        assert len(sampler.batch("words", step, 2)) == expected
