@@ -146,3 +146,14 @@ def run_command(command: Sequence[str]) -> None:
     done = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"error: {' '.join(command)} failed:\n{done.stderr[-2000:]}")
+
+
+def print_header(*titles: object) -> None:
+    """Print the header of a Markdown table, after an empty line."""
+    print()
+    print_row(*titles)
+    print("|---" * len(titles) + "|")
+
+
+def print_row(*cells: object) -> None:
+    print("| " + " | ".join(map(str, cells)) + " |", flush=True)

@@ -27,6 +27,8 @@ from benchmarks.experiments.experiment import (
     Job,
     create_parser,
     open_benchmark,
+    print_header,
+    print_row,
 )
 from conf.compose import compose
 from conf.files import read_json_lines
@@ -256,16 +258,6 @@ def print_claims(table: pd.DataFrame) -> None:
                 cells.append(f"{claims / len(rows):.1f}, {share}")
             shares = (rows.follows.astype(float), rows.true_reasons.astype(float))
             print_row(name, *cells, *(f"{100 * share.mean():.1f}" for share in shares))
-
-
-def print_header(*titles: str) -> None:
-    print()
-    print_row(*titles)
-    print("|---" * len(titles) + "|")
-
-
-def print_row(*cells: str) -> None:
-    print("| " + " | ".join(cells) + " |", flush=True)
 
 
 def credit_matrix(table: pd.DataFrame, variant: str, mode: str) -> pd.DataFrame:

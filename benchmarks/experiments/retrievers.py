@@ -1,77 +1,102 @@
-"""Compares ways to train the tiny retriever on the small benchmark: with in-batch negatives only,
-with same-scene hard negatives, and with late interaction; three seeds each, at every width.
+"""Compares ways to train the tiny retriever: over the tiny base, from random weights, and both of
+their variations; three seeds each.
 
     python -m benchmarks.experiments.retrievers            # train and evaluate what is missing
     python -m benchmarks.experiments.retrievers --table    # print the recorded results
 
-Results are recorded in `ranks.parquet`, one row per run and width. The table has means over the
-seeds, each with the smallest and the largest value. It also has variants whose settings no longer
-exist: `hard-scenes` (batches composed scene by scene), `masked` (the same, with near-identical
-frames masked) and `mined` (negatives mined during training).
+`--benchmark tiny_balanced` compares them on balanced items. Results are recorded in
+`ranks.parquet`, one row per run, width and builder. The tables have means over the seeds, each with
+the smallest and the largest value: all queries at every width, and Recall@10 at full width by
+builder.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from benchmarks.experiments.experiment import Experiment, Job, create_parser
+from benchmarks.experiments.experiment import (
+    Experiment,
+    Job,
+    create_parser,
+    print_header,
+    print_row,
+)
+from conf.compose import compose
+from conf.schema import ContrastiveCommand
+from data.tracks.selection.distractors import BUILDERS_VERSION
 from evaluation.metrics.results import RetrievalResult, from_json
+from models.fingerprints import settings_key, weights_digest
 
 RANKS = Path(__file__).with_name("ranks.parquet")
 VARIANTS: dict[str, list[str]] = {
-    "in-batch": ["train.hard_negatives=0"],
-    "hard": [],
-    "late": ["+exp=late_interaction"],
+    "over the base": [],
+    "over the base, in-batch negatives": ["train.hard_negatives=0"],
+    "over the base, late interaction": ["+exp=late_interaction"],
+    "from random weights": ["retriever=tiny_scratch"],
 }
 """Overrides of `train.contrastive`, which by default uses one hard negative per query."""
+UNTRAINED = "untrained base"
 MEASURES = {"recall@1": 1, "recall@10": 1, "recall@50": 1, "mrr": 3, "median_rank": 1}
 """The printed measures and their decimals; recalls are in percent."""
 
 
 def main() -> None:
-    args = create_parser(__doc__, "small", RANKS).parse_args()
-    identity = {"benchmark": args.benchmark}
+    args = create_parser(__doc__, "tiny", RANKS).parse_args()
+    preset = compose("train.contrastive", ContrastiveCommand, [f"benchmark={args.benchmark}"])
+    groups = {name: asdict(getattr(preset, name)) for name in ("retriever", "train", "benchmark")}
+    # Results of other settings, another base or other items are not reused.
+    identity = {
+        "benchmark": args.benchmark,
+        "base": weights_digest(preset.retriever.model),
+        "settings": settings_key(groups | {"builders": BUILDERS_VERSION}),
+    }
     experiment = Experiment(args, identity, "variant", "train.contrastive", "evaluation.retrieve")
 
     def evaluate(job: Job) -> list[dict[str, Any]]:
         variant, seed = job
-        name, training = f"{args.benchmark}-{variant}-{seed}", [*VARIANTS[variant], f"seed={seed}"]
-        return read_ranks(experiment.train_and_evaluate(name, training))
+        words = variant.replace(",", "").replace(" ", "_")
+        name = f"{args.benchmark}-{identity['settings'][:8]}-{words}-{seed}"
+        return read_ranks(experiment.train_and_evaluate(name, [*VARIANTS[variant], f"seed={seed}"]))
 
     jobs = [(variant, seed) for seed, variant in product(range(args.seeds), VARIANTS)]
-    print_table(experiment.run(jobs, evaluate))
+    print_tables(experiment.run(jobs, evaluate))
 
 
 def read_ranks(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of a run: its results at each width over the queries of all builders."""
+    """Return the rows of a run: its results at each width, by builder and over all queries."""
     report = json.loads((folder / "report.json").read_text())
     results = from_json(list[RetrievalResult], report["rows"])
     return [
         {
-            "untrained": result.untrained, "width": result.width,
+            "untrained": result.untrained, "width": result.width, "builder": result.builder,
             **{name: result.measures[name].value for name in MEASURES},
             "queries": result.queries, "frames": result.frames, "bytes": result.bytes,
             "seconds": result.seconds,
         }
         for result in results
-        if result.builder is None
     ]  # fmt: skip
 
 
-def print_table(table: pd.DataFrame) -> None:
-    # Every run also measures the untrained retriever. It is the same in all of them: print it once.
-    untrained = table[table.untrained & (table.variant == "in-batch") & (table.seed == 0)]
-    trained = table[~table.untrained]
-    print("| negatives | width | " + " | ".join(MEASURES) + " |\n" + "|---" * 7 + "|")
-    for name, rows in [("untrained", untrained), *trained.groupby("variant", sort=False)]:
-        for width, same in rows.groupby("width", sort=False):
-            cells = [summarize(same[measure], measure) for measure in MEASURES]
-            print(f"| {name} | {width} | " + " | ".join(cells) + " |", flush=True)
+def print_tables(table: pd.DataFrame) -> None:
+    # Every run also measures its model before the training, which is the same for all seeds.
+    first = next(iter(VARIANTS))
+    untrained = table[table.untrained & (table.variant == first) & (table.seed == 0)]
+    groups = [(UNTRAINED, untrained), *table[~table.untrained].groupby("variant", sort=False)]
+    print_header("retriever", "width", *MEASURES)
+    for name, rows in groups:
+        for width, same in rows[rows.builder.isna()].groupby("width", sort=False):
+            print_row(name, str(width), *(summarize(same[m], m) for m in MEASURES))
+    print_header("Recall@10 by builder", *sorted(table.builder.dropna().astype(int).unique()))
+    for name, rows in groups:
+        widest = rows[(rows.width == rows.width.max()) & rows.builder.notna()]
+        by_builder = widest.groupby("builder")["recall@10"]
+        print_row(name, *(summarize(values, "recall@10") for _, values in by_builder))
 
 
 def summarize(values: pd.Series, measure: str) -> str:

@@ -49,11 +49,7 @@ from train.retriever.batches import QueryBatchSampler
 from train.retriever.run import build_trainer
 from train.retriever.trainer import NUMBER, numbered_rows
 
-TINY = [
-    "retriever=tiny", "retriever.architecture=null", "retriever.model=checkpoints/bases/tiny",
-    "retriever.lora.rank=16", "retriever.image_size=128", "retriever.max_length=2048",
-    "retriever.widths=[192,128,64,32]", "train.mini_batch=16",
-]  # fmt: skip
+TINY = ["retriever=tiny", "train.mini_batch=16", "train.reuse_features=false"]
 
 
 @dataclass(frozen=True)

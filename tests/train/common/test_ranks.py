@@ -103,7 +103,7 @@ def plan_retriever(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]
     )
     command = [
         *(["+exp=late_interaction", f"retriever.late.width={late.width}"] if late else []),
-        "retriever=tiny",
+        "retriever=tiny_scratch",
         *model,
         *overrides(settings, folder),
         f"retriever.image_size={retriever.image_size}",
