@@ -120,9 +120,12 @@ def test_overrides_and_overlays_replace_the_recipe():
 
 def test_retriever_preset_sets_its_training_recipe():
     tiny = compose_line("python -m train.contrastive")
+    scratch = compose_line("python -m train.contrastive retriever=tiny_scratch")
     paper = compose_line("python -m train.contrastive retriever=qwen3_vl_emb_8b")
-    assert (tiny.train.batch, tiny.train.lr, tiny.retriever.widths[0]) == (64, 1.5e-3, 128)
-    assert tiny.retriever.architecture.vocabulary == 1024
+    assert (tiny.train.batch, tiny.train.lr, tiny.retriever.widths[0]) == (64, 2e-3, 192)
+    assert (tiny.retriever.model, tiny.retriever.architecture) == ("checkpoints/bases/tiny", None)
+    assert (scratch.train.batch, scratch.train.lr, scratch.retriever.widths[0]) == (64, 1.5e-3, 128)
+    assert scratch.retriever.architecture.vocabulary == 1024
     assert (paper.train.batch, paper.train.mini_batch, paper.train.lr) == (512, 8, 2e-5)
 
 
