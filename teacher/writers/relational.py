@@ -42,8 +42,7 @@ def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> Re
     return replace(
         p,
         objects=tuple(o for o in p.objects if o.object in kept),
-        # Without any, the writer would deny that there are collision courses.
-        courses=tuple(m for m in p.courses if kept.issuperset(m.objects)) or p.courses,
+        courses=tuple(m for m in p.courses if kept.issuperset(m.objects)),
         contacts=tuple(m for m in p.contacts if kept.issuperset(m.objects)),
         close=tuple(c for c in p.close if kept.issuperset(c.objects)),
     )
@@ -74,6 +73,7 @@ class RelationalWriter(Writer):
         # The objects of the deciding statements come first in every section.
         self.ranked = sorted(self.ranked, key=lambda o: o.object not in named)
         self.view_of = {view.letter: view for view in facts.views}
+        self.all_courses_left_out = bool(facts.courses) and not self.facts.courses
 
     def orient(self, relation: Relation) -> Relation:
         """Make the more relevant of two objects the subject of a relation."""
@@ -129,6 +129,9 @@ class RelationalWriter(Writer):
 
     def scene_parse(self) -> list[str]:
         parts = super().scene_parse()
+        if self.all_courses_left_out:
+            # "No pair is on a collision course" would be false.
+            parts.pop()
         now = [find_topic(s, self.facts.observed) for s in self.statements]
         parts += [self.statement(s, "is") for s in now if s is not None][: self.detail.relations]
         return parts

@@ -13,9 +13,11 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
 
 None of them is the selection task: no answer about pictures says which candidate is the target.
 Statements about pictures are chosen at random, not because they decide the item; those of `explain`
-are true of at least two candidates. `match` teaches to compare what a text says of a candidate with
-what it has predicted. `narrate` teaches the language of rationales, in both vocabularies, and how
-an answer follows from what a text says of the candidates.
+are true of at least two candidates. Of a few statements, the one that fewest candidates agree with
+is chosen: if most agreed, copying the prediction would describe most candidates. `match` teaches to
+compare what a text says of a candidate with what it has predicted. `narrate` teaches the language
+of rationales, in both vocabularies, and how an answer follows from what a text says of the
+candidates.
 """
 
 from __future__ import annotations
@@ -56,6 +58,8 @@ SPARSE = Detail(parsed=3, analysed=2, predicted=1, pairs=1)
 PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
 """Maximum numbers of relations in a prediction and about each candidate, and of statements that are
 compared with all candidates."""
+CHOICES = 4
+"""Number of statements of which the one that fewest candidates agree with is chosen."""
 
 WEIGHTS = {
     "region": 8, "gap": 4, "side": 2, "height": 2, "nearer": 2, "sight": 1, "between": 1,
@@ -84,8 +88,7 @@ class Question:
 
 def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the scene at the end of the clip, and for the motion."""
-    p = leave_out_unseen(p)
-    statements = sample_statements(p, p.target, rng, FULL.relations)
+    statements = sample_statements(leave_out_unseen(p), p.target, rng, FULL.relations)
     writer = make_statement_writer(p, item, rng, statements)
     answer = (
         f"Scene parse: {join_sentences(writer.scene_parse())}\n"
@@ -96,10 +99,9 @@ def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator
 
 def predict(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the place of each object at the target, and for relations."""
-    p = leave_out_unseen(p)
     writer = make_statement_writer(p, item, rng)
     parts = [writer.expected(o) for o in writer.order(writer.ranked)]
-    relations = sample_statements(p, p.target, rng, PREDICTED, without=PLACES)
+    relations = sample_statements(writer.facts, p.target, rng, PREDICTED, without=PLACES)
     parts += [writer.statement(s, "will be") for s in relations]
     parts[0] = f"{p.moment}, {parts[0]}"
     return Question(PREDICT, f"Prediction: {join_sentences(parts)}", candidates=False)
@@ -128,21 +130,21 @@ def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Genera
 
 
 def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
-    """Ask which candidates agree with statements, each true of some candidate and, if possible, not
-    of all."""
+    """Ask which candidates agree with statements, each true of some candidate and chosen by
+    `choose_decisive`."""
     blocks: dict[Relation, str] = {}  # by normalized statement
     for k in rng.permutation(len(p.views))[:COMPARED]:
         options = sample_statements(p, p.views[k], rng, 12)
         options = [s for s in options if normalize_relation(s) not in blocks]
-        options = [s for s in options if len(agreeing(p, [s])) < len(p.views)] or options
         if not options:
             continue
-        writer = make_statement_writer(p, item, rng, options[:1])
+        statement = choose_decisive(p, options)
+        writer = make_statement_writer(p, item, rng, [statement])
         parts = [f"candidate {view.letter} {judge(writer, view)}" for view in p.views]
-        blocks[normalize_relation(options[0])] = (
+        blocks[normalize_relation(statement)] = (
             f"Prediction: {join_sentences([writer.statement(writer.statements[0], 'will be')])}\n"
             f"Candidate analysis: {join_sentences(parts)}\n"
-            f"Outcome: {join_sentences([name_agreeing(p, options[:1])])}"
+            f"Outcome: {join_sentences([name_agreeing(p, [statement])])}"
         )
     return Question(COMPARE, "\n".join(blocks.values()), foresees=False)
 
@@ -150,8 +152,7 @@ def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
 def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the steps of a rationale, with statements that are true of the target and of another
     candidate; for the first two steps if there are none."""
-    p = leave_out_unseen(p)
-    statements = sample_shared_statements(p, rng)
+    statements = sample_shared_statements(leave_out_unseen(p), rng)
     if not statements:
         return replace(parse(p, item, rng), text=EXPLAIN, candidates=True)
     writer = make_statement_writer(p, item, rng, statements, SPARSE)
@@ -254,12 +255,21 @@ def sample_statements(
 
 
 def sample_shared_statements(p: RelationalPredicates, rng: np.random.Generator) -> list[Relation]:
-    """Sample one or two statements that are true of the target and of another candidate, if
-    possible not of all candidates. The list is empty if there are none."""
+    """Sample one or two statements that are true of the target and of another candidate, the first
+    chosen by `choose_decisive`. The list is empty if there are none."""
     options = sample_statements(p, p.target, rng, 12)
     shared = [s for s in options if len(agreeing(p, [s])) > 1]
-    first = ([s for s in shared if len(agreeing(p, [s])) < len(p.views)] or shared)[:1]
-    if not first or rng.random() < 0.6:
+    if not shared:
+        return []
+    first = [choose_decisive(p, shared)]
+    if rng.random() < 0.6:
         return first
     second = [s for s in shared if s not in first and len(agreeing(p, [*first, s])) > 1]
     return first + second[:1]
+
+
+def choose_decisive(p: RelationalPredicates, statements: Sequence[Relation]) -> Relation:
+    """Return the statement that fewest candidates agree with, of the first `CHOICES` that not all
+    candidates agree with; the first statement if there are none."""
+    ranked = [s for s in statements if len(agreeing(p, [s])) < len(p.views)] or statements
+    return min(ranked[:CHOICES], key=lambda s: len(agreeing(p, [s])))
