@@ -1,5 +1,5 @@
-"""Compares ways to train the tiny retriever: over the tiny base, from random weights, and both of
-their variations; three seeds each.
+"""Compares ways to train the tiny retriever: over the tiny base (also with in-batch negatives only,
+and with late interaction) and from random weights; three seeds each.
 
     python -m benchmarks.experiments.retrievers            # train and evaluate what is missing
     python -m benchmarks.experiments.retrievers --table    # print the recorded results
@@ -61,7 +61,9 @@ def main() -> None:
     def evaluate(job: Job) -> list[dict[str, Any]]:
         variant, seed = job
         words = variant.replace(",", "").replace(" ", "_")
-        name = f"{args.benchmark}-{identity['settings'][:8]}-{words}-{seed}"
+        # Runs over another base are not reused.
+        versions = f"{identity['base'][:8]}-{identity['settings'][:8]}"
+        name = f"{args.benchmark}-{versions}-{words}-{seed}"
         return read_ranks(experiment.train_and_evaluate(name, [*VARIANTS[variant], f"seed={seed}"]))
 
     jobs = [(variant, seed) for seed, variant in product(range(args.seeds), VARIANTS)]
@@ -91,7 +93,7 @@ def print_tables(table: pd.DataFrame) -> None:
     print_header("retriever", "width", *MEASURES)
     for name, rows in groups:
         for width, same in rows[rows.builder.isna()].groupby("width", sort=False):
-            print_row(name, str(width), *(summarize(same[m], m) for m in MEASURES))
+            print_row(name, width, *(summarize(same[m], m) for m in MEASURES))
     print_header("Recall@10 by builder", *sorted(table.builder.dropna().astype(int).unique()))
     for name, rows in groups:
         widest = rows[(rows.width == rows.width.max()) & rows.builder.notna()]

@@ -271,5 +271,5 @@ def sample_shared_statements(p: RelationalPredicates, rng: np.random.Generator) 
 def choose_decisive(p: RelationalPredicates, statements: Sequence[Relation]) -> Relation:
     """Return the statement that fewest candidates agree with, of the first `CHOICES` that not all
     candidates agree with; the first statement if there are none."""
-    ranked = [s for s in statements if len(agreeing(p, [s])) < len(p.views)] or statements
-    return min(ranked[:CHOICES], key=lambda s: len(agreeing(p, [s])))
+    divisive = [s for s in statements if len(agreeing(p, [s])) < len(p.views)]
+    return min((divisive or statements)[:CHOICES], key=lambda s: len(agreeing(p, [s])))

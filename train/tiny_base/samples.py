@@ -153,7 +153,8 @@ class LocatedMention:
         state: Place (from -0.5 to 0.5) and velocity of the object in the picture that the text
             speaks of; NaN where the oracle does not determine them.
         letter_at: Position of the letter of the candidate that the text speaks of, if any.
-        picture: Index in `PICTURES` of the picture that the text speaks of.
+        picture: Index of the picture that the text speaks of: 0 for the last one of the clip, 1 to
+            4 for the candidates.
         found: Visual token of the object in each of `PICTURES`, or -1.
         places: The object's places in these pictures, NaN where it is not visible.
         future: Its displacement to the moment that the item asks for, or NaN.
