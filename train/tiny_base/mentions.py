@@ -35,7 +35,8 @@ PREDICTED = re.compile(
 )
 """Matches a sentence that says where an object will be."""
 CLAIMED = re.compile(
-    rf"(?:[Cc]andidate \w|it) (?P<verb>shows) the (?P<name>{NAME.pattern}) (?P<place>[^.]+?)"
+    rf"(?:[Cc]andidate \w|it) (?P<verb>shows) the (?P<name>{NAME.pattern}) "
+    rf"(?P<place>between [^.]+? and the (?:{NAME.pattern})|[^.]+?)"
     r"(?P<comma>,?)(?=(?P<agrees>,? and agrees| and the )| not | but |,? and not |\.)"
 )
 """Matches what a text says that a candidate shows of an object. The group `agrees` matches if it

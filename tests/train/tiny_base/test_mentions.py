@@ -69,3 +69,23 @@ def test_places_in_candidates_are_compared_with_the_predicted_ones(processor) ->
         (ends[5], ends[0]),
         (ends[6], shows[3]), (commas[1], shows[3]),
     ]  # fmt: skip
+
+
+def test_a_place_between_two_objects_ends_after_both(processor) -> None:
+    place = "between the blue metal cube and the green metal cube"
+    text = TokenizedText(
+        f"Prediction: At the end, the red metal cube will be {place}.\n"
+        f"Candidate analysis: Candidate A shows the red metal cube {place}, and agrees. Candidate "
+        f"B shows the red metal cube {place} and agrees with the prediction. Candidate C shows "
+        f"the red metal cube left of the blue metal cube, not {place}.",
+        processor.tokenizer,
+    )
+    ends = [text.token_at(m.end() - 1) for m in re.finditer(place, text.text)]
+    left = text.token_at(text.text.index(", not") - 1)
+    shows = [text.token_at(m.start()) for m in re.finditer("shows", text.text)]
+    commas = [text.token_at(m.start()) for m in re.finditer(", and agrees|, not", text.text)]
+    assert [*text.comparisons()] == [
+        (ends[1], ends[0]), (commas[0], ends[0]),
+        (ends[2], ends[0]),
+        (left, shows[2]), (commas[1], shows[2]),
+    ]  # fmt: skip
