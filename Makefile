@@ -46,11 +46,11 @@ $(VLLM_READY): teacher/vllm_cpu/constraints.txt | $(READY)
 	@touch $(VLLM_READY)
 
 run: setup ## Train and evaluate the tiny student and the tiny retriever
-	$(BIN)/python -m train.sft +exp=cot
-	$(BIN)/python -m evaluation.select model=checkpoints/sft/exp-cot
-	$(BIN)/python -m train.contrastive
-	$(BIN)/python -m evaluation.retrieve model=checkpoints/contrastive/default
-	$(BIN)/python -m evaluation.report
+	$(PY) train.sft +exp=cot $(NARRATOR) run=exp-cot
+	$(PY) evaluation.select model=checkpoints/sft/exp-cot
+	$(PY) train.contrastive
+	$(PY) evaluation.retrieve model=checkpoints/contrastive/default
+	$(PY) evaluation.report
 
 # The target `experiments` runs the paper's experiments. Its variables are empty or set here for
 # `paper-tiny`, which uses the commands' default presets (tiny); the lines `paper:` below set them for
@@ -62,6 +62,7 @@ CONTROLS := candidate_only shuffled_prefix matched_anchor
 RUNS := exp-
 RETRIEVER_RUN := default
 SUITES := standin_movi_a standin_physion
+NARRATOR := teacher.predicates=relational
 # No record mode: the tiny base was not trained to write the structured record.
 ZERO_SHOT := modes=[reasoning,answer]
 # The tiny matcher is the trained retriever, because an untrained one cannot match texts to frames.
