@@ -20,8 +20,8 @@ from train.tiny_base.samples import OracleSample, make_sample
 SILENT = Question("", "")
 """The question of the stages without words."""
 TEXT_FACTOR = 3
-"""How many times as many questions without pictures as others a step asks; they take about a third
-of the time."""
+"""A step whose question shows no picture has this many times as many samples. Such a sample takes
+about a third of the time of one with pictures."""
 CORPUS_ITEMS = 800
 """Number of items whose texts the tokenizer is trained on."""
 
@@ -39,7 +39,7 @@ def split_items(
         if extract_predicates(item, frames.scene(item.scene_id), frames.scene) is not None
     ]
     training = [item for item in items if uses_only(item, training_scenes)]
-    # Distractors of other scenes may be of training scenes; such items measure nothing held out.
+    # A distractor may show another scene: an item that shows both kinds of scenes is left out.
     validation = [item for item in items if uses_only(item, held_out)]
     check_not_empty(len(training), "training items")
     check_not_empty(len(validation), "items of held-out training scenes")

@@ -1,14 +1,14 @@
 """Generate answers of the tiny base, and compare their claims with the oracle.
 
-generated_name/parse       share of the names in answers to `parse` that an object of the scene
-                           has
-generated_color/parse      share of the names whose colour is that of the object with which the
-                           name shares most words; likewise for material and shape
-generated_named/parse      share of the objects named in the true answers to `parse` that the
-                           generated ones name too
-generated_region/predict   share of the claims about regions in answers to `predict` that the
-                           oracle supports, of those that it can decide; likewise for other
-                           kinds of claims
+generated_name_precision/parse   share of the names in answers to `parse` that an object of the
+                                 scene has
+generated_color/parse            share of the names whose colour is that of the object with which
+                                 the name shares most words; likewise for material and shape
+generated_name_recall/parse      share of the objects named in the true answers to `parse` that the
+                                 generated ones name too
+generated_region/predict         share of the claims about regions in answers to `predict` that the
+                                 oracle supports, of those that it can decide; likewise for other
+                                 kinds of claims
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def measure_generated_answers(
             texts = generate(model, processor, collate(samples), limit, precision)
             for (item, question), text in zip(asked, texts, strict=True):
                 names = set(NAME.findall(text.text))
-                found[f"generated_named/{kind}"] += [
+                found[f"generated_name_recall/{kind}"] += [
                     name in names for name in set(NAME.findall(question.answer))
                 ]
                 for name, right in _read(section + text.text, item, kind, sampler):
@@ -83,7 +83,7 @@ def _read(
         # The object with most words in common is the one that is meant.
         closest = max(objects, key=lambda o: sum(a == b for a, b in zip(o, said, strict=True)))
         equal = [a == b for a, b in zip(closest, said, strict=True)]
-        read += [*zip(WORDS, equal, strict=True), ("name", all(equal))]
+        read += [*zip(WORDS, equal, strict=True), ("name_precision", all(equal))]
     return read
 
 

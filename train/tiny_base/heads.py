@@ -12,20 +12,13 @@ picture. The heads are linear, so the base itself has to represent what they pre
                in "seen", so that attention can compare a name with visual tokens
     "named"    names of objects in a text after the layer `NAMING`: in which pictures the object is
                visible and where, and its displacement up to the moment that the item asks for
-    "spoken"   every token of a text from a name to the next name or letter or the end of the
-               sentence, after the layer `SPEAKING`: place and velocity of the named object in the
-               picture that the text speaks of there
+    "spoken"   tokens from the end of a name until the text names another object, candidate or
+               section, or the sentence ends, after the layer `SPEAKING`: place and velocity of the
+               named object in the picture that the text describes there
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
-at the tower's output and motion in the middle layers. Further losses teach attention heads where
-to look: at a token of a text, the two tokens before it (layer `PRECEDING`); at a visual token of a
-candidate, the letter of the candidate (layer `PRECEDING`) and the same object at the end of the
-clip (layer `TRACKING`); at an object's name in a text, the letter of the candidate that the text
-speaks of (layer `TRACKING`), the object in each picture, and the object in the picture that the
-text speaks of (layer `NAMING`); after a name, this name, before a name that is repeated, its last
-mention, and after an object's place in a candidate, its predicted place if both are the same (layer
-`RECALLING`); before a letter in an outcome, the word that says that this candidate agrees, and
-before a name in a scene parse, the object (layer `SPEAKING`).
+at the tower's output and motion in the middle layers. Further losses train attention heads to
+attend to given tokens (`pointing_losses`).
 """
 
 from __future__ import annotations
@@ -58,7 +51,8 @@ SCALES = {"place": 3.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(DISPLACEME
 BEND = 0.1
 """Scaled error above which the loss of a place or displacement is linear."""
 MOVING = 0.012
-"""An object moves if its velocity, as a share of the image in 10 frames, is above this."""
+"""An object moves if its velocity, as a share of the image in 10 frames, is above this. Measures of
+displacements leave out objects that are displaced by less."""
 
 
 @dataclass(frozen=True)
@@ -75,23 +69,24 @@ class OracleTargets:
         inside: (N, 2) place in the token, from -0.5 to 0.5, or beyond at the border of the picture.
         tracked: (K, 3) row, token of a candidate, and token of the same object in the clip.
         names: (M, 2) row and position of a name's last token.
-        named: (M,) the named object's colour, material and shape, by kind.
+        name_words: (M,) the named object's colour, material and shape, by kind.
         found: (M, PICTURES) token of the named object in each picture, or -1.
         shown: (_, 3) row, position of a name, and token of the object in the picture that the text
             speaks of.
         places: (M, 2 * PICTURES) its places relative to the centre of each picture, NaN where it is
             not visible.
         future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
-        spoken: (S, 2) row and position of the tokens from each name to the next.
+        spoken: (S, 2) row and position of the tokens that describe a named object, from the end of
+            its name on.
         spoken_state: (S, 4) place and velocity of the object there, or NaN.
         subjects: (_, 3) row, position after a name, and position of the name.
-        letters: (_, 3) row, position of a name where the text speaks of a candidate, and position
-            of the candidate's letter in the text.
-        labels: (_, 3) row, position of a visual token of a candidate, and position of its letter
-            in the prompt.
+        text_letters: (_, 3) row, position of a name where the text speaks of a candidate, and
+            position of the candidate's letter in the text.
+        prompt_letters: (_, 3) row, position of a visual token of a candidate, and position of its
+            letter in the prompt.
         repeats: (_, 3) row, position before a name that the text has mentioned before, and position
             of the first token of its last mention.
-        preceding: (_, 2) row and position of the tokens of texts.
+        text_tokens: (_, 2) row and position of the tokens of texts.
         verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
             of the word that says that the candidate agrees.
         comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
@@ -108,7 +103,7 @@ class OracleTargets:
     inside: Tensor
     tracked: Tensor
     names: Tensor
-    named: dict[str, Tensor]
+    name_words: dict[str, Tensor]
     found: Tensor
     shown: Tensor
     places: Tensor
@@ -116,10 +111,10 @@ class OracleTargets:
     spoken: Tensor
     spoken_state: Tensor
     subjects: Tensor
-    letters: Tensor
-    labels: Tensor
+    text_letters: Tensor
+    prompt_letters: Tensor
     repeats: Tensor
-    preceding: Tensor
+    text_tokens: Tensor
     verdicts: Tensor
     comparisons: Tensor
     following: Tensor
@@ -150,7 +145,7 @@ class OracleHeads(nn.Module):
 
         self.seen = heads({"presence": 1, "inside": 2, "shift": 2, "place": 2})
         self.known = heads({"place": 2, "moving": 1} | dict.fromkeys(DISPLACEMENTS, 2))
-        self.named = heads({"shown": PICTURES, "places": 2 * PICTURES, "future": 2})
+        self.named = heads({"visible": PICTURES, "places": 2 * PICTURES, "future": 2})
         self.spoken = heads({"place": 2, "velocity": 2})
         self.norms = nn.ModuleDict(
             {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled", "spoken")}
@@ -226,7 +221,7 @@ class OracleHeads(nn.Module):
         found["place_error"] = (read["place"] - truth["place"]).norm(dim=1)
         for name in (*AHEADS, "since"):
             distances = truth[name].norm(dim=1)
-            # An image has no velocity; an object may have moved since the clip.
+            # Objects in images have no velocity, so `since` is filtered by its own length.
             displaced = moves & ~distances.isnan() if name != "since" else distances > MOVING
             found[f"{name}_error"] = (read[name] - truth[name]).norm(dim=1)[displaced]
             found[f"{name}_still"] = distances[displaced]
@@ -237,7 +232,7 @@ class OracleHeads(nn.Module):
         row, at = targets.names.T
         spelled = self.norms["spelled"](hidden[row, at])
         return {
-            kind: cross_entropy(logits, targets.named[kind])
+            kind: cross_entropy(logits, targets.name_words[kind])
             for kind, logits in self.word_logits(spelled).items()
         }
 
@@ -245,16 +240,16 @@ class OracleHeads(nn.Module):
         """Return the losses at names in texts, from the output of the layer `NAMING`, (B, L, H)."""
         row, at = targets.names.T
         named = self.norms["named"](hidden[row, at])
-        shown = (targets.found >= 0).float()
+        visible = (targets.found >= 0).float()
         return {
-            "shown": binary_cross_entropy_with_logits(self.named["shown"](named), shown),
+            "visible": binary_cross_entropy_with_logits(self.named["visible"](named), visible),
             "places": distance(self.named["places"](named), targets.places, SCALES["place"]),
             "future": distance(self.named["future"](named), targets.future, SCALES["since"]),
         }
 
     def spoken_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
-        """Return the losses at the tokens from each name to the next, from the output of the layer
-        `SPEAKING`, (B, L, H)."""
+        """Return the losses at the tokens that describe a named object, from the output of the
+        layer `SPEAKING`, (B, L, H)."""
         row, at = targets.spoken.T
         spoken = self.norms["spoken"](hidden[row, at])
         truth = dict(zip(("place", "velocity"), targets.spoken_state.split(2, dim=1), strict=True))
@@ -283,21 +278,27 @@ class OracleHeads(nn.Module):
 
 
 def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
-    """Return the losses of the attention heads that find objects: the negative logarithm of the
-    attention weight on the object's token.
+    """Return the losses of attention heads: the negative logarithm of the attention weight from a
+    token to the token that it should attend to.
 
-    At a token of a text, heads 0 and 1 of layer `PRECEDING` find the token before it and the one
-    before that, without which later layers cannot find what followed an earlier use of the same
-    words. At a visual token of a candidate, head 2 of layer `PRECEDING` finds the letter of the
-    candidate, without which a text that speaks of a candidate cannot find its visual tokens, and
-    head 0 of layer `TRACKING` finds the object at the end of the clip. At a name, head 1 of layer
-    `TRACKING` finds the letter of the candidate that the text speaks of; head k of layer `NAMING`
-    finds the object in picture k, and the head after these the object in the picture that the text
-    speaks of. After a name, head 0 of layer `RECALLING` finds this name; before a repeated name,
-    head 1 finds its last mention; after the place of an object in a candidate, head 2 finds its
-    predicted place if both are the same, otherwise the word "shows". Before a letter in an outcome,
-    head 0 of layer `SPEAKING` finds the word that says that the candidate agrees; before the first
-    mention of an object in a scene parse, head 1 finds the object at the end of the clip.
+    loss           layer, head    from -> to
+    before         PRECEDING 0    token of a text -> the token before it
+    second before  PRECEDING 1    token of a text -> the second token before it
+    label          PRECEDING 2    visual token of a candidate -> its letter in the prompt
+    track          TRACKING 0     object in a candidate -> the same object at the end of the clip
+    letter         TRACKING 1     name in a text about a candidate -> the candidate's letter there
+    find k         NAMING k       name -> the object in picture k
+    find shown     NAMING 5       name -> the object in the picture that the text describes
+    subject        RECALLING 0    token that describes an object -> the object's name
+    repeat         RECALLING 1    token before a repeated name -> the name's last mention
+    comparison     RECALLING 2    end of a place in a candidate -> the end of the predicted place if
+                                  both are the same, otherwise the word "shows"
+    verdict        SPEAKING 0     token before a letter in an outcome -> "agrees" of this candidate
+    following      SPEAKING 1     token before a new name in a scene parse -> the object at the end
+                                  of the clip
+
+    The two preceding tokens allow later layers to find what followed an earlier use of the same
+    words. The letters allow a text about a candidate to find the candidate's visual tokens.
     """
     losses = {}
     row, start, end = targets.tracked.T
@@ -310,7 +311,7 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         if len(row):
             key = targets.visual[row, found[found >= 0]]
             losses[f"find {head}"] = -trace.log_attention(NAMING, head, row, query, key).mean()
-    row, position = targets.preceding.T
+    row, position = targets.text_tokens.T
     before, second_before = (torch.stack([row, position, position - k], dim=1) for k in (1, 2))
     row, query, token = targets.following.T
     following = torch.stack([row, query, targets.visual[row, token]], dim=1)
@@ -319,8 +320,8 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     for name, layer, head, pairs in (
         ("before", PRECEDING, 0, before),
         ("second before", PRECEDING, 1, second_before),
-        ("label", PRECEDING, 2, targets.labels),
-        ("letter", TRACKING, 1, targets.letters),
+        ("label", PRECEDING, 2, targets.prompt_letters),
+        ("letter", TRACKING, 1, targets.text_letters),
         ("find shown", NAMING, PICTURES, shown),
         ("subject", RECALLING, 0, targets.subjects),
         ("repeat", RECALLING, 1, targets.repeats),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from transformers import PreTrainedModel
 
 from train.tiny_base.heads import OracleHeads
+from train.tiny_base.samples import OracleCollator, OracleSample
 from train.tiny_base.trace import (
     MIDDLE,
     NAMING,
@@ -20,9 +20,6 @@ from train.tiny_base.trace import (
     trace_states,
 )
 
-if TYPE_CHECKING:
-    from train.tiny_base.samples import OracleCollator, OracleSample
-
 BATCH = 16
 
 
@@ -30,7 +27,7 @@ class Probe:
     """Measures a model and its heads on held-out samples.
 
     Args:
-        samples: Held-out samples without words.
+        samples: Held-out samples without a question.
         worded: Held-out samples by kind of question.
         word_ids: First tokens of words by kind of word.
         bf16: Whether the model computes in bf16.
@@ -57,7 +54,7 @@ class Probe:
         with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
             measures = self._read_heads(with_motion=stage != "eyes")
             if stage == "words":
-                measures |= self._follow_words()
+                measures |= self._measure_predicted_words()
         return measures
 
     def _read_heads(self, with_motion: bool) -> dict[str, float]:
@@ -74,7 +71,7 @@ class Probe:
                 found[name].append(values.float())
         return average(found)
 
-    def _follow_words(self) -> dict[str, float]:
+    def _measure_predicted_words(self) -> dict[str, float]:
         """Return the share of words of each kind that the model predicts, given the correct words
         before them, and the errors of what the heads read at names."""
         found: dict[str, list[Tensor]] = defaultdict(list)

@@ -58,6 +58,8 @@ SPARSE = Detail(parsed=3, analysed=2, predicted=1, pairs=1)
 PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
 """Maximum numbers of relations in a prediction and about each candidate, and of statements that are
 compared with all candidates."""
+OPTIONS = 12
+"""Number of statements that are sampled about a picture."""
 CHOICES = 4
 """Number of statements of which the one that fewest candidates agree with is chosen."""
 
@@ -76,18 +78,22 @@ class Question:
 
     Attributes:
         clip, candidates: Whether the prompt shows the clip, and the candidates.
-        foresees: Whether the answer's predictions are true of the target.
+        predicts_target: Whether the answer's predictions are true of the target.
     """
 
     text: str
     answer: str
     clip: bool = True
     candidates: bool = True
-    foresees: bool = True
+    predicts_target: bool = True
 
 
 def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
-    """Ask for the scene at the end of the clip, and for the motion."""
+    """Ask for the scene at the end of the clip, and for the motion.
+
+    Statements that are true of the target choose which objects and relations the answer mentions.
+    What it says of relations is true at the end of the clip.
+    """
     statements = sample_statements(leave_out_unseen(p), p.target, rng, FULL.relations)
     writer = make_statement_writer(p, item, rng, statements)
     answer = (
@@ -131,14 +137,14 @@ def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Genera
 
 def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask which candidates agree with statements, each true of some candidate and chosen by
-    `choose_decisive`."""
+    `choose_rarest`."""
     blocks: dict[Relation, str] = {}  # by normalized statement
     for k in rng.permutation(len(p.views))[:COMPARED]:
-        options = sample_statements(p, p.views[k], rng, 12)
+        options = sample_statements(p, p.views[k], rng, OPTIONS)
         options = [s for s in options if normalize_relation(s) not in blocks]
         if not options:
             continue
-        statement = choose_decisive(p, options)
+        statement = choose_rarest(p, options)
         writer = make_statement_writer(p, item, rng, [statement])
         parts = [f"candidate {view.letter} {judge(writer, view)}" for view in p.views]
         blocks[normalize_relation(statement)] = (
@@ -146,7 +152,7 @@ def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
             f"Candidate analysis: {join_sentences(parts)}\n"
             f"Outcome: {join_sentences([name_agreeing(p, [statement])])}"
         )
-    return Question(COMPARE, "\n".join(blocks.values()), foresees=False)
+    return Question(COMPARE, "\n".join(blocks.values()), predicts_target=False)
 
 
 def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
@@ -256,19 +262,19 @@ def sample_statements(
 
 def sample_shared_statements(p: RelationalPredicates, rng: np.random.Generator) -> list[Relation]:
     """Sample one or two statements that are true of the target and of another candidate, the first
-    chosen by `choose_decisive`. The list is empty if there are none."""
-    options = sample_statements(p, p.target, rng, 12)
+    chosen by `choose_rarest`. The list is empty if there are none."""
+    options = sample_statements(p, p.target, rng, OPTIONS)
     shared = [s for s in options if len(agreeing(p, [s])) > 1]
     if not shared:
         return []
-    first = [choose_decisive(p, shared)]
+    first = [choose_rarest(p, shared)]
     if rng.random() < 0.6:
         return first
     second = [s for s in shared if s not in first and len(agreeing(p, [*first, s])) > 1]
     return first + second[:1]
 
 
-def choose_decisive(p: RelationalPredicates, statements: Sequence[Relation]) -> Relation:
+def choose_rarest(p: RelationalPredicates, statements: Sequence[Relation]) -> Relation:
     """Return the statement that fewest candidates agree with, of the first `CHOICES` that not all
     candidates agree with; the first statement if there are none."""
     divisive = [s for s in statements if len(agreeing(p, [s])) < len(p.views)]

@@ -51,7 +51,7 @@ class OracleSample:
             describe.
         future: Displacements of objects, by name, from the end of the clip to the moment that the
             item asks for.
-        foresees: Whether predictions in the response are true of that moment.
+        predicts_target: Whether predictions in the response are true of that moment.
     """
 
     sample: Sample
@@ -59,7 +59,7 @@ class OracleSample:
     last: int
     observed: Mapping[str, tuple[float, ...]]
     future: Mapping[str, tuple[float, float]]
-    foresees: bool
+    predicts_target: bool
 
 
 def make_sample(
@@ -84,7 +84,7 @@ def make_sample(
             parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
     parts.append(f"\n{question.text}")
     sample = conversation(item.item_id, parts, question.answer, clip)
-    return OracleSample(sample, tuple(targets), last, observed, future, question.foresees)
+    return OracleSample(sample, tuple(targets), last, observed, future, question.predicts_target)
 
 
 class OracleCollator:
@@ -100,35 +100,26 @@ class OracleCollator:
         media = torch.tensor([self._processor.image_token_id, self._processor.video_token_id])
         visual = torch.isin(ids, media).nonzero()[:, 1].reshape(len(samples), -1)
         grid = round((visual.shape[1] // max(samples[0].sample.pictures, 1)) ** 0.5)
-        labels = [*self._find_labels(ids, visual, samples, grid)]
         texts = [TokenizedText(s.sample.response or "", self._processor.tokenizer) for s in samples]
-        # The token that ends the turn follows the response.
-        starts = [ids.shape[1] - len(text) - 1 for text in texts]
-        mentions = [
-            mention
-            for row, s in enumerate(samples)
-            for mention in locate_mentions(s, texts[row], row, starts[row], grid)
-        ]
-        verdicts = [
-            (row, start + letter - 1, start + agrees)
-            for row, (text, start) in enumerate(zip(texts, starts, strict=True))
-            for letter, agrees in text.verdicts()
-        ]
-        comparisons = [
-            (row, start + claimed, start + predicted)
-            for row, (text, start) in enumerate(zip(texts, starts, strict=True))
-            for claimed, predicted in text.comparisons()
-        ]
-        preceding = [
-            (row, start + k)
-            for row, (text, start) in enumerate(zip(texts, starts, strict=True))
-            for k in range(len(text))
-        ]
-        return batch, stack_samples(
-            samples, mentions, labels, verdicts, comparisons, preceding, visual, grid
-        )
+        mentions: list[LocatedMention] = []
+        pairs: dict[str, list[tuple[int, ...]]] = {
+            "prompt_letters": [*self._find_letters(ids, visual, samples, grid)],
+            "text_tokens": [], "verdicts": [], "comparisons": [],
+        }  # fmt: skip
+        for row, (sample, text) in enumerate(zip(samples, texts, strict=True)):
+            # The token that ends the turn follows the response.
+            start = ids.shape[1] - len(text) - 1
+            mentions += locate_mentions(sample, text, row, start, grid)
+            pairs["text_tokens"] += [(row, start + k) for k in range(len(text))]
+            pairs["verdicts"] += [
+                (row, start + letter - 1, start + agrees) for letter, agrees in text.verdicts()
+            ]
+            pairs["comparisons"] += [
+                (row, start + shown, start + predicted) for shown, predicted in text.comparisons()
+            ]
+        return batch, stack_samples(samples, mentions, pairs, visual, grid)
 
-    def _find_labels(
+    def _find_letters(
         self, ids: Tensor, visual: Tensor, samples: Sequence[OracleSample], grid: int
     ) -> Iterator[tuple[int, int, int]]:
         """Yield the row and the position of each visual token of a candidate, and the position of
@@ -148,7 +139,7 @@ class LocatedMention:
 
     Attributes:
         row, first, position: Row of the batch, and positions of the name's first and last token.
-        spoken: Positions from the name's last token to the next name.
+        spoken: Positions of the tokens that describe the object, from the name's last token on.
         section: Title of the section of the rationale; None before the first.
         state: Place (from -0.5 to 0.5) and velocity of the object in the picture that the text
             speaks of; NaN where the oracle does not determine them.
@@ -200,17 +191,14 @@ def locate_mentions(
 def stack_samples(
     samples: Sequence[OracleSample],
     mentions: Sequence[LocatedMention],
-    labels: list[tuple[int, int, int]],
-    verdicts: list[tuple[int, int, int]],
-    comparisons: list[tuple[int, int, int]],
-    preceding: list[tuple[int, int]],
+    pairs: Mapping[str, list[tuple[int, ...]]],
     visual: Tensor,
     grid: int,
 ) -> OracleTargets:
     """Return the targets of a batch.
 
     Args:
-        labels, verdicts, comparisons, preceding: See `OracleTargets`.
+        pairs: Further rows and positions, by attribute of `OracleTargets`.
         visual: (B, T) positions of the visual tokens, grid x grid for each picture.
     """
     objects = [
@@ -235,7 +223,7 @@ def stack_samples(
         inside=scaled - scaled.floor().clamp(0, grid - 1) - 0.5,
         tracked=integers([*track_objects(samples, objects, grid)], 3),
         names=integers([(m.row, m.position) for m in mentions], 2),
-        named=name_words([m.name for m in mentions]),
+        name_words=name_words([m.name for m in mentions]),
         found=integers([m.found for m in mentions], PICTURES),
         shown=integers(
             [(m.row, m.position, m.found[m.picture]) for m in mentions if m.found[m.picture] >= 0],
@@ -246,14 +234,14 @@ def stack_samples(
         spoken=integers([(m.row, k) for m in mentions for k in m.spoken], 2),
         spoken_state=torch.tensor([m.state for m in mentions for _ in m.spoken]).reshape(-1, 4),
         subjects=integers([(m.row, k, m.position) for m in mentions for k in m.spoken[1:]], 3),
-        letters=integers(
+        text_letters=integers(
             [(m.row, m.position, m.letter_at) for m in mentions if m.letter_at is not None], 3
         ),
-        labels=integers(labels, 3),
+        prompt_letters=integers(pairs["prompt_letters"], 3),
         repeats=integers([*find_repeats(mentions)], 3),
-        preceding=integers(preceding, 2),
-        verdicts=integers(verdicts, 3),
-        comparisons=integers(comparisons, 3),
+        text_tokens=integers(pairs["text_tokens"], 2),
+        verdicts=integers(pairs["verdicts"], 3),
+        comparisons=integers(pairs["comparisons"], 3),
         following=integers([*find_following(mentions)], 3),
     )
 
@@ -305,7 +293,7 @@ def spoken_state(
         place = seen.place if seen else UNKNOWN
     elif mention.section in ("Prediction", "Outcome"):
         now, moved = shown.get((sample.last, mention.name)), sample.future.get(mention.name)
-        if now and moved and sample.foresees:
+        if now and moved and sample.predicts_target:
             place = now.place[0] + moved[0], now.place[1] + moved[1]
     elif mention.name in sample.observed:
         state = sample.observed[mention.name]

@@ -45,8 +45,8 @@ class Trace:
         """Return the logarithms (K,) of the attention weights of a head between K pairs of
         positions in the rows `row` of the batch."""
         cosine, sine = self.rotary
-        # All pairs of positions from the first query on: gathering the keys of each pair of a text
-        # would copy them some hundred times.
+        # Compute all pairs from the first query on: gathering the keys of each pair would copy a
+        # key hundreds of times.
         start = int(query.min())
         heads, key_heads = self.queries[layer].shape[2], self.keys[layer].shape[2]
         key_head = head * key_heads // heads
@@ -60,7 +60,7 @@ class Trace:
         scores = (queries @ keys.mT).float() / math.sqrt(keys.shape[-1])
         position = torch.arange(keys.shape[1], device=keys.device)
         hidden = (position > position[start:, None]) | (self.mask[:, None] == 0)
-        # A position of the padding sees nothing; its weights are not asked for.
+        # Rows of padding are not masked: a row of -inf would give NaN. They are never read.
         hidden = hidden & (self.mask[:, start:, None] == 1)
         logarithms = scores.masked_fill(hidden, -torch.inf).log_softmax(dim=-1)
         return logarithms[row, query - start, key]

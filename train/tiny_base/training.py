@@ -1,6 +1,7 @@
 """Train the tiny base in stages: eyes, motion, words.
 
-    eyes     the vision tower alone learns to see the objects of single pictures
+    eyes     the vision tower, and the embeddings of the words for colours, materials and shapes,
+             learn to see the objects of single pictures
     motion   the whole model learns from clips and candidates where objects are and where they go
     words    the model learns to answer questions in words; the targets of both other stages remain
 
@@ -115,8 +116,8 @@ class BaseTrainer:
 
     Args:
         folder: The run's folder, for the checkpoint, the journal and the curves.
-        tokenizer: Digest of the tokenizer. Every start trains it on the texts of the recipe, so
-            another digest means another version of the recipe.
+        tokenizer_digest: Every start trains the tokenizer on the texts of the recipe, so another
+            digest means another version of the recipe.
     """
 
     def __init__(
@@ -128,11 +129,11 @@ class BaseTrainer:
         sampler: ItemSampler,
         probe: Probe,
         folder: Path,
-        tokenizer: str,
+        tokenizer_digest: str,
     ) -> None:
         self.cfg, self.model, self.heads = cfg, model, heads
         self.collate, self.sampler, self.probe, self.folder = collate, sampler, probe, folder
-        self.tokenizer = tokenizer
+        self.tokenizer_digest = tokenizer_digest
         self.stage, self.step = 0, 0
 
     def run(self) -> None:
@@ -205,7 +206,7 @@ class BaseTrainer:
         state = {
             "stage": self.stage,
             "step": self.step,
-            "tokenizer": self.tokenizer,
+            "tokenizer": self.tokenizer_digest,
             "model": self.model.state_dict(),
             "heads": self.heads.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -223,7 +224,7 @@ class BaseTrainer:
             journal.unlink(missing_ok=True)
             return
         state = torch.load(path, weights_only=True)
-        if state["tokenizer"] != self.tokenizer:
+        if state["tokenizer"] != self.tokenizer_digest:
             raise UserError(
                 f"{path} has another tokenizer: the texts of the recipe have changed since; "
                 "delete the run, or give run=NAME",

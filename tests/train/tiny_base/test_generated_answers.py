@@ -49,7 +49,7 @@ def test_true_answers_are_right_in_every_respect(measure) -> None:
     assert {
         "generated_region/predict",
         "generated_color/parse",
-        "generated_name/describe",
+        "generated_name_precision/describe",
     } <= measures.keys()
     assert {k: v for k, v in measures.items() if v < 1} == {}
 
@@ -58,12 +58,12 @@ def test_false_words_are_noticed(measure) -> None:
     metal = measure(lambda text: text.replace(" rubber ", " metal "))
     # Another object may have the false material, and then seems to be meant.
     assert metal["generated_material/parse"] < metal["generated_color/parse"]
-    assert metal["generated_name/parse"] < 0.8
+    assert metal["generated_name_precision/parse"] < 0.8
     regions = measure(lambda text: text.replace("near the ", "not near the "))
     assert regions["generated_region/predict"] == 0
 
 
 def test_objects_that_an_answer_lacks_are_noticed(measure) -> None:
     repeated = measure(lambda text: text.split(".")[0] + ".")
-    assert repeated["generated_named/parse"] < 0.8
-    assert repeated["generated_name/parse"] == 1
+    assert repeated["generated_name_recall/parse"] < 0.8
+    assert repeated["generated_name_precision/parse"] == 1

@@ -207,8 +207,8 @@ def test_pictures_refer_to_the_letters_of_their_candidates(sampler, collate, pro
     samples += [sampler.sample(sampler.items[3], "explain", "test")]
     for some in (samples[:3], samples[3:]):
         batch, targets = collate(some)
-        assert len(targets.labels) == len(some) * 4 * GRID**2
-        for row, token, letter in targets.labels.tolist():
+        assert len(targets.prompt_letters) == len(some) * 4 * GRID**2
+        for row, token, letter in targets.prompt_letters.tolist():
             picture = targets.visual[row].tolist().index(token) // GRID**2 - some[row].last - 1
             text = processor.tokenizer.decode(batch["input_ids"][row, letter - 1 : letter + 1])
             assert text == f"Candidate {LETTERS[picture]}"
@@ -217,7 +217,7 @@ def test_pictures_refer_to_the_letters_of_their_candidates(sampler, collate, pro
 def test_names_refer_to_the_picture_that_the_text_speaks_of(sampler, collate, processor) -> None:
     samples = [sampler.sample(item, "explain", "test") for item in sampler.items[:8]]
     batch, targets = collate(samples)
-    letters = {(row, at): letter for row, at, letter in targets.letters.tolist()}
+    letters = {(row, at): letter for row, at, letter in targets.text_letters.tolist()}
     names = {(row, at): m for m, (row, at) in enumerate(targets.names.tolist())}
     assert len(letters) > 20
     assert len(targets.shown) > 40
