@@ -25,6 +25,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from benchmarks.experiments.experiment import compose_benchmark, open_benchmark
+from conf.failures import report_failures
 from conf.schema import SftCommand, TeacherConfig
 from data.parallel import batched
 from data.records import FAMILIES, SelectionItem
@@ -77,8 +78,9 @@ def main() -> None:
             given = [end_after(truth[item.item_id], section) for item in batch]
             for item, letter in zip(batch, student.choose(batch, given), strict=True):
                 right[item.family].append(letter == item.letter)
-        shares = [100 * sum(values) / len(values) for values in right.values()]
-        cells = [f"{share:.1f}" for share in (*shares, sum(shares) / len(shares))]
+        shares = [100 * sum(values) / len(values) if values else None for values in right.values()]
+        macro = None if None in shares else sum(shares) / len(shares)
+        cells = ["-" if share is None else f"{share:.1f}" for share in (*shares, macro)]
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 
@@ -133,4 +135,5 @@ class Student:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

@@ -11,7 +11,7 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,13 @@ Job = tuple[str, int]
 def create_parser(description: str, benchmark: str, record: Path) -> argparse.ArgumentParser:
     """Return a parser with the options of every experiment, some with an experiment's defaults."""
     parser = argparse.ArgumentParser(description=description.partition("\n\n")[0])
-    parser.add_argument("--benchmark", default=benchmark)
-    parser.add_argument("--store", default="store")
-    parser.add_argument("--checkpoints", type=Path, default=Path("checkpoints"))
+    parser.add_argument("--benchmark", default=benchmark, help="name of a preset")
+    parser.add_argument("--store", default="store", help="folder of built benchmarks")
+    parser.add_argument(
+        "--checkpoints", type=Path, default=Path("checkpoints"), help="folder of runs"
+    )
     parser.add_argument("--record", type=Path, default=record, help="file of recorded results")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=3, help="number of seeds per variant")
     parser.add_argument("--table", action="store_true", help="only print the recorded results")
     return parser
 
@@ -44,7 +46,7 @@ class Experiment:
     args: argparse.Namespace
     """The parsed options of `create_parser`."""
     identity: dict[str, str]
-    """Columns that tell the rows of this experiment from other rows of the record, with values."""
+    """Columns and values that identify the rows of this experiment in the record."""
     variant_column: str
     """Name of the column with the variant."""
     trainer: str
@@ -126,6 +128,16 @@ class Experiment:
         return self.args.checkpoints / self.evaluator.partition(".")[2] / name
 
 
+def training_settings(command: str, schema: type, overrides: Sequence[str]) -> dict[str, Any]:
+    """Return the settings of a training that decide its result, apart from its seed."""
+    settings = asdict(compose(command, schema, overrides))
+    return {
+        name: settings[name]
+        for name in ("student", "retriever", "teacher", "train", "benchmark")
+        if name in settings
+    }
+
+
 def compose_benchmark(benchmark: str) -> BenchmarkConfig:
     """Return the settings of a preset."""
     return compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
@@ -137,15 +149,10 @@ def open_benchmark(store: Path, benchmark: str) -> Store:
 
 
 def run_command(command: Sequence[str]) -> None:
-    """Run `python -m` with a command, and wait until it ends.
-
-    Raises:
-        SystemExit: The command fails; the message holds the end of its standard error.
-    """
+    """Run `python -m` with a command, and exit if it fails."""
     print("python -m", *command, flush=True)
-    done = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True)
-    if done.returncode:
-        raise SystemExit(f"error: {' '.join(command)} failed:\n{done.stderr[-2000:]}")
+    if subprocess.run([sys.executable, "-m", *command]).returncode:
+        raise SystemExit(f"error: {' '.join(command)} failed, see above")
 
 
 def print_header(*titles: object) -> None:

@@ -7,9 +7,9 @@
 The built-in narrator writes rationales for the training items of a built benchmark, or they are
 read from a JSON lines file with the fields item_id, text and predicates. For each kind of word,
 such as speed, one word of each rationale is replaced by a false word, which is detected if the
-validator finds a contradicted claim in the changed text. The script prints the detected share of
-each kind, some of the undetected words, and the claims of the unchanged rationales by kind and
-verdict.
+validator finds a contradicted claim in the changed text. Rationales with a contradicted claim are
+left unchanged and counted. The script prints the detected share of each kind, some of the
+undetected words, and the claims of the unchanged rationales by kind and verdict.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from conf.failures import report_failures
 from data.records import COLORS, LETTERS
 from data.store import open_store
 from teacher.narrator import write_rationale
@@ -53,11 +54,15 @@ def main() -> None:
     results: dict[str, list[bool]] = defaultdict(list)
     misses: dict[str, list[str]] = defaultdict(list)
     claims: Counter[tuple[str, str]] = Counter()
+    rejected = 0
     bounds = Bounds() if args.predicates == "relational" else None
     for number, (item_id, text, predicates) in enumerate(read_rationales(args.source, bounds)):
         if number == args.limit:
             break
         claims.update((claim.kind, claim.verdict) for claim in extract_claims(text, predicates))
+        if is_contradicted(text, predicates):
+            rejected += 1
+            continue
         rng = Random(item_id)
         for kind, mutate in {**MUTATIONS, **RELATION_MUTATIONS}.items():
             options = list(mutate(text, predicates, rng))
@@ -73,6 +78,7 @@ def main() -> None:
         print(f"{kind:10} {share:7.2%} detected ({sum(detected)} of {len(detected)})")
         for miss in misses[kind][:MISSES_PRINTED]:
             print(f"    {miss}")
+    print(f"rationales with a contradicted claim: {rejected}")
     verdicts = ("supported", "contradicted", "unknown")
     print(f"{'claims':14}" + "".join(f"{verdict:>14}" for verdict in verdicts))
     for kind in sorted({kind for kind, _ in claims}):
@@ -263,4 +269,5 @@ RELATION_MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutat
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

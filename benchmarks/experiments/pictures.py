@@ -19,6 +19,7 @@ from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.experiments.experiment import open_benchmark
+from conf.failures import report_failures
 from conf.files import read_json_lines
 from data.records import LETTERS, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
@@ -200,4 +201,5 @@ def _join(sentences: Sequence[str]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,10 @@ from benchmarks.experiments.experiment import (
     open_benchmark,
     print_header,
     print_row,
+    training_settings,
 )
 from conf.compose import compose
+from conf.failures import report_failures
 from conf.files import read_json_lines
 from conf.schema import SftCommand
 from data.records import FAMILIES, SelectionItem
@@ -102,8 +104,11 @@ def main() -> None:
     base = weights_digest(preset.student.model)
     # Results of other settings, other items or other rationales are not reused.
     versions = {"builders": BUILDERS_VERSION, "narrator": NARRATOR_VERSION}
-    groups = {name: asdict(getattr(preset, name)) for name in ("student", "train", "benchmark")}
-    settings = settings_key(groups | versions)
+    variants = {
+        name: training_settings("train.sft", SftCommand, [*(v.training or ()), *overrides])
+        for name, v in VARIANTS.items()
+    }
+    settings = settings_key(variants | versions)
     identity = {"base": base, "benchmark": args.benchmark, "settings": settings}
     experiment = Experiment(args, identity, "variant", "train.sft", "evaluation.select")
 
@@ -317,4 +322,5 @@ class Resampling:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

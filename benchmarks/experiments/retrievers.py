@@ -13,7 +13,6 @@ builder.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,10 @@ from benchmarks.experiments.experiment import (
     create_parser,
     print_header,
     print_row,
+    training_settings,
 )
 from conf.compose import compose
+from conf.failures import report_failures
 from conf.schema import ContrastiveCommand
 from data.tracks.selection.distractors import BUILDERS_VERSION
 from evaluation.metrics.results import RetrievalResult, from_json
@@ -48,13 +49,17 @@ MEASURES = {"recall@1": 1, "recall@10": 1, "recall@50": 1, "mrr": 3, "median_ran
 
 def main() -> None:
     args = create_parser(__doc__, "tiny", RANKS).parse_args()
-    preset = compose("train.contrastive", ContrastiveCommand, [f"benchmark={args.benchmark}"])
-    groups = {name: asdict(getattr(preset, name)) for name in ("retriever", "train", "benchmark")}
+    benchmark = f"benchmark={args.benchmark}"
+    preset = compose("train.contrastive", ContrastiveCommand, [benchmark])
+    settings = {
+        name: training_settings("train.contrastive", ContrastiveCommand, [*variant, benchmark])
+        for name, variant in VARIANTS.items()
+    }
     # Results of other settings, another base or other items are not reused.
     identity = {
         "benchmark": args.benchmark,
         "base": weights_digest(preset.retriever.model),
-        "settings": settings_key(groups | {"builders": BUILDERS_VERSION}),
+        "settings": settings_key(settings | {"builders": BUILDERS_VERSION}),
     }
     experiment = Experiment(args, identity, "variant", "train.contrastive", "evaluation.retrieve")
 
@@ -112,4 +117,5 @@ def summarize(values: pd.Series, measure: str) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()
