@@ -39,7 +39,7 @@ def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
     frames = FrameReader(store, cfg.student.image_size)
     training, held_out = split_items(store, frames)
     sampler = ItemSampler(training, frames, cfg.student.frames, cfg.seed)
-    precision = resolve_precision(cfg.train.precision)
+    precision = resolve_precision(cfg.train.precision, on_cpu=True)
     cfg = replace(cfg, train=replace(cfg.train, precision=precision))
 
     log.info("training %s on %d items, computing in %s", cfg.student.name, len(training), precision)
