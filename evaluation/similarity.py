@@ -24,7 +24,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         selection_report,
     )
     from evaluation.reporting.selection_report import write_report
-    from evaluation.retrieval import nearest_candidate
+    from evaluation.retrieval import candidate_similarity
     from evaluation.select import select_items
 
     preset, store, embedders = open_retriever(cfg, run)
@@ -36,9 +36,9 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         queries = embedder.embed_queries(items)
         embeddings = embedder.embed_frames(candidates)
         log.info("scoring %s items with %s", f"{len(items):,}", name)
-        scores = nearest_candidate.score_candidates(items, queries, embeddings, preset)
+        scores = candidate_similarity.score_candidates(items, queries, embeddings, preset)
         credits = credit_choices(scores, [item.answer for item in items])
-        score_rows += nearest_candidate.score_rows(name, items, scores)
+        score_rows += candidate_similarity.score_rows(name, items, scores)
         letters = choose_letters(scores)
         choices.append(Choices(name, SIMILARITY, None, credits, letters))
 

@@ -69,7 +69,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         route_rows = results.retrieval_results(store.name, title, ranks, queries, cfg.seed)
         rows += route_rows
         # Ranks at the widest width; a query without a rank (a miss) gets the last one.
-        counts = ranks.greater[0], ranks.tied[0], ranks.found
+        counts = ranks.above[0], ranks.tied[0], ranks.found
         target_ranks = query_metrics(*counts, ranks.frames, ())["median_rank"].tolist()
         matched += [
             {"query_id": q.query_id, "route": key, "text": texts[route.mode][q.name], "rank": rank}

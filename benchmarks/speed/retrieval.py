@@ -127,7 +127,7 @@ def print_ranks(ranks: Ranks) -> None:
     """Print the peak memory, and the shares of queries whose target is first, or ties, by width."""
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
     for k, width in enumerate(ranks.widths):
-        first = (ranks.found & (ranks.greater[k] == 0)).mean()
+        first = (ranks.found & (ranks.above[k] == 0)).mean()
         print(f"  width {width}: target first {first:.1%}, tied {(ranks.tied[k] > 0).mean():.1%}")
 
 

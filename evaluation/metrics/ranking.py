@@ -44,24 +44,24 @@ def count_above_and_equal(scores: np.ndarray, targets: np.ndarray) -> tuple[np.n
     return (scores > targets).sum(1), (scores == targets).sum(1)
 
 
-def expected_hits(greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, k: int) -> np.ndarray:
+def expected_hits(above: np.ndarray, tied: np.ndarray, valid: np.ndarray, k: int) -> np.ndarray:
     """Return the probability (queries,) that a query's target ranks among the first `k` frames if
     ties are broken at random.
 
     With k = 1 this is the credit of a retriever on a selection item: 1/m if the target is one of m
     candidates with the highest score. The other arguments are those of `query_metrics`.
     """
-    hits = np.clip((k - np.asarray(greater)) / (np.where(valid, tied, 0) + 1), 0, 1)
+    hits = np.clip((k - np.asarray(above)) / (np.where(valid, tied, 0) + 1), 0, 1)
     return np.where(valid, hits, 0.0)
 
 
 def query_metrics(
-    greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
+    above: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
 ) -> dict[str, np.ndarray]:
     """Return the measures of each query by name.
 
     Args:
-        greater, tied: (queries,) numbers of frames that score above the target, and of other frames
+        above, tied: (queries,) numbers of frames that score above the target, and of other frames
             with the target's score.
         valid: (queries,) False for a query without a response or with a NaN target score. Such a
             query has recall 0, reciprocal rank 0 and the last rank, `frames`.
@@ -73,14 +73,14 @@ def query_metrics(
         `median_rank` (reports give its median), to which each tied frame adds one half; and
         `tie_rate`, 1 if another frame ties with the target.
     """
-    greater, tied, valid = np.asarray(greater), np.asarray(tied), np.asarray(valid, bool)
+    above, tied, valid = np.asarray(above), np.asarray(tied), np.asarray(valid, bool)
     # The sum of 1/rank over the tied ranks is a difference of harmonic numbers.
     harmonic = np.concatenate([[0.0], np.cumsum(1 / np.arange(1, frames + 1))])
-    reciprocals = harmonic[greater + np.where(valid, tied, 0) + 1] - harmonic[greater]
+    reciprocals = harmonic[above + np.where(valid, tied, 0) + 1] - harmonic[above]
     return {
-        **{f"recall@{k}": expected_hits(greater, tied, valid, k) for k in ks},
+        **{f"recall@{k}": expected_hits(above, tied, valid, k) for k in ks},
         "mrr": np.where(valid, reciprocals / np.where(valid, tied + 1, 1), 0.0),
-        "median_rank": np.where(valid, greater + 1 + tied / 2, frames),
+        "median_rank": np.where(valid, above + 1 + tied / 2, frames),
         "tie_rate": (valid & (tied > 0)).astype(float),
     }
 

@@ -287,7 +287,7 @@ def compare_retrievers(
 
 def _query_metrics(ranks: Ranks, k: int, indices: list[int] | slice) -> dict[str, np.ndarray]:
     """Return the measures of the queries at `indices`, at the k-th width."""
-    counts = (ranks.greater[k, indices], ranks.tied[k, indices], ranks.found[indices])
+    counts = (ranks.above[k, indices], ranks.tied[k, indices], ranks.found[indices])
     return query_metrics(*counts, ranks.frames, RECALLS)
 
 

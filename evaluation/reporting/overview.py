@@ -1,4 +1,5 @@
-"""The report's overview: one line per trained model, and example responses."""
+"""The overview that `evaluation.report` prints: the accuracy of the student that was evaluated last
+and of each trained retriever, and example responses."""
 
 from __future__ import annotations
 
@@ -36,8 +37,10 @@ def write_overview(
             }
             listed = ", ".join(f"{share} about the {part}" for part, share in shares.items())
             lines.append(
-                f"Its claims that the oracle supports: {listed or 'none, it makes no claims'}. "
-                f"Answers that are right for true reasons: {percent(reasons.true)}."
+                f"Of its claims, the oracle supports {listed}. The answer is right and its reasons "
+                f"are true in {percent(reasons.true)} of its responses."
+                if listed
+                else "Its responses make no claims that the oracle can check."
             )
     lines += _describe_retriever(retrievals)
     if main is not None:

@@ -1,4 +1,4 @@
-"""Choose the candidate with the highest similarity to an item's prefix and question."""
+"""Similarity of each candidate to an item's prefix and question."""
 
 from __future__ import annotations
 

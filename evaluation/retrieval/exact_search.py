@@ -33,7 +33,7 @@ class Ranks:
 
     Attributes:
         widths: Embedding widths, widest first.
-        greater, tied: (widths, queries) numbers of frames that score above the target, and of other
+        above, tied: (widths, queries) numbers of frames that score above the target, and of other
             frames that score exactly as the target does.
         found: (queries,) False for a miss: a query that could not be ranked.
         frames: Number of frames in the database.
@@ -42,7 +42,7 @@ class Ranks:
     """
 
     widths: tuple[int, ...]
-    greater: np.ndarray
+    above: np.ndarray
     tied: np.ndarray
     found: np.ndarray
     frames: int
@@ -51,26 +51,24 @@ class Ranks:
 
     @classmethod
     def from_counts(
-        cls, widths: Sequence[int], counts: np.ndarray, frames: int, vectors: int, began: float
+        cls, widths: Sequence[int], counts: np.ndarray, frames: int, vectors: int, seconds: float
     ) -> Ranks:
         """Build ranks without misses from the counts (2, widths, queries) of the frames that score
-        above the target and of the frames that score as it does, including the target itself.
-        `began` is the value of `time.perf_counter()` before the ranking."""
-        (greater, equal), found = counts, np.ones(counts.shape[2], bool)
-        seconds = time.perf_counter() - began
-        return cls(tuple(widths), greater, equal - 1, found, frames, vectors, seconds)
+        above the target and of the frames that score as it does, including the target itself."""
+        (above, equal), found = counts, np.ones(counts.shape[2], bool)
+        return cls(tuple(widths), above, equal - 1, found, frames, vectors, seconds)
 
 
 def write_ranks(
     folder: Path, ranks: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
 ) -> None:
     """Write ranks.jsonl. For a retriever and a query, a row has at each width the number of frames
-    `before` the target and the number of other frames `tied` with it."""
+    `above` the target and the number of other frames `tied` with it."""
     rows = []
     for name, result in ranks.items():
         for k, query in enumerate(queries):
             row = {"by": name, "query_id": query.query_id, "widths": result.widths}
-            row["before"] = result.greater[:, k].tolist()
+            row["above"] = result.above[:, k].tolist()
             row["tied"] = result.tied[:, k].tolist()
             rows.append(row)
     write_json_lines(folder / "ranks.jsonl", rows)
@@ -175,4 +173,5 @@ def exact_ranks(
             for k, scores in enumerate(block_scores(grid[rows], block)):
                 counts[:, k, rows] += count_above_and_equal(scores, target_scores[k][rows])
     # The scores begin with the narrowest width, the ranks with the widest.
-    return Ranks.from_counts(widths, counts[:, ::-1], frames, frames, began)
+    seconds = time.perf_counter() - began
+    return Ranks.from_counts(widths, counts[:, ::-1], frames, frames, seconds)

@@ -60,7 +60,8 @@ def late_ranks(
             part = slice(start, start + step)
             scores = block_scores(to_grid(queries[part], width), frame_vectors)
             counts[:, 0, part] += count_above_and_equal(scores, target_scores[part])
-    return Ranks.from_counts([width], counts, frames, vectors, began)
+    seconds = time.perf_counter() - began
+    return Ranks.from_counts([width], counts, frames, vectors, seconds)
 
 
 def pair_scores(queries: np.ndarray, frames: np.ndarray, width: int) -> np.ndarray:

@@ -65,7 +65,7 @@ ROUTES = {
     "predict_caption": Route("predict -> caption", "prediction", captions=True),
     "predict_image": Route("predict -> image", "prediction"),
 }
-"""The paper's three routes (Models and metrics)."""
+"""The paper's three routes (its section "Models and metrics")."""
 
 Texts = dict[str, str]
 """Texts by the name of a query or frame. A text is empty if the response has no usable text."""
@@ -181,6 +181,6 @@ def rank_by_text(
         embeddings = matcher.embed_frames(database)
         target_rows, parts = embeddings.rows(targets), embeddings.parts(names)
     ranks = rank_targets(matcher.preset, query_rows, target_rows, parts)
-    greater, tied = np.zeros((2, len(ranks.widths), len(queries)), np.int64)
-    greater[:, valid], tied[:, valid] = ranks.greater, ranks.tied
-    return replace(ranks, greater=greater, tied=tied, found=np.array(valid), frames=len(names))
+    above, tied = np.zeros((2, len(ranks.widths), len(queries)), np.int64)
+    above[:, valid], tied[:, valid] = ranks.above, ranks.tied
+    return replace(ranks, above=above, tied=tied, found=np.array(valid), frames=len(names))

@@ -27,8 +27,8 @@ def scene_interval(
 def count_ranks(scores: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Count the frames above each target, and the other frames with its score. Both are 0 if the
     target's score is NaN."""
-    greater, equal = count_above_and_equal(scores, target_scores(scores, targets))
-    return greater, np.maximum(equal - 1, 0)
+    above, equal = count_above_and_equal(scores, target_scores(scores, targets))
+    return above, np.maximum(equal - 1, 0)
 
 
 def matrix_metrics(scores: np.ndarray, targets: np.ndarray, ks: Sequence[int]) -> dict[str, float]:
@@ -39,10 +39,10 @@ def matrix_metrics(scores: np.ndarray, targets: np.ndarray, ks: Sequence[int]) -
 
 
 def ranking_metrics(
-    greater: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
+    above: np.ndarray, tied: np.ndarray, valid: np.ndarray, frames: int, ks: Sequence[int]
 ) -> dict[str, float]:
     """Return the means of `query_metrics` over all queries, and the median of `median_rank`."""
-    measures = query_metrics(greater, tied, valid, frames, ks)
+    measures = query_metrics(above, tied, valid, frames, ks)
     return {
         name: float((np.median if name == "median_rank" else np.mean)(values))
         for name, values in measures.items()

@@ -62,10 +62,10 @@ def test_blockwise_metrics_equal_those_of_the_full_matrix(block):
     of_target = target_scores(scores, target)
     blocks = [scores[:, i : i + block] for i in range(0, 30, block)]
     counts = [count_above_and_equal(columns, of_target) for columns in blocks]
-    greater = sum(g for g, _ in counts)
+    above = sum(g for g, _ in counts)
     tied = np.maximum(sum(e for _, e in counts) - 1, 0)
     valid = ~np.isnan(of_target)
-    by_frame = ranking_metrics(greater, tied, valid, 30, KS)
+    by_frame = ranking_metrics(above, tied, valid, 30, KS)
     parts = [count_ranks(scores[i : i + block], target[i : i + block]) for i in range(0, 40, block)]
     by_query = ranking_metrics(*map(np.concatenate, zip(*parts, strict=True)), valid, 30, KS)
     assert by_frame == by_query == matrix_metrics(scores, target, KS)

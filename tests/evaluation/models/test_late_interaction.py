@@ -49,7 +49,7 @@ def ranks(queries, frames, targets=TARGETS, size=120, more=0):
 
 
 def same(one, two) -> bool:
-    return np.array_equal(one.greater, two.greater) and np.array_equal(one.tied, two.tied)
+    return np.array_equal(one.above, two.above) and np.array_equal(one.tied, two.tied)
 
 
 def test_ranks_agree_with_the_librarys_scores(queries, frames) -> None:
@@ -57,13 +57,13 @@ def test_ranks_agree_with_the_librarys_scores(queries, frames) -> None:
     pairs = pair_scores(rows_of(queries), rows_of(frames)[TARGETS], WIDTH)
     np.testing.assert_allclose(pairs, scores[np.arange(20), TARGETS], rtol=1e-6, atol=1e-5)
     found = ranks(queries, frames)
-    greater, _ = count_ranks(scores, TARGETS)
+    above, _ = count_ranks(scores, TARGETS)
     # The library computes in fp32, where the scores of equal frames may differ.
-    assert (found.greater[0] <= greater).all()
-    assert (found.greater[0] + found.tied[0] >= greater).all()
+    assert (found.above[0] <= above).all()
+    assert (found.above[0] + found.tied[0] >= above).all()
     copies = TARGETS % 3 == 0
     assert np.array_equal(found.tied[0][copies], np.full(copies.sum(), 39))
-    assert np.array_equal(found.greater[0][~copies], greater[~copies])
+    assert np.array_equal(found.above[0][~copies], above[~copies])
     assert not found.tied[0][~copies].any()
 
 

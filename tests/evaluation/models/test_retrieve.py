@@ -99,9 +99,9 @@ def test_ranks_follow_the_definition_and_embeddings_are_computed_once(
             difference = left[key]["value"] - right[key]["value"]
             assert reported["value"] == pytest.approx(difference, abs=1e-12)
         left_ranks = [row for row in ranks if row["by"] == pair["left"]]
-        before, tied = (np.array([r[key][k] for r in left_ranks]) for key in ("before", "tied"))
+        above, tied = (np.array([r[key][k] for r in left_ranks]) for key in ("above", "tied"))
         valid = np.ones(len(left_ranks), bool)
-        measures = ranking_metrics(before, tied, valid, len(database), [1])
+        measures = ranking_metrics(above, tied, valid, len(database), [1])
         assert measures["mrr"] == pytest.approx(left["mrr"]["value"])
     assert [pair["width"] for pair in first["differences"]] == RETRIEVER.widths
     assert (tmp_path / "one" / "retrieval.png").stat().st_size > 10_000

@@ -114,10 +114,10 @@ def test_ranks_follow_from_the_scores_and_an_empty_text_is_a_miss(rank, store, m
 
     missing = rank("predict_image", ["", *texts[1:-1], ""])
     assert missing.found.tolist() == [False, *[True] * (len(texts) - 2), False]
-    assert (missing.greater[:, 1:-1] == found.greater[:, 1:-1]).all()
+    assert (missing.above[:, 1:-1] == found.above[:, 1:-1]).all()
     row = retrieval_results("micro", "x", missing, queries, 0)[0]
     assert (row.queries, row.frames) == (len(queries), len(database))
-    measures = query_metrics(found.greater[0], found.tied[0], found.found, len(database), [1])
+    measures = query_metrics(found.above[0], found.tied[0], found.found, len(database), [1])
     assert row.mrr.value == pytest.approx(measures["mrr"][1:-1].sum() / len(queries))
     with raises_user_error("no-texts", contains="predict -> image"):
         rank("predict_image", [""] * len(queries))
@@ -128,7 +128,7 @@ def test_a_text_is_matched_to_the_caption_with_the_same_words(rank, store) -> No
     captions = [f"Frame {f.name}." for f in database]
     texts = [f"Frame {q.target.name}." for q in queries]
     found = rank("predict_caption", texts, captions)
-    assert not found.greater.any()
+    assert not found.above.any()
     assert not found.tied.any()
     # Frames with the same caption tie.
     same = rank("predict_caption", texts, ["A frame."] * len(captions))

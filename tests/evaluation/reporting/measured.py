@@ -37,7 +37,7 @@ from evaluation.metrics.selection import (
     selection_report,
 )
 from evaluation.reporting.selection_report import write_report
-from evaluation.retrieval import nearest_candidate
+from evaluation.retrieval import candidate_similarity
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.select import limit_items
 from models.student.responses import GeneratedText
@@ -141,7 +141,7 @@ def similarity_run(
         credits = credit_choices(by_item, answers)
         letters = choose_letters(by_item)
         choices.append(Choices(title, SIMILARITY, None, credits, letters))
-        rows += nearest_candidate.score_rows(title, items, by_item)
+        rows += candidate_similarity.score_rows(title, items, by_item)
     folder = root / "similarity" / (model or name)
     finish(folder, settings)
     report = selection_report(choices, items, store.name, store.identity, 0)
@@ -163,9 +163,9 @@ def retrieve_run(
     rng = np.random.default_rng(0)
     rows, ranked = [], {}
     for title in (name, "untrained small"):
-        greater = rng.integers(frames, size=(2, len(queries)))
+        above = rng.integers(frames, size=(2, len(queries)))
         found = np.ones(len(queries), bool)
-        ranks = Ranks((64, 32), greater, np.zeros_like(greater), found, frames, frames, 0.5)
+        ranks = Ranks((64, 32), above, np.zeros_like(above), found, frames, frames, 0.5)
         ranked[title] = ranks
         rows += retrieval_results(store.name, title, ranks, queries, 0)
     report = {"rows": rows, "build": store.identity}

@@ -65,10 +65,10 @@ def queries() -> list[RetrievalQuery]:
 def ranks(queries) -> Ranks:
     rng = np.random.default_rng(0)
     shape = (3, len(queries))
-    greater = np.floor(10 ** rng.uniform(0, 3.5, shape)).astype(int) - 1
+    above = np.floor(10 ** rng.uniform(0, 3.5, shape)).astype(int) - 1
     tied = rng.integers(3, size=shape) * (rng.random(shape) < 0.2)
     found = rng.random(len(queries)) > 0.05
-    return Ranks((4096, 256, 64), greater, tied, found, 10_000, vectors=10_000, seconds=1234.5)
+    return Ranks((4096, 256, 64), above, tied, found, 10_000, vectors=10_000, seconds=1234.5)
 
 
 @pytest.fixture(scope="module")
@@ -85,14 +85,14 @@ def test_retrieval_results_match_reference_metrics_and_intervals(ranks, queries)
     for result in results:
         indices = [i for i, q in enumerate(queries) if result.builder in (None, q.builder)]
         k = ranks.widths.index(result.width)
-        counts = (ranks.greater[k, indices], ranks.tied[k, indices], ranks.found[indices])
+        counts = (ranks.above[k, indices], ranks.tied[k, indices], ranks.found[indices])
         metrics = ranking_metrics(*counts, 10_000, RECALLS)
         assert {name: measure.value for name, measure in result.measures.items()} == metrics
         assert (result.queries, result.frames) == (len(indices), 10_000)
         for measure in result.measures.values():
             assert measure.low <= measure.value <= measure.high
             assert measure.n == len(indices)
-    each = query_metrics(ranks.greater[1], ranks.tied[1], ranks.found, 10_000, RECALLS)
+    each = query_metrics(ranks.above[1], ranks.tied[1], ranks.found, 10_000, RECALLS)
     scenes = [q.scene_id for q in queries]
     for name, statistic in (("mrr", np.mean), ("median_rank", np.median), ("recall@10", np.mean)):
         measure = results[1].measures[name]
@@ -144,17 +144,17 @@ def test_the_retrieval_table_has_untrained_rows_and_costs_at_each_width(retrieva
 
 def test_differences_between_retrievers_are_paired_by_query():
     rng = np.random.default_rng(0)
-    greater, found = rng.integers(40, size=(1, 60)), np.ones(60, bool)
-    none = np.zeros_like(greater)
-    one = Ranks((8,), greater, none, found, 41, vectors=41, seconds=0.5)
+    above, found = rng.integers(40, size=(1, 60)), np.ones(60, bool)
+    none = np.zeros_like(above)
+    one = Ranks((8,), above, none, found, 41, vectors=41, seconds=0.5)
     # Every target ranks one place worse.
-    other = replace(one, greater=greater + 1)
+    other = replace(one, above=above + 1)
     scenes = [SimpleNamespace(scene_id=f"s{k // 3}") for k in range(60)]
     (same,) = compare_retrievers({"one": one, "again": one}, scenes, 0)
     for measure in same.measures.values():
         assert (measure.value, measure.low, measure.high) == (0, 0, 0)
     (different,) = compare_retrievers({"one": one, "other": other}, scenes, 0)
-    assert different.measures["recall@1"].value == (greater == 0).mean()
+    assert different.measures["recall@1"].value == (above == 0).mean()
     assert all(0 <= m.low <= m.value <= m.high for m in different.measures.values())
     text = str(rank_differences_table([same, different]))
     assert "one less again" in text

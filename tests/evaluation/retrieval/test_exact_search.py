@@ -41,7 +41,7 @@ def split(database: np.ndarray, size: int) -> list[np.ndarray]:
 
 def same(one: exact_search.Ranks, two: exact_search.Ranks) -> bool:
     return (
-        np.array_equal(one.greater, two.greater)
+        np.array_equal(one.above, two.above)
         and np.array_equal(one.tied, two.tied)
         and one.frames == two.frames
     )
@@ -61,10 +61,10 @@ def test_ranks_equal_those_of_a_score_matrix() -> None:
     targets = np.random.default_rng(2).integers(300, size=40)
     found = exact_ranks(queries, database[targets], [database], WIDTHS)
     for k, width in enumerate(WIDTHS):
-        greater, tied = count_ranks(cosines(queries, database, width), targets)
+        above, tied = count_ranks(cosines(queries, database, width), targets)
         # A few frames tie with the target in fp32 but not in double precision.
-        assert np.abs(found.greater[k] - greater).max() <= 1
-        assert (found.greater[k] + found.tied[k] >= greater).all()
+        assert np.abs(found.above[k] - above).max() <= 1
+        assert (found.above[k] + found.tied[k] >= above).all()
         assert (found.tied[k] >= tied).all()
     assert found.tied.sum() < 5
 
@@ -95,7 +95,7 @@ def test_the_order_of_the_database_and_of_the_queries_does_not_change_ranks() ->
             split(database[order], 101),
             WIDTHS,
         )
-        assert np.array_equal(moved.greater, expected.greater[:, moved_queries])
+        assert np.array_equal(moved.above, expected.above[:, moved_queries])
         assert np.array_equal(moved.tied, expected.tied[:, moved_queries])
 
 
@@ -110,7 +110,7 @@ def test_equal_frames_tie_at_any_position(size) -> None:
     assert not distinct.tied.any()
     found = exact_ranks(queries, database[targets], split(database, size), WIDTHS)
     assert (found.tied == 2).all()
-    assert np.array_equal(found.greater, 3 * distinct.greater)
+    assert np.array_equal(found.above, 3 * distinct.above)
 
 
 def test_scores_of_pairs_and_of_blocks_are_bit_identical() -> None:
@@ -158,5 +158,5 @@ def test_an_embedding_of_zeros_ties_with_all_frames() -> None:
     database = embeddings(10)
     database[4] = 0
     found = exact_ranks(np.zeros((1, 96), np.float32), database[:1], [database], WIDTHS)
-    assert (found.greater == 0).all()
+    assert (found.above == 0).all()
     assert (found.tied == 9).all()
