@@ -13,8 +13,8 @@ CLEARNESS = 0.5
 this share of the largest offsets of all statements that exclude as many."""
 SIMPLICITY = (
     ("region", "sight"),
-    ("side", "height", "gap", "cover", "between", "extreme"),
-    ("nearer",),
+    ("side", "height", "gap", "cover"),
+    ("between", "extreme", "nearer"),
 )
 """Kinds of statements that a single frame shows, the simplest first. Changes since the cut are not
 among them."""
@@ -40,8 +40,8 @@ def choose_statements(predicates: RelationalPredicates, seed: int | str) -> Deci
     Statements are added one by one; each excludes as many of the remaining distractors as possible.
     With three distractors, no smaller set exists: either a statement excludes all, or two do, or
     each excludes one. Of equally good statements, those about objects that are visible at the cut
-    are preferred, because others can hardly be predicted; of these the clear ones; and of these one
-    of the simplest kind is chosen at random.
+    are preferred, because others can hardly be predicted; of these the clear ones; of these the
+    simplest kind; and of these the clearest, or one of several at random.
     """
     rng = Random(seed)
     views = [view for view in predicates.views if view.letter != predicates.answer]
@@ -70,6 +70,7 @@ def choose_statements(predicates: RelationalPredicates, seed: int | str) -> Deci
         clear = [statement for statement, value in clearness.items() if value >= least]
         simplest = min(LEVELS[statement.kind] for statement in clear)
         options = [statement for statement in clear if LEVELS[statement.kind] == simplest]
-        chosen.append(rng.choice(options))
+        clearest = max(clearness[statement] for statement in options)
+        chosen.append(rng.choice([s for s in options if clearness[s] == clearest]))
         left -= excluded_by[chosen[-1]]
     return Decision(tuple(chosen), tuple(sorted(left)))

@@ -175,7 +175,7 @@ def replace_relations(
     """
     pattern = "|".join(map(re.escape, sorted(phrases, key=len, reverse=True)))
     for match in re.finditer(rf"(?<!not )\b({pattern}) (?=the |it\b)", text):
-        if _names_object(text, match.end()):
+        if _names_object(text, match.end()) or _is_possessed(text, match.start()):
             yield replace_match(text, match, rng.choice(phrases[match[1]]) + " ")
 
 
@@ -184,6 +184,12 @@ def _names_object(text: str, position: int) -> bool:
     return bool(re.match(rf"the (?:{'|'.join(COLORS)}) ", text[position : position + 20]))
 
 
+def _is_possessed(text: str, position: int) -> bool:
+    """Return whether "with the red metal cube" or "has the red metal cube" precedes."""
+    return bool(re.search(rf"(?:with|has|have) {OBJECT} $", text[max(0, position - 60) : position]))
+
+
+OBJECT = rf"the (?:{'|'.join(COLORS)}) (?:metal|rubber) \w+"
 SIDES = {
     "left of": ["right of", "vertically aligned with"],
     "to the left of": ["right of", "to the right of"],
@@ -206,7 +212,6 @@ COVERS = {"in front of": ["behind"], "behind": ["in front of"]}
 EXTREMES = {
     "leftmost": "rightmost", "rightmost": "leftmost", "topmost": "lowest", "lowest": "topmost"
 }  # fmt: skip
-OBJECT = rf"the (?:{'|'.join(COLORS)}) (?:metal|rubber) \w+"
 
 
 def replace_extremes(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:

@@ -58,6 +58,8 @@ class CandidateReader(TopicReader):
 
     def on_relation(self, tag: Tag) -> None:
         partners = self.find_partners(tag)
+        if possessed := self.find_possessed(tag):
+            self.objects, partners = [possessed[0]], possessed[1:]
         if self.skipped or not self.objects or partners is None:
             return
         phrase = tag.value

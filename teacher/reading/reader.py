@@ -11,6 +11,8 @@ from teacher.reading.tagging import Noun, RelationPhrase, Sentence, Tag
 
 MAX_OBJECTS = 9
 """Maximum number of objects in a list, and in the subject of a clause."""
+POSSESSIVES = {"with", "has", "have", "having"}
+"""Last words before the object in "the cube has the sphere left of it"."""
 
 Names = list[str | None]
 """Names of objects, such as "red metal cube"; None for an object that the text leaves open."""
@@ -135,6 +137,24 @@ class Reader:
                 return None
             partners.append(names[0])
         return tuple(partners)
+
+    def find_possessed(self, tag: Tag) -> tuple[str, str] | None:
+        """Return the sphere and the cube in "the cube has the sphere left of it" and "the cube with
+        the sphere left of it", where `tag` is the relation; None if the text is different."""
+        assert isinstance(tag.value, RelationPhrase)
+        verb, thing = self.near(-2), self.near(-1)
+        possessed = thing.name == "object" and verb.last_word in POSSESSIVES
+        if tag.value.nouns != (None,) or not possessed:
+            return None
+        index = self.cursor - 1
+        while self.sentence[index - 1].last_word in POSSESSIVES:
+            # "The cube with the sphere left of it and with the cylinder near it": the cube.
+            index = self.sentence.find(index - 1, {"object"}, -1)
+        owner = self.sentence[index]
+        names = [self.names_at.get(start, ()) for start in (thing.start, owner.start)]
+        if any(len(found) != 1 or None in found for found in names):
+            return None
+        return str(names[0][0]), str(names[1][0])
 
     def _find_objects(self, tag: Tag, noun: Noun | None = None) -> Names:
         """Return the objects that a noun phrase names, and record the claim that they exist.

@@ -80,6 +80,10 @@ class SceneReader(SubjectReader):
         assert isinstance(phrase, RelationPhrase)
         kind = KINDS[phrase.value]
         partners = self.find_partners(tag)
+        if possessed := self.find_possessed(tag):
+            self.blocked = False
+            self.start_clause([possessed[0]])
+            partners = possessed[1:]
         if kind in CHANGES:
             self.record_verb()
         if partners is None:

@@ -28,6 +28,10 @@ from teacher.writers.paper import Detail, Writer
 
 PHRASES = yaml.safe_load((files("teacher") / "templates" / "relations.yaml").read_text())
 
+POSSESSIVE = {"is": "has", "will be": "will have"}
+"""The verbs of statements, and those of statements in which the subject has another object beside
+it."""
+
 
 def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> RelationalPredicates:
     """Leave out what is said of objects that are out of view at the cut, unless all are: a model
@@ -86,7 +90,7 @@ class RelationalWriter(Writer):
     # Statements.
 
     def place(self, relation: Relation, pronoun: bool = False) -> str:
-        """Return what a statement says of its subject, such as "left of the red cube".
+        """Return what a relation says of its subject, such as "left of the red cube".
 
         Args:
             pronoun: Whether to write "it" instead of the other object.
@@ -100,24 +104,42 @@ class RelationalWriter(Writer):
         values = dict(zip("bc", ["it"] if pronoun else others, strict=False))
         return phrasings[self.rng.integers(len(phrasings))].format(**values)
 
+    def other(self, relation: Relation) -> str:
+        """Return where the other object of a symmetric relation is, such as "the red cube near it".
+
+        Both objects are named before the relation, so that a model that writes the word can attend
+        to both.
+        """
+        return f"the {relation.objects[1]} {self.place(flip_relation(relation), pronoun=True)}"
+
     def statement(self, relation: Relation, verb: str) -> str:
+        """Return a clause; `verb` is a key of `POSSESSIVE`."""
+        if relation.kind in SYMMETRIC:
+            return f"the {relation.objects[0]} {POSSESSIVE[verb]} {self.other(relation)}"
         return f"the {relation.objects[0]} {verb} {self.place(relation)}"
+
+    def attribute(self, relation: Relation) -> str:
+        """Return what follows the subject in `shown`."""
+        if relation.kind in SYMMETRIC:
+            return f"with {self.other(relation)}"
+        return self.place(relation)
 
     def shown(self, relation: Relation) -> str:
         """Return a statement as the object of "shows"."""
-        return f"the {relation.objects[0]} {self.place(relation)}"
+        return f"the {relation.objects[0]} {self.attribute(relation)}"
 
     def all_shown(self) -> str:
         """Return all deciding statements as the object of "shows"."""
-        # "No red cube and the blue sphere near the top" would deny both.
-        ordered = sorted(self.statements, key=lambda s: s.kind == "sight")
+        # "No red cube and the blue sphere near the top" would deny both, and in "the red cube with
+        # the blue sphere left of it and near the top", either could be near the top.
+        ordered = sorted(self.statements, key=lambda s: (s.kind == "sight", s.kind in SYMMETRIC))
         parts: list[str] = []
         subject = None
         for s in ordered:
             if s.kind == "sight":
                 parts.append(f"no {s.objects[0]}")
             else:
-                parts.append(self.place(s) if s.objects[0] == subject else self.shown(s))
+                parts.append(self.attribute(s) if s.objects[0] == subject else self.shown(s))
                 subject = s.objects[0]
         return " and ".join(parts)
 
@@ -189,8 +211,9 @@ class RelationalWriter(Writer):
         if unseen:
             return f"shows the {unseen[0]} out of sight"
         if actual := find_topic(s, view.relations):
-            wanted = f", not {self.place(s, pronoun=True)}" if s.kind in SYMMETRIC else ""
-            return f"shows {self.shown(actual)}{wanted}"
+            if s.kind not in SYMMETRIC:
+                return f"shows {self.shown(actual)}"
+            return f"shows {self.shown(actual)}, not {self.place(flip_relation(s), pronoun=True)}"
         return f"shows the {s.objects[0]}, but not {self.place(s)}"
 
     def match(self, candidate: CandidateFacts) -> str:

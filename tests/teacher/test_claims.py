@@ -150,13 +150,22 @@ def test_false_word_is_contradicted(rationales, source, kind):
     assert sum(detected) >= 0.97 * len(detected) > 20
 
 
+def add_extremes(text, predicates):
+    """Add to the prediction which object is leftmost and so on: the narrator says it rarely."""
+    extremes = [s for s in sorted(predicates.target.statements) if s.kind == "extreme"]
+    stated = "".join(f" The {s.objects[0]} will be {s.value}." for s in extremes)
+    return text.replace("\nCandidate analysis:", f"{stated}\nCandidate analysis:")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", RELATION_MUTATIONS)
 def test_false_relation_is_contradicted(rationales, kind):
     detected = [
         is_contradicted(false, predicates)
         for item_id, text, predicates in rationales["relational"]
-        for false, _ in RELATION_MUTATIONS[kind](text, predicates, Random(item_id))
+        for false, _ in RELATION_MUTATIONS[kind](
+            add_extremes(text, predicates), predicates, Random(item_id)
+        )
     ]
     assert sum(detected) >= 0.97 * len(detected) > 5
 

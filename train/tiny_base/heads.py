@@ -14,7 +14,8 @@ picture. The heads are linear, so the base itself has to represent what they pre
                visible and where, and its displacement up to the moment that the item asks for
     "spoken"   tokens from the end of a name until the text names another object, candidate or
                section, or the sentence ends, after the layer `SPEAKING`: place and velocity of the
-               named object in the picture that the text describes there
+               named object in the picture that the text describes there, and, if the text says
+               that another object has it beside it, its displacement from this object
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
 at the tower's output and motion in the middle layers. Further losses train attention heads to
@@ -46,7 +47,9 @@ PICTURES = 1 + len(LETTERS)
 """Pictures in which a named object is found: the last one of the clip, and the candidates."""
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
 DISPLACEMENTS = ("velocity", *AHEADS, "since")
-SCALES = {"place": 3.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(DISPLACEMENTS, 5.0)
+SCALES = {"place": 3.0, "offset": 3.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
+    DISPLACEMENTS, 5.0
+)
 """Factors on places and displacements, so that their losses are of similar size."""
 BEND = 0.1
 """Scaled error above which the loss of a place or displacement is linear."""
@@ -78,8 +81,11 @@ class OracleTargets:
         future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
         spoken: (S, 2) row and position of the tokens that describe a named object, from the end of
             its name on.
-        spoken_state: (S, 4) place and velocity of the object there, or NaN.
+        spoken_state: (S, 6) place and velocity of the object there, and its displacement from its
+            owner, or NaN.
         subjects: (_, 3) row, position after a name, and position of the name.
+        owners: (_, 3) row, position of a token that describes the sphere in "the cube has the
+            sphere left of it", and position of the cube's name.
         text_letters: (_, 3) row, position of a name where the text speaks of a candidate, and
             position of the candidate's letter in the text.
         prompt_letters: (_, 3) row, position of a visual token of a candidate, and position of its
@@ -111,6 +117,7 @@ class OracleTargets:
     spoken: Tensor
     spoken_state: Tensor
     subjects: Tensor
+    owners: Tensor
     text_letters: Tensor
     prompt_letters: Tensor
     repeats: Tensor
@@ -146,7 +153,7 @@ class OracleHeads(nn.Module):
         self.seen = heads({"presence": 1, "inside": 2, "shift": 2, "place": 2})
         self.known = heads({"place": 2, "moving": 1} | dict.fromkeys(DISPLACEMENTS, 2))
         self.named = heads({"visible": PICTURES, "places": 2 * PICTURES, "future": 2})
-        self.spoken = heads({"place": 2, "velocity": 2})
+        self.spoken = heads({"place": 2, "velocity": 2, "offset": 2})
         self.norms = nn.ModuleDict(
             {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled", "spoken")}
         )
@@ -252,7 +259,7 @@ class OracleHeads(nn.Module):
         layer `SPEAKING`, (B, L, H)."""
         row, at = targets.spoken.T
         spoken = self.norms["spoken"](hidden[row, at])
-        truth = dict(zip(("place", "velocity"), targets.spoken_state.split(2, dim=1), strict=True))
+        truth = dict(zip(self.spoken, targets.spoken_state.split(2, dim=1), strict=True))
         return {
             name: distance(head(spoken), truth[name], SCALES[name])
             for name, head in self.spoken.items()
@@ -293,6 +300,8 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     repeat         RECALLING 1    token before a repeated name -> the name's last mention
     comparison     RECALLING 2    end of a place in a candidate -> the end of the predicted place if
                                   both are the same, otherwise the word "shows"
+    owner          RECALLING 3    token that describes the sphere in "the cube has the sphere left
+                                  of it" -> the cube's name
     verdict        SPEAKING 0     token before a letter in an outcome -> "agrees" of this candidate
     following      SPEAKING 1     token before a new name in a scene parse -> the object at the end
                                   of the clip
@@ -326,6 +335,7 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         ("subject", RECALLING, 0, targets.subjects),
         ("repeat", RECALLING, 1, targets.repeats),
         ("comparison", RECALLING, 2, targets.comparisons),
+        ("owner", RECALLING, 3, targets.owners),
         ("verdict", SPEAKING, 0, targets.verdicts),
         ("following", SPEAKING, 1, following),
     ):

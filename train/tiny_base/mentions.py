@@ -31,7 +31,8 @@ OUTCOME = re.compile(
 )
 """Matches where a text names the candidates that agree."""
 PREDICTED = re.compile(
-    rf"[Tt]he (?P<name>{NAME.pattern}) (?:will be|should be|remains|stays) (?P<place>[^.]+)\."
+    rf"[Tt]he (?P<name>{NAME.pattern}) (?:will (?:be|have)|should be|remains|stays) "
+    r"(?P<place>[^.]+)\."
 )
 """Matches a sentence that says where an object will be."""
 CLAIMED = re.compile(
@@ -41,6 +42,8 @@ CLAIMED = re.compile(
 )
 """Matches what a text says that a candidate shows of an object. The group `agrees` matches if it
 was predicted."""
+POSSESSES = re.compile(r"\b(?:with|has|have) the $")
+"""Matches the words before the sphere in "the cube has the sphere left of it"."""
 PREDICTION = re.compile("Prediction:")
 
 
@@ -54,6 +57,8 @@ class Mention:
         section: Title of the section of the rationale; None before the first.
         letter: The candidate that the text speaks of; None if it speaks of the scene.
         letter_at: Index of the token of the letter, if any.
+        owner: Index of the mention of the cube if this is the sphere in "the cube has the sphere
+            left of it", otherwise None.
     """
 
     name: str
@@ -63,6 +68,7 @@ class Mention:
     section: str | None
     letter: str | None
     letter_at: int | None
+    owner: int | None
 
 
 class TokenizedText:
@@ -83,18 +89,27 @@ class TokenizedText:
 
     def mentions(self) -> Iterator[Mention]:
         """Yield the names of objects in the order of the text."""
-        section = letter = letter_at = None
+        section = letter = letter_at = previous = None
+        end = count = 0
         events = [*EVENTS.finditer(self.text)]
         starts = [*(e.start() for e in events), len(self.text)]
         for event, following in zip(events, starts[1:], strict=True):
             if name := event["name"]:
+                owner = None
+                if previous and POSSESSES.search(self.text[end : event.start()]):
+                    # "The cube with the sphere left of it and with the cylinder near it": the cube.
+                    owner = count - 1 if previous.owner is None else previous.owner
                 first, last = self.token_at(event.start()), self.token_at(event.end() - 1)
                 stop = self.token_at(following)
-                yield Mention(name, first, last, stop, section, letter, letter_at)
+                previous = Mention(name, first, last, stop, section, letter, letter_at, owner)
+                end, count = event.end(), count + 1
+                yield previous
             elif event["letter"]:
                 letter, letter_at = event["letter"], self.token_at(event.end() - 1)
             elif event["section"]:
                 section, letter, letter_at = event["section"], None, None
+            else:
+                previous = None
 
     def verdicts(self) -> Iterator[tuple[int, int]]:
         """Yield the index of each letter's token in an outcome or answer, and that of the word

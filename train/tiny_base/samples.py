@@ -149,6 +149,10 @@ class LocatedMention:
         found: Visual token of the object in each of `PICTURES`, or -1.
         places: The object's places in these pictures, NaN where it is not visible.
         future: Its displacement to the moment that the item asks for, or NaN.
+        owner: Position of the cube's name if this is the sphere in "the cube has the sphere left of
+            it", otherwise None.
+        offset: The displacement from the owner to this object in the picture that the text speaks
+            of, or NaN.
     """
 
     name: str
@@ -163,6 +167,8 @@ class LocatedMention:
     found: tuple[int, ...]
     places: tuple[float, ...]
     future: tuple[float, float]
+    owner: int | None
+    offset: tuple[float, float]
 
 
 def locate_mentions(
@@ -170,7 +176,13 @@ def locate_mentions(
 ) -> Iterator[LocatedMention]:
     """Yield the mentions of objects in a sample's response, whose first token is at `start`."""
     shown = shown_objects(sample)
-    for m in text.mentions():
+    mentions = [*text.mentions()]
+    states = [spoken_state(sample, shown, m) for m in mentions]
+    for m, state in zip(mentions, states, strict=True):
+        owner = None if m.owner is None else start + mentions[m.owner].last
+        offset = UNKNOWN
+        if m.owner is not None:
+            offset = state[0] - states[m.owner][0], state[1] - states[m.owner][1]
         pictures = [shown.get((sample.last + k, m.name)) for k in range(PICTURES)]
         yield LocatedMention(
             m.name,
@@ -179,12 +191,14 @@ def locate_mentions(
             start + m.last,
             range(start + m.last, start + m.stop),
             m.section,
-            spoken_state(sample, shown, m),
+            state,
             None if m.letter_at is None else start + m.letter_at,
             0 if m.letter is None else 1 + LETTERS.index(m.letter),
             tuple(t.token(grid) if t else -1 for t in pictures),
             tuple(x for t in pictures for x in (t.place if t else UNKNOWN)),
             sample.future.get(m.name, UNKNOWN),
+            owner,
+            offset,
         )
 
 
@@ -232,8 +246,13 @@ def stack_samples(
         places=torch.tensor([m.places for m in mentions]).reshape(-1, 2 * PICTURES) - 0.5,
         future=torch.tensor([m.future for m in mentions]).reshape(-1, 2),
         spoken=integers([(m.row, k) for m in mentions for k in m.spoken], 2),
-        spoken_state=torch.tensor([m.state for m in mentions for _ in m.spoken]).reshape(-1, 4),
+        spoken_state=torch.tensor(
+            [(*m.state, *m.offset) for m in mentions for _ in m.spoken]
+        ).reshape(-1, 6),
         subjects=integers([(m.row, k, m.position) for m in mentions for k in m.spoken[1:]], 3),
+        owners=integers(
+            [(m.row, k, m.owner) for m in mentions if m.owner is not None for k in m.spoken], 3
+        ),
         text_letters=integers(
             [(m.row, m.position, m.letter_at) for m in mentions if m.letter_at is not None], 3
         ),

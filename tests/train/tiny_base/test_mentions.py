@@ -89,3 +89,16 @@ def test_a_place_between_two_objects_ends_after_both(processor) -> None:
         (ends[2], ends[0]),
         (left, shows[2]), (commas[1], shows[2]),
     ]  # fmt: skip
+
+
+def test_owners_are_named_before_what_is_beside_them(processor) -> None:
+    text = TokenizedText(
+        "Prediction: At the end, the red metal cube will have the gray metal cube left of it. The "
+        "gray metal cube will be near the top.\n"
+        "Candidate analysis: Candidate A shows the red metal cube near the top and with the gray "
+        "metal cube above it and with the blue rubber sphere near it, and agrees. Candidate B "
+        "shows the red metal cube nearer to the gray metal cube than to the blue rubber sphere.",
+        processor.tokenizer,
+    )
+    owners = [mention.owner for mention in text.mentions()]
+    assert owners == [None, 0, None, None, 3, 3, None, None, None]

@@ -391,7 +391,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
         "before", "second before", "track", *(f"find {k}" for k in range(PICTURES)), "subject",
-        "find shown", "label", "letter", "repeat", "verdict", "comparison",
+        "find shown", "label", "letter", "repeat", "verdict", "comparison", "owner",
     }  # fmt: skip
     assert not any(loss.item() for loss in losses.values())
 
