@@ -99,10 +99,9 @@ class RelationalWriter(Writer):
             return relation.value
         if relation.kind == "sight":
             return "out of sight"
-        phrasings = PHRASES[relation.value]
         others = [f"the {name}" for name in relation.objects[1:]]
         values = dict(zip("bc", ["it"] if pronoun else others, strict=False))
-        return phrasings[self.rng.integers(len(phrasings))].format(**values)
+        return PHRASES[relation.value].format(**values)
 
     def other(self, relation: Relation) -> str:
         """Return where the other object of a symmetric relation is, such as "the red cube near it".
