@@ -268,6 +268,24 @@ def test_spoken_states_are_those_of_the_oracle(sampler, collate, processor) -> N
     assert compared >= {"Scene parse", "Motion analysis", "Prediction", "Candidate analysis"}
 
 
+def test_offsets_lead_from_the_owner_to_the_object(sampler, collate) -> None:
+    samples = [sampler.sample(item, "describe", "test") for item in sampler.items[:12]]
+    _, targets = collate(samples)
+    at = [tuple(position) for position in targets.spoken.tolist()]
+    states = dict(zip(at, targets.spoken_state, strict=True))
+    owners = {(row, k): (row, owner) for row, k, owner in targets.owners.tolist()}
+    assert len(owners) > 20
+    compared = 0
+    for position, state in states.items():
+        if position in owners:
+            expected = state[:2] - states[owners[position]][:2]
+            assert torch.allclose(state[4:], expected, equal_nan=True)
+            compared += int(not expected.isnan().any())
+        else:
+            assert state[4:].isnan().all()
+    assert compared > 10
+
+
 def test_observed_states_are_those_of_the_cut(micro_store: Store, items) -> None:
     earlier = 0
     for item in items:
