@@ -11,7 +11,8 @@ picture. The heads are linear, so the base itself has to represent what they pre
     "spelled"  names of objects in a text after the layer `MIDDLE`: colour, material and shape, as
                in "seen", so that attention can compare a name with visual tokens
     "named"    names of objects in a text after the layer `NAMING`: in which pictures the object is
-               visible and where, and its displacement up to the moment that the item asks for
+               visible and where, its displacement up to the moment that the item asks for, and how
+               far apart the candidates show it
     "spoken"   tokens from the end of a name until the text names another object, candidate or
                section, or the sentence ends, after the layer `SPEAKING`: place and velocity of the
                named object in the picture that the text describes there, and, if the text says
@@ -51,6 +52,8 @@ SCALES = {"place": 3.0, "offset": 3.0, "inside": 1.0, "shift": 15.0} | dict.from
     DISPLACEMENTS, 5.0
 )
 """Factors on places and displacements, so that their losses are of similar size."""
+UNSEEN_DISTANCE = 0.3
+"""Distance, as a share of the image, that counts for a candidate that does not show an object."""
 BEND = 0.1
 """Scaled error above which the loss of a place or displacement is linear."""
 MOVING = 0.012
@@ -154,6 +157,7 @@ class OracleHeads(nn.Module):
         self.known = heads({"place": 2, "moving": 1} | dict.fromkeys(DISPLACEMENTS, 2))
         self.named = heads({"visible": PICTURES, "places": 2 * PICTURES, "future": 2})
         self.spoken = heads({"place": 2, "velocity": 2, "offset": 2})
+        self.spread = nn.Linear(hidden, 1)
         self.norms = nn.ModuleDict(
             {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled", "spoken")}
         )
@@ -248,10 +252,12 @@ class OracleHeads(nn.Module):
         row, at = targets.names.T
         named = self.norms["named"](hidden[row, at])
         visible = (targets.found >= 0).float()
+        spread = measure_spread(targets.places)[:, None]
         return {
             "visible": binary_cross_entropy_with_logits(self.named["visible"](named), visible),
             "places": distance(self.named["places"](named), targets.places, SCALES["place"]),
             "future": distance(self.named["future"](named), targets.future, SCALES["since"]),
+            "spread": distance(self.spread(named), spread, SCALES["since"]),
         }
 
     def spoken_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
@@ -351,6 +357,21 @@ def distance(predicted: Tensor, true: Tensor, scale: float) -> Tensor:
     if not known.any():
         return predicted.sum() * 0
     return 2 * smooth_l1_loss(predicted[known], true[known] * scale, beta=BEND)
+
+
+def measure_spread(places: Tensor) -> Tensor:
+    """Return the mean distance (M,) of an object's places in the candidates from their mean; NaN if
+    no candidate shows the object. A prediction about objects with a large spread tells the
+    candidates apart.
+
+    Args:
+        places: (M, 2 * PICTURES) places in the clip and in the candidates, NaN where the object is
+            not visible, which counts as `UNSEEN_DISTANCE`.
+    """
+    candidates = places.unflatten(1, (-1, 2))[:, 1:]
+    distances = (candidates - candidates.nanmean(dim=1, keepdim=True)).norm(dim=2)
+    spread = distances.nan_to_num(UNSEEN_DISTANCE).mean(dim=1)
+    return spread.where((~distances.isnan()).any(dim=1), torch.nan)
 
 
 def octant(vectors: Tensor) -> Tensor:

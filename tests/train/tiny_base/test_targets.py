@@ -17,8 +17,10 @@ from train.tiny_base.data import TEXT_FACTOR, ItemSampler
 from train.tiny_base.heads import (
     PICTURES,
     SCALES,
+    UNSEEN_DISTANCE,
     OracleHeads,
     distance,
+    measure_spread,
     octant,
     pointing_losses,
 )
@@ -443,3 +445,17 @@ def test_steps_ask_more_questions_without_pictures(sampler: ItemSampler) -> None
     for step, kind in enumerate(KINDS):
         expected = 2 * TEXT_FACTOR if kind in WITHOUT_PICTURES else 2
         assert len(sampler.batch("words", step, 2)) == expected
+
+
+def test_spread_is_the_mean_distance_from_the_mean_place() -> None:
+    unseen = float("nan")
+    places = torch.tensor(
+        [
+            [9, 9, 0.1, 0.2, 0.1, 0.2, 0.1, 0.2, 0.1, 0.2],
+            [9, 9, 0.0, 0.0, 0.4, 0.0, 0.4, 0.0, 0.0, 0.0],
+            [9, 9, 0.3, 0.0, 0.3, 0.0, 0.3, 0.0, unseen, unseen],
+            [0.5, 0.5, *[unseen] * 8],
+        ]
+    )
+    expected = torch.tensor([0, 0.2, UNSEEN_DISTANCE / 4, unseen])
+    assert torch.allclose(measure_spread(places), expected, equal_nan=True)
