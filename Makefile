@@ -46,8 +46,8 @@ $(VLLM_READY): teacher/vllm_cpu/constraints.txt | $(READY)
 	@touch $(VLLM_READY)
 
 run: setup ## Train and evaluate the tiny student and the tiny retriever
-	$(PY) train.sft +exp=cot $(NARRATOR) run=exp-cot
-	$(PY) evaluation.select model=checkpoints/sft/exp-cot
+	$(PY) train.sft +exp=cot $(NARRATOR) run=$(RUNS)cot
+	$(PY) evaluation.select model=checkpoints/sft/$(RUNS)cot
 	$(PY) train.contrastive
 	$(PY) evaluation.retrieve model=checkpoints/contrastive/default
 	$(PY) evaluation.report
@@ -55,11 +55,10 @@ run: setup ## Train and evaluate the tiny student and the tiny retriever
 # The target `experiments` runs the paper's experiments. Its variables are empty or set here for
 # `paper-tiny`, which uses the commands' default presets (tiny); the lines `paper:` below set them for
 # `paper`. An interrupted command resumes, and a finished command reuses its results. $(RUNS) is the
-# prefix of the names of the students' runs; `exp-` is the prefix that `make run` gives, so that its
-# runs are reused.
+# prefix of the names of the students' runs. `make run` and `paper-tiny` share it, and thus their runs.
 REGIMES := answer_only cot cot_no_candidate_analysis cot_no_match_layout
 CONTROLS := candidate_only shuffled_prefix matched_anchor
-RUNS := exp-
+RUNS := relational-
 RETRIEVER_RUN := default
 SUITES := standin_movi_a standin_physion
 NARRATOR := teacher.predicates=relational

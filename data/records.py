@@ -307,7 +307,8 @@ class Rationale(Record):
     """Probability that a reader who knows only the prediction picks the target; None if it was not
     measured (see `teacher.sufficiency`)."""
     undecided: bool = False
-    """Whether no statement of the relational vocabulary excludes every distractor of the item."""
+    """Whether there is a distractor of which all statements about the target's frame are true
+    (`teacher.deciding`)."""
 
     @classmethod
     def from_row(cls, row: dict[str, Any]) -> Self:

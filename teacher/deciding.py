@@ -27,7 +27,8 @@ class Decision:
 
     Attributes:
         statements: The smallest set of statements that excludes as many distractors as possible.
-        rivals: Letters of the distractors of which every statement of the target is true.
+        rivals: Letters of the distractors of which all statements about the target's frame are
+            true.
     """
 
     statements: tuple[Relation, ...]
@@ -39,9 +40,14 @@ def choose_statements(predicates: RelationalPredicates, seed: int | str) -> Deci
 
     Statements are added one by one; each excludes as many of the remaining distractors as possible.
     With three distractors, no smaller set exists: either a statement excludes all, or two do, or
-    each excludes one. Of equally good statements, those about objects that are visible at the cut
-    are preferred, because others can hardly be predicted; of these the clear ones; of these the
-    simplest kind; and of these the clearest, or one of several at random.
+    each excludes one. Ties are broken in this order:
+
+    1. All objects are visible at the cut, because others can hardly be predicted.
+    2. The clearness is at least `CLEARNESS` of the largest. It is the smallest offset, over the
+       excluded candidates, of the objects from their places in the target.
+    3. The kind is the simplest of `SIMPLICITY`.
+    4. The clearness is the largest.
+    5. At random.
     """
     rng = Random(seed)
     views = [view for view in predicates.views if view.letter != predicates.answer]

@@ -50,7 +50,7 @@ def summarize(
       the same if the names of objects are ignored.
     - `sufficiency`: mean sufficiency of the accepted rationales, and share of those with
       sufficiency 1, over all items, by family and by difficulty. `undecided`: number of items with
-      a response that no statement of the relational vocabulary decides.
+      a response that the statements about the target's frame do not decide.
     - `claims`: numbers of supported, contradicted and unknown claims, by kind.
     - `hours`: time in which the servers were in use. Multiply it by their GPUs to get GPU hours.
     """
@@ -89,7 +89,7 @@ def summarize(
         "sufficiency": _summarize_sufficiency(items, accepted),
         "undecided": len({r.item_id for r in every if r.undecided}),
         "claims": {kind: counts.tolist() for kind, counts in sorted(claims.items())},
-        "requests": sum(r.prompt_tokens is not None for r in every),
+        "requests": sum(bool(r.prompt_tokens) for r in every),
         "prompt_tokens": sum(r.prompt_tokens or 0 for r in every),
         "completion_tokens": sum(r.completion_tokens or 0 for r in every),
         "hours": float(gaps[gaps < IDLE_SECONDS].sum()) / 3600,
@@ -120,7 +120,7 @@ def describe_sufficiency(figures: Figures) -> str:
     mean, ones, _ = figures["sufficiency"].get("all", (float("nan"),) * 3)
     return (
         f"sufficiency {mean:.3f} ({ones:.1%} decide their item; {figures['undecided']} items that "
-        "no relational statement decides)"
+        "the target's frame does not decide)"
     )
 
 

@@ -31,7 +31,7 @@ class CommandConfig(Settings):
     checkpoints: str = "checkpoints"
     """Folder of the runs."""
     workers: int = setting(2, least=1)
-    """Worker processes for simulation, rendering and narration."""
+    """Worker processes for simulation and rendering."""
 
 
 @dataclass

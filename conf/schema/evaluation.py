@@ -129,10 +129,10 @@ class ReportCommand(CommandConfig):
 class TwoStageCommand(GenerationCommand):
     matcher: EmbedderConfig = field(default_factory=EmbedderConfig)
     routes: list[str] | None = None
-    """Routes from a query to frames: cot_text (matches the outcome of the model's rationale to
-    frames), predict_image (matches the model's description of the future frame to frames) and
-    predict_caption (matches this description to the model's captions of the frames). null uses
-    cot_text for a student, and all three for a base."""
+    """Routes from a query to frames: cot_text (matches the prediction and the outcome of the
+    model's rationale to frames), predict_image (matches the model's description of the future frame
+    to frames) and predict_caption (matches this description to the model's captions of the frames).
+    null uses cot_text for a student, and all three for a base."""
 
     def find_problems(self, group: str) -> list[str]:
         return check_choices("routes", self.routes, ROUTES)

@@ -81,10 +81,10 @@ class RelationBounds(Settings):
     """Maximum distance of an object between two others from the line through them, as a share of
     their distance."""
     nearer: float = setting(1.25, above=1)
-    """An object is nearer to another than to a third if the latter distance is at least as many
-    times the former."""
+    """a is nearer to b than to c if it is at least this many times as far from c as from b."""
     covered: float = setting(0.9, above=0, most=1)
-    """Visible fraction of an object below which one before it is in front of it."""
+    """An object is partly hidden if its visible fraction is below this. A close object that is
+    lower in the image is then in front of it."""
     cover_distance: float = setting(0.12, above=0)
     """Maximum distance in the image of an object from one that it covers, as a share of the
     width."""

@@ -156,8 +156,11 @@ def _offsets(scene: Scene, target: int, other: Scene, frame: int) -> dict[str, f
 def _object_facts(
     scene: Scene, index: int, cut: int, other: Scene, other_index: int | None, target: int
 ) -> ObjectFacts:
-    """Return the facts of an object at the cut of a scene and at a frame of another scene, where it
-    has another index; None if that scene lacks the object."""
+    """Return the facts of an object at the cut of `scene` and at frame `target` of `other`.
+
+    Args:
+        other_index: The object's index in `other`; None if that scene lacks it.
+    """
     sight, target_sight = object_sight(scene, cut, index), OUT_OF_VIEW
     target_region = OUT_OF_VIEW
     if other_index is not None:

@@ -72,10 +72,10 @@ class Bounds(NamedTuple):
     """Maximum distance of an object between two others from the line through them, as a share of
     their distance."""
     nearer: float = 1.25
-    """An object is nearer to another than to a third if the latter distance is at least as many
-    times the former."""
+    """a is nearer to b than to c if it is at least this many times as far from c as from b."""
     covered: float = 0.9
-    """Visible fraction of an object below which one before it is in front of it."""
+    """An object is partly hidden if its visible fraction is below this. A close object that is
+    lower in the image is then in front of it."""
     cover_distance: float = 0.12
     """Maximum distance in the image of an object from one that it covers, as a share of the
     width."""
@@ -111,8 +111,10 @@ def find_topic(statement: Relation, relations: Sequence[Relation]) -> Relation |
         subject, *others = objects
         same = (r for r in relations if r.kind == kind and r.objects[0] == subject)
         return next((r for r in same if {*r.objects[1:]} == {*others}), None)
+    if kind not in SYMMETRIC:
+        return None
     for relation in relations:
-        if kind in SYMMETRIC and relation[:2] == (kind, objects):
+        if relation[:2] == (kind, objects):
             return relation if objects == statement.objects else flip_relation(relation)
     return None
 

@@ -29,8 +29,8 @@ from teacher.writers.paper import Detail, Writer
 PHRASES = yaml.safe_load((files("teacher") / "templates" / "relations.yaml").read_text())
 
 POSSESSIVE = {"is": "has", "will be": "will have"}
-"""The verbs of statements, and those of statements in which the subject has another object beside
-it."""
+"""For each verb, the one to use if the other object is named before the relation: "the cube *has*
+the sphere left of it"."""
 
 
 def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> RelationalPredicates:
@@ -56,8 +56,8 @@ class RelationalWriter(Writer):
     """Writes the sections of a rationale from relational predicates.
 
     The prediction begins with the statements that decide the item (see `teacher.deciding`), and the
-    candidate analysis holds each candidate against just these. Other objects that are out of view
-    at the cut are left out.
+    candidate analysis compares each candidate with these statements only. Other objects that are
+    out of view at the cut are left out.
     """
 
     facts: RelationalPredicates
@@ -163,7 +163,7 @@ class RelationalWriter(Writer):
         changes = [
             r
             for r in self.facts.target.relations
-            if r.kind in CHANGES and r.objects[0] in named and set(r.objects) <= named
+            if r.kind in CHANGES and named.issuperset(r.objects)
         ]
         for change in changes[: self.detail.relations]:
             parts.append(f"the {change.objects[0]} {self.place(change)}")
