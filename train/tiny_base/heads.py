@@ -68,6 +68,8 @@ class OracleTargets:
 
     Attributes:
         visual: (B, T) positions of the visual tokens in the sequence.
+        start: (B,) positions of the first tokens, before which a sequence is padded.
+        has_picture: (B, PICTURES) whether the prompt has the picture.
         presence: (B, T) 1 where the centre of an object is in the token, otherwise 0.
         objects: (N, 2) row of the batch and token.
         truth: Properties of the N objects, see `oracle_targets.stack_targets`; places are relative
@@ -76,9 +78,10 @@ class OracleTargets:
         tracked: (K, 3) row, token of a candidate, and token of the same object in the clip.
         names: (M, 2) row and position of a name's last token.
         name_words: (M,) the named object's colour, material and shape, by kind.
-        found: (M, PICTURES) token of the named object in each picture, or -1.
+        found: (M, PICTURES) token of the named object in each picture, or -1 where it is not
+            visible.
         shown: (_, 3) row, position of a name, and token of the object in the picture that the text
-            speaks of.
+            speaks of, or -1 where it is not visible.
         places: (M, 2 * PICTURES) its places relative to the centre of each picture, NaN where it is
             not visible.
         future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
@@ -106,6 +109,8 @@ class OracleTargets:
     """
 
     visual: Tensor
+    start: Tensor
+    has_picture: Tensor
     presence: Tensor
     objects: Tensor
     truth: dict[str, Tensor]
@@ -251,10 +256,13 @@ class OracleHeads(nn.Module):
         """Return the losses at names in texts, from the output of the layer `NAMING`, (B, L, H)."""
         row, at = targets.names.T
         named = self.norms["named"](hidden[row, at])
-        visible = (targets.found >= 0).float()
+        pictures = targets.has_picture[row]
+        visible = (targets.found >= 0).float()[pictures]
         spread = measure_spread(targets.places)[:, None]
         return {
-            "visible": binary_cross_entropy_with_logits(self.named["visible"](named), visible),
+            "visible": binary_cross_entropy_with_logits(
+                self.named["visible"](named)[pictures], visible
+            ),
             "places": distance(self.named["places"](named), targets.places, SCALES["place"]),
             "future": distance(self.named["future"](named), targets.future, SCALES["since"]),
             "spread": distance(self.spread(named), spread, SCALES["since"]),
@@ -272,9 +280,10 @@ class OracleHeads(nn.Module):
         }
 
     def named_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
-        """Return the errors of what the heads read at names, as shares of the image:
-        `named_place_error`, and `named_future_error` beside `named_future_still`, the error of
-        staying put, of objects that will be displaced."""
+        """Return what the heads read at names: `named_visible`, whether they tell if a picture
+        shows the object, and errors as shares of the image: `named_place_error`, and
+        `named_future_error` beside `named_future_still`, the error of staying put, of objects that
+        will be displaced."""
         row, at = targets.names.T
         named = self.norms["named"](hidden[row, at])
         read = {name: self.named[name](named).float() for name in ("places", "future")}
@@ -283,7 +292,10 @@ class OracleHeads(nn.Module):
         still = targets.future.norm(dim=1)
         displaced = still > MOVING
         future = (read["future"] / SCALES["since"] - targets.future).norm(dim=1)
+        pictures = targets.has_picture[row]
+        visible = (self.named["visible"](named) > 0) == (targets.found >= 0)
         return {
+            "named_visible": visible[pictures].float(),
             "named_place_error": errors[~errors.isnan()],
             "named_future_error": future[displaced],
             "named_future_still": still[displaced],
@@ -300,8 +312,9 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     label          PRECEDING 2    visual token of a candidate -> its letter in the prompt
     track          TRACKING 0     object in a candidate -> the same object at the end of the clip
     letter         TRACKING 1     name in a text about a candidate -> the candidate's letter there
-    find k         NAMING k       name -> the object in picture k
-    find shown     NAMING 5       name -> the object in the picture that the text describes
+    find k         NAMING k       name -> the object in picture k, or, if the picture does not show
+                                  it, the first token of the sequence
+    find shown     NAMING 5       name -> likewise, in the picture that the text describes
     subject        RECALLING 0    token that describes an object -> the object's name
     repeat         RECALLING 1    token before a repeated name -> the name's last mention
     comparison     RECALLING 2    end of a place in a candidate -> the end of the predicted place if
@@ -321,17 +334,17 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         query, key = targets.visual[row, start], targets.visual[row, end]
         losses["track"] = -trace.log_attention(TRACKING, 0, row, query, key).mean()
     for head in range(PICTURES):
-        found = targets.found[:, head]
-        row, query = targets.names[found >= 0].T
+        named = targets.has_picture[targets.names[:, 0], head]
+        row, query = targets.names[named].T
         if len(row):
-            key = targets.visual[row, found[found >= 0]]
+            key = locate_objects(row, targets.found[named, head], targets)
             losses[f"find {head}"] = -trace.log_attention(NAMING, head, row, query, key).mean()
     row, position = targets.text_tokens.T
     before, second_before = (torch.stack([row, position, position - k], dim=1) for k in (1, 2))
     row, query, token = targets.following.T
     following = torch.stack([row, query, targets.visual[row, token]], dim=1)
     row, query, token = targets.shown.T
-    shown = torch.stack([row, query, targets.visual[row, token]], dim=1)
+    shown = torch.stack([row, query, locate_objects(row, token, targets)], dim=1)
     for name, layer, head, pairs in (
         ("before", PRECEDING, 0, before),
         ("second before", PRECEDING, 1, second_before),
@@ -349,6 +362,11 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         if len(row):
             losses[name] = -trace.log_attention(layer, head, row, query, key).mean()
     return losses
+
+
+def locate_objects(row: Tensor, token: Tensor, targets: OracleTargets) -> Tensor:
+    """Return the positions of visual tokens in the sequence, and that of its first token for -1."""
+    return targets.visual[row, token].where(token >= 0, targets.start[row])
 
 
 def distance(predicted: Tensor, true: Tensor, scale: float) -> Tensor:

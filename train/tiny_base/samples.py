@@ -117,7 +117,8 @@ class OracleCollator:
             pairs["comparisons"] += [
                 (row, start + shown, start + predicted) for shown, predicted in text.comparisons()
             ]
-        return batch, stack_samples(samples, mentions, pairs, visual, grid)
+        start = batch["attention_mask"].argmax(dim=1)
+        return batch, stack_samples(samples, mentions, pairs, visual, start, grid)
 
     def _find_letters(
         self, ids: Tensor, visual: Tensor, samples: Sequence[OracleSample], grid: int
@@ -207,6 +208,7 @@ def stack_samples(
     mentions: Sequence[LocatedMention],
     pairs: Mapping[str, list[tuple[int, ...]]],
     visual: Tensor,
+    start: Tensor,
     grid: int,
 ) -> OracleTargets:
     """Return the targets of a batch.
@@ -214,6 +216,7 @@ def stack_samples(
     Args:
         pairs: Further rows and positions, by attribute of `OracleTargets`.
         visual: (B, T) positions of the visual tokens, grid x grid for each picture.
+        start: (B,) positions of the first tokens.
     """
     objects = [
         (row, t) for row, s in enumerate(samples) for t in most_visible_per_token(s.targets, grid)
@@ -229,8 +232,13 @@ def stack_samples(
     scaled = truth["place"] * grid
     truth["place"] = truth["place"] - 0.5
 
+    has_picture = torch.tensor(
+        [[0 <= s.last + k < s.sample.pictures for k in range(PICTURES)] for s in samples]
+    )
     return OracleTargets(
         visual=visual,
+        start=start,
+        has_picture=has_picture,
         presence=presence,
         objects=at,
         truth=truth,
@@ -240,7 +248,11 @@ def stack_samples(
         name_words=name_words([m.name for m in mentions]),
         found=integers([m.found for m in mentions], PICTURES),
         shown=integers(
-            [(m.row, m.position, m.found[m.picture]) for m in mentions if m.found[m.picture] >= 0],
+            [
+                (m.row, m.position, m.found[m.picture])
+                for m in mentions
+                if has_picture[m.row, m.picture]
+            ],
             3,
         ),
         places=torch.tensor([m.places for m in mentions]).reshape(-1, 2 * PICTURES) - 0.5,

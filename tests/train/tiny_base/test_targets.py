@@ -20,6 +20,7 @@ from train.tiny_base.heads import (
     UNSEEN_DISTANCE,
     OracleHeads,
     distance,
+    locate_objects,
     measure_spread,
     octant,
     pointing_losses,
@@ -229,6 +230,22 @@ def test_names_refer_to_the_picture_that_the_text_speaks_of(sampler, collate, pr
             word = processor.tokenizer.decode(batch["input_ids"][row, letter]).strip()
             picture = 1 + LETTERS.index(word)
         assert token == targets.found[names[row, at], picture]
+
+
+def test_names_of_unseen_objects_refer_to_the_first_token(sampler, collate) -> None:
+    crossed = [item for item in sampler.items if "cross" in item.item_id]
+    samples = [sampler.sample(item, "describe", "test") for item in crossed[:6]]
+    batch, targets = collate(samples)
+    assert targets.has_picture.tolist() == [[False, True, True, True, True]] * len(samples)
+    row, _, token = targets.shown.T
+    assert (token < 0).sum() > 5
+    positions = locate_objects(row, token, targets)
+    seen = token >= 0
+    assert positions[seen].equal(targets.visual[row[seen], token[seen]])
+    for k, position in zip(row[~seen].tolist(), positions[~seen].tolist(), strict=True):
+        mask = batch["attention_mask"][k]
+        assert mask[position] == 1
+        assert not mask[:position].any()
 
 
 def test_texts_without_pictures_have_losses(sampler, collate, deep_model, heads) -> None:
