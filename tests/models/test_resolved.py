@@ -46,9 +46,9 @@ def hub(tmp_path, monkeypatch):
 
 
 def test_a_resumed_run_keeps_its_precision(base, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("models.precision.supports_bf16", lambda: True)
+    monkeypatch.setattr("models.precision.supports_bf16", lambda on_cpu=False: True)
     assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
-    monkeypatch.setattr("models.precision.supports_bf16", lambda: False)
+    monkeypatch.setattr("models.precision.supports_bf16", lambda on_cpu=False: False)
     assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
     assert resolve_precision("auto") == "fp32"
 
