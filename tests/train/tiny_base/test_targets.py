@@ -7,23 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch.nn.functional import one_hot
 
-from data.records import LETTERS, SelectionItem, sample_prefix_frames
-from data.render.frame_cache import FrameReader
+from data.records import LETTERS, sample_prefix_frames
 from data.store import Store
 from teacher.predicates.motion import find_cut, motion_start
 from train.tiny_base.data import TEXT_FACTOR, ItemSampler
 from train.tiny_base.heads import (
-    PICTURES,
-    SCALES,
-    UNSEEN_DISTANCE,
-    OracleHeads,
-    distance,
     locate_objects,
-    measure_spread,
-    octant,
-    pointing_losses,
 )
 from train.tiny_base.mentions import TokenizedText
 from train.tiny_base.oracle_targets import (
@@ -39,69 +29,12 @@ from train.tiny_base.oracle_targets import (
 )
 from train.tiny_base.questions import KINDS, WITHOUT_PICTURES
 from train.tiny_base.samples import (
-    OracleCollator,
-    OracleSample,
     shown_objects,
     spoken_state,
 )
-from train.tiny_base.trace import (
-    NAMING,
-    PRECEDING,
-    RECALLING,
-    SPEAKING,
-    TRACKING,
-    encode_pictures,
-    select_tokens,
-    trace_forward,
-)
-from train.tiny_base.training import first_tokens, motion_losses, words_losses
 
 GRID = 3
 """Visual tokens along the side of an image of 96 px."""
-
-
-@pytest.fixture(scope="module")
-def items(micro_store: Store) -> list[SelectionItem]:
-    return [
-        item
-        for item in micro_store.selection("train")
-        if find_cut(micro_store.scene(item.scene_id), item.prefix_start, item.prefix_stop)
-    ]
-
-
-@pytest.fixture(scope="module")
-def sampler(items: list[SelectionItem], frames: FrameReader) -> ItemSampler:
-    return ItemSampler(items, frames, 6, seed=0)
-
-
-@pytest.fixture(scope="module")
-def samples(sampler: ItemSampler) -> list[OracleSample]:
-    return [sampler.sample(item, "compare", "test") for item in sampler.items[:3]]
-
-
-@pytest.fixture
-def collate(processor) -> OracleCollator:
-    return OracleCollator(processor, 1500)
-
-
-@pytest.fixture(params=[PICTURES + 1, 1], ids=["", "grouped"])
-def deep_model(model, request: pytest.FixtureRequest):
-    """A model with enough layers for all targets, without and with grouped-query attention."""
-    from models.tiny_qwen3_vl import build_model
-    from tests.tiny_models import SMALL
-
-    model = build_model(
-        replace(SMALL, layers=SPEAKING + 1, heads=PICTURES + 1, kv_heads=request.param),
-        model.config.text_config.vocab_size,
-    )
-    return model.eval()
-
-
-@pytest.fixture
-def heads(deep_model, processor) -> OracleHeads:
-    words = first_tokens(processor)
-    kinds = {kind: words[kind] for kind in ("color", "material", "shape")}
-    return OracleHeads(deep_model.get_input_embeddings(), kinds)
 
 
 def test_clip_targets_are_those_of_the_oracle(micro_store: Store, items) -> None:
@@ -248,14 +181,6 @@ def test_names_of_unseen_objects_refer_to_the_first_token(sampler, collate) -> N
         assert not mask[:position].any()
 
 
-def test_texts_without_pictures_have_losses(sampler, collate, deep_model, heads) -> None:
-    batch, targets = collate([sampler.sample(i, "narrate", "test") for i in sampler.items[:3]])
-    losses = words_losses(deep_model, heads, batch, targets)
-    assert {"words", "spelled color", "verdict", "repeat"} <= losses.keys()
-    assert not {"color", "place", "named places", "find 0", "label", "find shown"} & losses.keys()
-    assert sum(losses.values()).isfinite()
-
-
 def test_repeated_names_refer_to_their_last_mention(samples, collate, processor) -> None:
     batch, targets = collate(samples)
     assert len(targets.repeats) > 20
@@ -321,133 +246,6 @@ def test_observed_states_are_those_of_the_cut(micro_store: Store, items) -> None
     assert earlier
 
 
-def test_vision_tower_alone_gives_what_the_whole_model_embeds(samples, collate, deep_model) -> None:
-    batch, targets = collate(samples)
-    inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
-    with torch.no_grad():
-        with trace_forward(deep_model.model.language_model, batch["attention_mask"]) as trace:
-            deep_model.model(**inputs)
-        alone = encode_pictures(deep_model, batch)
-    torch.testing.assert_close(alone, select_tokens(trace.embedded, targets.visual))
-
-
-@pytest.mark.parametrize("layer", [PRECEDING, TRACKING, NAMING, RECALLING, SPEAKING])
-def test_traced_attention_is_that_of_the_model(samples, collate, deep_model, layer: int) -> None:
-    batch, targets = collate(samples)
-    inputs = {k: v for k, v in batch.items() if k not in ("labels", "logits_to_keep")}
-    deep_model.set_attn_implementation("eager")
-    with torch.no_grad():
-        with trace_forward(deep_model.model.language_model, batch["attention_mask"]) as trace:
-            attention = deep_model(**inputs, output_attentions=True).attentions[layer]
-        row = torch.tensor([0, 1, 2, 2])
-        query = torch.tensor([-1, -5, -1, -2]) + attention.shape[-1]
-        key = targets.visual[row, torch.tensor([0, 4, 8, 9])]
-        logarithms = trace.log_attention(layer, 1, row, query, key)
-    torch.testing.assert_close(logarithms.exp(), attention[row, 1, query, key])
-
-
-def test_losses_train_the_layers_that_they_refer_to(samples, collate, deep_model, heads) -> None:
-    batch, targets = collate(samples)
-    losses = motion_losses(deep_model, heads, batch, targets)
-    losses["place"].backward(retain_graph=True)
-    layers = deep_model.model.language_model.layers
-    weights = [layer.mlp.down_proj.weight.grad for layer in layers]
-    assert [w is not None for w in weights] == [True] * 3 + [False] * 3
-    deep_model.zero_grad(set_to_none=True)
-    losses["color"].backward()
-    assert layers[0].mlp.down_proj.weight.grad is None
-    assert deep_model.model.visual.blocks[0].attn.qkv.weight.grad is not None
-
-
-def test_measures_of_what_is_right_and_of_staying_put(samples, collate, deep_model) -> None:
-    # The small tokenizer splits words, and some have the same first token.
-    tokens = {"color": [*range(20, 28)], "material": [28, 29], "shape": [30, 31, 32]}
-    heads = OracleHeads(deep_model.get_input_embeddings(), tokens)
-    _, targets = collate(samples)
-    truth, (row, token) = targets.truth, targets.objects.T
-    hidden = heads.known["place"].in_features
-    heads.norms["seen"] = heads.norms["known"] = torch.nn.Identity()
-    moves = truth["velocity"].norm(dim=1) > 0.012
-
-    # Each head of the middle layers reads two numbers of its own.
-    known = torch.zeros(*targets.visual.shape, hidden)
-    for k, (name, head) in enumerate(heads.known.items()):
-        torch.nn.init.zeros_(head.weight)
-        torch.nn.init.zeros_(head.bias)
-        width = head.out_features
-        head.weight.data[:, 2 * k : 2 * k + width] = torch.eye(width)
-        values = moves[:, None].float() - 0.5 if name == "moving" else truth[name] * SCALES[name]
-        known[row, token, 2 * k : 2 * k + width] = values.nan_to_num()
-    # Tokens whose products with the embeddings of the right words are 1, and with others 0.
-    right = torch.cat([one_hot(truth[kind], len(ids)) for kind, ids in tokens.items()], dim=1)
-    words = deep_model.get_input_embeddings().weight[20:33]
-    seen = torch.zeros_like(known)
-    seen[row, token] = right.float() @ torch.linalg.pinv(words.detach()).T
-
-    measures = heads.measures(seen, known, targets)
-    for name in ("color", "material", "shape", "moving", "heading"):
-        assert len(measures[name])
-        assert measures[name].float().mean() == 1
-    errors = [name for name in measures if name.endswith("_error")]
-    assert len(errors) == 2 + len(AHEAD)
-    for name in errors:
-        assert measures[name].max() < 1e-5
-
-    still = heads.measures(-seen, torch.zeros_like(known), targets)
-    assert still["color"].float().mean() < 1
-    observed = ~truth["velocity"][:, 0].isnan()
-    assert still["moving"].tolist() == (~moves[observed]).tolist()
-    for name in errors[1:]:
-        unmoved = still[name.replace("_error", "_still")]
-        torch.testing.assert_close(still[name], unmoved)
-
-
-def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, heads) -> None:
-    batch, targets = collate(samples)
-    optimizer = torch.optim.Adam([*deep_model.parameters(), *heads.parameters()], lr=3e-3)
-    totals = []
-    for _ in range(8):
-        losses = words_losses(deep_model, heads, batch, targets)
-        assert {"words", "track", "find 0", "named places", "color", "since"} <= losses.keys()
-        assert {"subject", "letter", "repeat", "verdict"} <= losses.keys()
-        assert {"spoken place", "spelled color"} <= losses.keys()
-        total = sum(losses.values())
-        optimizer.zero_grad()
-        total.backward()
-        optimizer.step()
-        totals.append(total.item())
-    assert totals[-1] < 0.8 * totals[0]
-
-
-def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate) -> None:
-    class Certain:
-        def log_attention(self, layer, head, row, query, key):
-            return torch.zeros(len(row))
-
-    _, targets = collate(samples)
-    losses = pointing_losses(Certain(), targets)
-    assert losses.keys() == {
-        "before", "second before", "track", *(f"find {k}" for k in range(PICTURES)), "subject",
-        "find shown", "label", "letter", "repeat", "verdict", "comparison", "owner",
-    }  # fmt: skip
-    assert not any(loss.item() for loss in losses.values())
-
-
-def test_unknown_values_do_not_count() -> None:
-    true = torch.tensor([[0.2, 0.1], [float("nan")] * 2])
-    predicted = torch.tensor([[0.6, 0.3], [9.0, 9.0]])
-    assert distance(predicted, true, 3.0).item() == pytest.approx(0, abs=1e-12)
-    assert distance(predicted, true * float("nan"), 3.0).item() == 0
-    assert distance(predicted + 0.2, true, 3.0).item() == pytest.approx(2 * (0.2 - 0.05))
-
-
-def test_headings_are_eighths_of_the_circle() -> None:
-    angles = torch.arange(0, 360, 45) * torch.pi / 180
-    vectors = torch.stack([angles.cos(), angles.sin()], dim=1)
-    assert len(octant(vectors).unique()) == 8
-    assert octant(vectors * 3 + 0.01).equal(octant(vectors))
-
-
 def test_samples_depend_on_seed_and_step_only(sampler: ItemSampler) -> None:
     first, again, later = (sampler.batch("words", step, 4) for step in (1, 1, 1 + len(KINDS)))
     assert [s.sample.response for s in first] == [s.sample.response for s in again]
@@ -462,17 +260,3 @@ def test_steps_ask_more_questions_without_pictures(sampler: ItemSampler) -> None
     for step, kind in enumerate(KINDS):
         expected = 2 * TEXT_FACTOR if kind in WITHOUT_PICTURES else 2
         assert len(sampler.batch("words", step, 2)) == expected
-
-
-def test_spread_is_the_mean_distance_from_the_mean_place() -> None:
-    unseen = float("nan")
-    places = torch.tensor(
-        [
-            [9, 9, 0.1, 0.2, 0.1, 0.2, 0.1, 0.2, 0.1, 0.2],
-            [9, 9, 0.0, 0.0, 0.4, 0.0, 0.4, 0.0, 0.0, 0.0],
-            [9, 9, 0.3, 0.0, 0.3, 0.0, 0.3, 0.0, unseen, unseen],
-            [0.5, 0.5, *[unseen] * 8],
-        ]
-    )
-    expected = torch.tensor([0, 0.2, UNSEEN_DISTANCE / 4, unseen])
-    assert torch.allclose(measure_spread(places), expected, equal_nan=True)

@@ -1,0 +1,69 @@
+"""Samples of the tiny base, and a model that is deep enough for its targets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from data.records import SelectionItem
+from data.render.frame_cache import FrameReader
+from data.store import Store
+from teacher.predicates.motion import find_cut
+from train.tiny_base.data import ItemSampler
+from train.tiny_base.heads import (
+    PICTURES,
+    OracleHeads,
+)
+from train.tiny_base.samples import (
+    OracleCollator,
+    OracleSample,
+)
+from train.tiny_base.trace import (
+    SPEAKING,
+)
+from train.tiny_base.training import first_tokens
+
+
+@pytest.fixture(scope="module")
+def items(micro_store: Store) -> list[SelectionItem]:
+    return [
+        item
+        for item in micro_store.selection("train")
+        if find_cut(micro_store.scene(item.scene_id), item.prefix_start, item.prefix_stop)
+    ]
+
+
+@pytest.fixture(scope="module")
+def sampler(items: list[SelectionItem], frames: FrameReader) -> ItemSampler:
+    return ItemSampler(items, frames, 6, seed=0)
+
+
+@pytest.fixture(scope="module")
+def samples(sampler: ItemSampler) -> list[OracleSample]:
+    return [sampler.sample(item, "compare", "test") for item in sampler.items[:3]]
+
+
+@pytest.fixture
+def collate(processor) -> OracleCollator:
+    return OracleCollator(processor, 1500)
+
+
+@pytest.fixture(params=[PICTURES + 1, 1], ids=["", "grouped"])
+def deep_model(model, request: pytest.FixtureRequest):
+    """A model with enough layers for all targets, without and with grouped-query attention."""
+    from models.tiny_qwen3_vl import build_model
+    from tests.tiny_models import SMALL
+
+    model = build_model(
+        replace(SMALL, layers=SPEAKING + 1, heads=PICTURES + 1, kv_heads=request.param),
+        model.config.text_config.vocab_size,
+    )
+    return model.eval()
+
+
+@pytest.fixture
+def heads(deep_model, processor) -> OracleHeads:
+    words = first_tokens(processor)
+    kinds = {kind: words[kind] for kind in ("color", "material", "shape")}
+    return OracleHeads(deep_model.get_input_embeddings(), kinds)
