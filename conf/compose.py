@@ -41,8 +41,9 @@ REMOVED_KEYS: dict[str, str] = {
     "benchmark.max_collisions": "use benchmark.world.start.max_collisions instead",
     "format": "leave it out: data.export writes a Hugging Face dataset",
     "shown": "use examples instead",
-    "url": "leave it out: the Hub writes the metadata of a dataset",
-    "published": "leave it out: the Hub writes the metadata of a dataset",
+    "url": "data.export does not need it, because the Hub writes the metadata of a dataset; the "
+    "address of a server is server.url or teacher.url",
+    "published": "data.export does not need it, because the Hub writes the metadata of a dataset",
     "cards": "use gpus instead",
     "train.keep": "use train.keep_checkpoints instead",
     "train.packing": "leave it out: samples of similar length are padded together",

@@ -1,5 +1,5 @@
-"""Draws the pictures of the README from a student's responses: an item that it solves beside one
-that it does not, with its own words (`docs/item.webp`), and the solved one as an animation
+"""Draws two pictures from a student's responses: an item that it solves beside one that it does
+not, with its own words (`docs/item.webp`), and the solved one as an animation
 (`docs/reasoning.webp`).
 
     python -m benchmarks.experiments.pictures checkpoints/select/model-checkpoints-sft-exp-cot

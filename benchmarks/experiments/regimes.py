@@ -47,7 +47,7 @@ RECORD = Path(__file__).with_name("letters.parquet")
 BOTH = ("reasoning", "answer")
 RELATIONAL = "teacher.predicates=relational"
 EPOCHS = "train.epochs=1"
-"""One epoch of these benchmarks has as many steps as four of `tiny`."""
+"""One epoch of these benchmarks has about as many steps as four of `tiny`."""
 ZERO_SHOT = "zero-shot"
 UNCHANGED = "none"
 CONTROLS = ("candidate_only", "shuffled_prefix", MATCHED_ANCHOR)
