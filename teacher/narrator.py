@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from data.records import Scene, SelectionItem
+from data.records import SelectionItem
 from teacher.deciding import choose_statements
-from teacher.predicates.extraction import extract_facts
 from teacher.predicates.facts import Predicates, RelationalPredicates
 from teacher.writers.paper import Detail, Writer
 from teacher.writers.relational import RelationalWriter
@@ -56,17 +55,6 @@ def make_writer(
 def list_clauses(predicates: Predicates, item: SelectionItem) -> dict[str, list[str]]:
     """Return the clauses from which a rationale can be made, by section, in full detail."""
     return make_writer(predicates, item, FULL, item.item_id, "clauses").sections()
-
-
-def write_description(scene: Scene, start: int, stop: int, target: int, seed: int) -> str | None:
-    """Describe what happens from the end of the prefix [start, stop] to the target frame.
-
-    The description mentions no candidates. Returns None if the prefix is too short.
-    """
-    facts = extract_facts(scene, start, stop, target)
-    if facts is None:
-        return None
-    return Writer(facts, FULL, seed, scene.scene_id, start, stop, target).text()
 
 
 def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:

@@ -86,21 +86,21 @@ class Writer:
     """Writes the sections of a text.
 
     Args:
-        facts: Content of the text. Predicates add the candidate analysis and the answer.
+        facts: Content of the text.
         detail: How many objects and pairs each section mentions.
         keys: Seed of the random choice of phrasings.
         padded: Whether to lengthen the text by two sentences that hold for every scene.
     """
 
     def __init__(
-        self, facts: Facts, detail: Detail, *keys: int | str, padded: bool = False
+        self, facts: Predicates, detail: Detail, *keys: int | str, padded: bool = False
     ) -> None:
         digest = hashlib.sha256(repr(keys).encode()).digest()
         self.rng = np.random.default_rng(int.from_bytes(digest[:8], "big"))
         self.facts, self.detail, self.padded = facts, detail, padded
         self.ranked = rank_objects(facts)
         self.target_regions = {o.object: o.target_region for o in facts.objects}
-        self.key = most_discriminative_object(facts) if isinstance(facts, Predicates) else None
+        self.key = most_discriminative_object(facts)
 
     def say(self, statement: str, **values: Any) -> str:
         """Fill a random phrasing of a statement with values."""
@@ -108,27 +108,21 @@ class Writer:
         return phrasings[self.rng.integers(len(phrasings))].format(**values)
 
     def text(self) -> str:
-        """Return a rationale from predicates, or a description from facts without candidates."""
+        """Return the rationale: a line for each section, and the answer."""
         lines = [f"{name}: {join_sentences(parts)}" for name, parts in self.sections().items()]
-        if isinstance(self.facts, Predicates):
-            lines.append(f"Answer: {self.facts.answer}")
-        return "\n".join(lines)
+        return "\n".join([*lines, f"Answer: {self.facts.answer}"])
 
     def sections(self) -> dict[str, list[str]]:
-        """Return the clauses of each section; the candidate analysis needs predicates."""
-        facts, answer = self.facts, None
-        sections = {
+        """Return the clauses of each section."""
+        return {
             "Scene parse": self.scene_parse(),
             "Motion analysis": self.motion_analysis(),
             "Prediction": self.prediction(),
+            "Candidate analysis": [
+                f"candidate {c.letter} {self.judgement(c)}" for c in self.facts.candidates
+            ],
+            "Outcome": self.outcome(),
         }
-        if isinstance(facts, Predicates):
-            answer = facts.answer
-            sections["Candidate analysis"] = [
-                f"candidate {c.letter} {self.judgement(c)}" for c in facts.candidates
-            ]
-        sections["Outcome"] = self.outcome(answer)
-        return sections
 
     def scene_parse(self) -> list[str]:
         parts = [self.observed(o) for o in self.order(self.ranked[: self.detail.parsed])]
@@ -187,7 +181,7 @@ class Writer:
     def prediction(self) -> list[str]:
         close = self.facts.close[: self.detail.pairs]
         parts = [f"{name_pair(c.objects)} will be very close {c.region}" for c in close]
-        key_first = sorted(self.ranked, key=lambda o: self.key is not None and o is not self.key)
+        key_first = sorted(self.ranked, key=lambda o: o is not self.key)
         parts += [self.expected(o) for o in key_first[: self.detail.predicted]]
         parts[0] = f"{self.facts.moment}, {parts[0]}"
         if self.padded:
@@ -227,11 +221,9 @@ class Writer:
         expected = self.target_regions.get(d.object)
         return self.say(statement, d=d, expected=expected, toward=toward_phrase(d.heading))
 
-    def outcome(self, answer: str | None) -> list[str]:
+    def outcome(self) -> list[str]:
         close = self.facts.close[:1]
         parts = [f"{name_pair(c.objects)} are very close {c.region}" for c in close]
         visible = [o for o in self.ranked if o.target_sight == "shown"]
         parts += [f"the {o.object} is {o.target_region}" for o in visible[: 2 - len(parts)]]
-        if answer is not None:
-            parts.append(self.say("answer", answer=answer))
-        return parts or ["no object is in view"]
+        return [*parts, self.say("answer", answer=self.facts.answer)]

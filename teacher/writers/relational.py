@@ -223,8 +223,8 @@ class RelationalWriter(Writer):
             return f"Candidate {candidate.letter} does not match: it {self.contrast(wrong, view)}."
         return super().match(candidate)
 
-    def outcome(self, answer: str | None) -> list[str]:
+    def outcome(self) -> list[str]:
         if not self.statements:
-            return super().outcome(answer)
+            return super().outcome()
         shortest = min(self.statements, key=lambda s: len(s.objects))
-        return [self.statement(shortest, "is"), self.say("answer", answer=answer)]
+        return [self.statement(shortest, "is"), self.say("answer", answer=self.facts.answer)]

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from conf.schema import TeacherConfig
-from teacher.narrator import write_description, write_rationale
-from teacher.numbers.detection import find_numbers
+from teacher.narrator import write_rationale
 from teacher.predicates.extraction import extract_predicates
 from teacher.validation.validator import WORD, validate_rationale
 from tests.children import run_child
@@ -63,16 +62,6 @@ def test_text_is_the_same_in_another_process():
     item, predicates = next(random_cases(9))
     result = run_child([sys.executable, "-c", code], check=True)
     assert result.stdout.strip() == write_rationale(predicates, item, 5)
-
-
-def test_descriptions_have_no_candidates_and_no_numbers():
-    scene = synthetic.random_scene(np.random.default_rng(2))
-    text = write_description(scene, 0, 20, 70, 0)
-    headings = [line.split(":")[0] for line in text.splitlines()]
-    assert headings == ["Scene parse", "Motion analysis", "Prediction", "Outcome"]
-    assert not find_numbers(text)
-    assert "andidate" not in text
-    assert text == write_description(scene, 0, 20, 70, 0)
 
 
 def change_letter(text, item):
