@@ -14,7 +14,7 @@ from teacher.predicates.facts import Predicates, RelationalPredicates
 from teacher.writers.paper import Detail, Writer
 from teacher.writers.relational import RelationalWriter
 
-NARRATOR_VERSION = "10"
+NARRATOR_VERSION = "11"
 SHORT, LONG = 110, 250
 """A rationale with more than LONG words is written again with less detail, one of fewer than SHORT
 words with more. SHORT is well above the minimum, 80 words (paper, Rationale construction)."""
@@ -47,7 +47,7 @@ def make_writer(
     """Return a writer for the vocabulary of predicates. All texts of an item rest on the same
     deciding statements."""
     if isinstance(predicates, RelationalPredicates):
-        decision = choose_statements(predicates, item.item_id)
+        decision = choose_statements(predicates)
         return RelationalWriter(predicates, decision, *args, padded=padded)
     return Writer(predicates, *args, padded=padded)
 

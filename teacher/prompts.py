@@ -19,7 +19,7 @@ from teacher.predicates.facts import Predicates, Relation, RelationalPredicates
 from teacher.predicates.relations import find_topic
 from teacher.sections import SECTIONS
 
-PROMPT_VERSION = "3"
+PROMPT_VERSION = "4"
 
 SYSTEM = (files("teacher") / "templates" / "system_prompt.txt").read_text().rstrip()
 CITED = (files("teacher") / "templates" / "cited_prompt.txt").read_text().rstrip()
@@ -60,7 +60,7 @@ def format_facts(predicates: Predicates, item: SelectionItem) -> dict[str, Any]:
     if not isinstance(predicates, RelationalPredicates):
         return asdict(predicates)
     facts = asdict(predicates.without_relations())
-    decision = choose_statements(predicates, item.item_id)
+    decision = choose_statements(predicates)
     named = {name for statement in decision.statements for name in statement.objects}
     facts["deciding"] = [
         {

@@ -52,7 +52,7 @@ def main() -> None:
             if predicates is None:
                 continue
             count += 1
-            timed("deciding statements", choose_statements, predicates, item.item_id)
+            timed("deciding statements", choose_statements, predicates)
             facts = choose_vocabulary(predicates, cfg)
             text = timed("rationale", write_rationale, facts, item, 0)
             result = timed("reading and validation", validate_rationale, text, facts, item, cfg)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import dist
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from teacher.predicates.facts import (
     RelationalPredicates,
     View,
 )
+from teacher.predicates.margins import measure_margin
 from teacher.predicates.motion import (
     describe_meeting,
     find_collision_courses,
@@ -34,7 +36,13 @@ from teacher.predicates.places import (
     object_sight,
     square_position,
 )
-from teacher.predicates.relations import Bounds, Places, find_changes, find_relations
+from teacher.predicates.relations import (
+    CHANGES,
+    Bounds,
+    Places,
+    find_changes,
+    find_relations,
+)
 
 STAYS, SHIFTS = 8.0, 60.0
 """Upper bounds of the displacement (px of the square image) of an object that "stays", and of one
@@ -97,12 +105,13 @@ def extract_predicates(
     if bounds is None:
         return Predicates(**vars(facts), candidates=candidates)
     cut = find_cut(scene, item.prefix_start, item.prefix_stop)
-    observed, views = _describe_views(item, scene, scene_of, cut, bounds)
+    observed, paths, views = _describe_views(item, scene, scene_of, cut, bounds)
     order = np.argsort(scene.image_positions[cut, :, 0], kind="stable")
     return RelationalPredicates(
         **vars(facts),
         candidates=candidates,
         left_to_right=tuple(scene.objects[k].noun_phrase for k in order),
+        paths=paths,
         observed=observed,
         views=views,
     )
@@ -114,10 +123,11 @@ def _describe_views(
     scene_of: Callable[[str], Scene],
     cut: int,
     bounds: Bounds,
-) -> tuple[tuple[Relation, ...], tuple[View, ...]]:
-    """Return the relations at the cut, and the views of the candidates."""
+) -> tuple[tuple[Relation, ...], dict[str, float], tuple[View, ...]]:
+    """Return the relations at the cut, the paths of the objects, and the views of the
+    candidates."""
     earlier = Places.of(scene, cut)
-    views = []
+    views, places = [], []
     for letter, candidate in zip(LETTERS, item.candidates, strict=True):
         other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
         index = {key: k for k, key in enumerate(other.object_keys)}
@@ -130,27 +140,15 @@ def _describe_views(
         relations = find_relations(later, bounds)
         relations |= find_changes(earlier, later, at_rest, bounds)
         close = close_pairs(other, candidate.frame)
-        offsets = _offsets(scene, item.target_frame, other, candidate.frame)
-        views.append(View(letter, objects, close, tuple(sorted(relations)), offsets))
-    return tuple(sorted(find_relations(earlier, bounds))), tuple(views)
-
-
-def _offsets(scene: Scene, target: int, other: Scene, frame: int) -> dict[str, float]:
-    """Return how far each object is from its place at the target; see `View`."""
-    index = {key: k for k, key in enumerate(other.object_keys)}
-    offsets = {}
-    for k, key in enumerate(scene.object_keys):
-        j = index.get(key)
-        was, shown = object_sight(scene, target, k), j is not None and object_sight(other, frame, j)
-        if was != "shown" and shown != "shown":
-            offset = 0.0
-        elif was == shown:
-            shift = square_position(other, frame, j) - square_position(scene, target, k)
-            offset = float(np.hypot(*shift))
-        else:
-            offset = float(IMAGE_SIZE)
-        offsets[key[0].noun_phrase] = offset
-    return offsets
+        views.append(View(letter, objects, close, tuple(sorted(relations)), {}))
+        places.append(later)
+    statements = [s for s in sorted(views[item.answer].statements) if s.kind not in CHANGES]
+    for view, later in zip(views, places, strict=True):
+        view.margins.update({s: measure_margin(s, later, bounds) for s in statements})
+    at_target = places[item.answer].image
+    both = earlier.image.keys() & at_target.keys()
+    paths = {name: dist(earlier.image[name], at_target[name]) for name in sorted(both)}
+    return tuple(sorted(find_relations(earlier, bounds))), paths, tuple(views)
 
 
 def _object_facts(

@@ -153,16 +153,16 @@ class View:
     """A frame as a reader of a rationale sees it, with what has changed since the cut.
 
     `objects` are the item's objects, with this frame as the target; an object that the frame's
-    scene lacks is out of view. `relations` are normalized and sorted. `offsets` are the distances
-    (px of the square image) of the objects from their places at the target, or the side of the
-    image for an object that is visible in only one of the two.
+    scene lacks is out of view. `relations` are normalized and sorted. `margins` has, for each
+    statement that is true of the target, how clearly it is true or false of this frame (see
+    `teacher.predicates.margins`).
     """
 
     letter: str
     objects: tuple[ObjectFacts, ...]
     close: tuple[Closeness, ...]
     relations: tuple[Relation, ...]
-    offsets: dict[str, float]
+    margins: dict[Relation, float]
 
     @cached_property
     def statements(self) -> frozenset[Relation]:
@@ -185,10 +185,13 @@ class RelationalPredicates(Predicates):
 
     `left_to_right` are the names of the objects in the order of their places along the image's
     width at the cut, `observed` are the relations at the cut, and `views` are the candidates as a
-    reader sees them. That of the answer is the view of the target.
+    reader sees them. That of the answer is the view of the target. `paths` are the distances in the
+    image, as shares of its width and height, of the objects that are visible at the cut and the
+    target from one to the other.
     """
 
     left_to_right: tuple[str, ...]
+    paths: dict[str, float]
     observed: tuple[Relation, ...]
     views: tuple[View, ...]
 

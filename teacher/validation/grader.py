@@ -61,7 +61,7 @@ class RationaleGrader:
         else:
             vocabulary = choose_vocabulary(predicates, self.cfg)
             result = validate_rationale(response.text, vocabulary, item, self.cfg)
-        undecided = bool(choose_statements(predicates, item.item_id).rivals)
+        undecided = bool(choose_statements(predicates).rivals)
         sufficiency = None
         if result.sections:
             sufficiency = measure_sufficiency(response.text, result.claims, predicates)

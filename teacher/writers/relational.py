@@ -193,10 +193,10 @@ class RelationalWriter(Writer):
         return f"{text} but {self.difference(candidate.differences[0])}"
 
     def find_false(self, view: View) -> Relation | None:
-        """Return the first deciding statement that is false of a candidate."""
-        return next(
-            (s for s in self.statements if normalize_relation(s) not in view.statements), None
-        )
+        """Return the deciding statement that is most clearly false of a candidate."""
+        false = [s for s in self.statements if normalize_relation(s) not in view.statements]
+        # Statements that are not true of the target have no margin.
+        return min(false, key=lambda s: view.margins.get(normalize_relation(s), 0.0), default=None)
 
     def contrast(self, s: Relation, view: View) -> str:
         """State how a candidate differs from a deciding statement that is false of it."""

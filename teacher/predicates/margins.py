@@ -1,0 +1,129 @@
+"""Margins: how clearly a statement is true or false of a frame."""
+
+from __future__ import annotations
+
+from math import dist, hypot, inf
+
+from teacher.predicates.facts import REGIONS, Relation
+from teacher.predicates.relations import VALUES, Bounds, Places
+
+FAINT = 0.01
+"""Margin of a statement that is true or false because an object is hidden or missing. It is small,
+because a reader easily overlooks this."""
+CELLS = {value: (x, y) for y, row in enumerate(REGIONS) for x, value in enumerate(row)}
+"""Column and row of each region."""
+EXTREMES = {"leftmost": (0, 1), "rightmost": (0, -1), "topmost": (1, 1), "lowest": (1, -1)}
+"""Axis and sign that make the smallest coordinate that of the extreme object."""
+
+
+def measure_margin(statement: Relation, places: Places, bounds: Bounds) -> float:
+    """Return the distance of what a statement describes from the bound of its words, as a share of
+    the image's width or height: not negative if the statement is true of a frame, negative if it is
+    false.
+
+    The statement stays true, or false, if one of its objects moves by less than this in the image.
+    For gaps and "nearer to", which are measured on the ground, this holds approximately.
+
+    Args:
+        statement: Any statement of a frame, but no change since the cut.
+    """
+    kind, objects, value = statement
+    seen = all(name in places.image for name in objects)
+    if kind == "sight":
+        return -FAINT if seen else FAINT
+    if not seen:
+        return -FAINT
+    if kind == "region":
+        return _region_margin(places.image[objects[0]], value)
+    if kind in ("side", "height"):
+        axis = ("side", "height").index(kind)
+        first, second = (places.image[name][axis] for name in objects)
+        return _order_margin(second - first, VALUES[kind].index(value), bounds.level)
+    if kind == "extreme":
+        return _extreme_margin(objects[0], value, places, bounds)
+    if kind == "between":
+        return _between_margin(*(places.image[name] for name in objects), bounds)
+    if kind == "gap":
+        return _gap_margin(*objects, value, places, bounds)
+    if kind == "nearer":
+        return _nearer_margin(*objects, value, places, bounds)
+    return _cover_margin(*objects, value, places, bounds)
+
+
+def _region_margin(place: tuple[float, float], region: str) -> float:
+    """Return the distance from the nearest side of the region's cell; the image's edge is none."""
+    distances = []
+    for coordinate, cell in zip(place, CELLS[region], strict=True):
+        distances += [
+            coordinate - cell / 3 if cell > 0 else inf,
+            (cell + 1) / 3 - coordinate if cell < 2 else inf,
+        ]
+    return min(distances)
+
+
+def _order_margin(difference: float, position: int, level: float) -> float:
+    """Return the margin of a word for the order along an axis.
+
+    Args:
+        difference: Coordinate of the second object less that of the first.
+        position: 0 if the first object comes first, 1 if the two are level, 2 if it comes last.
+    """
+    return (difference - level, level - abs(difference), -difference - level)[position]
+
+
+def _extreme_margin(name: str, value: str, places: Places, bounds: Bounds) -> float:
+    axis, sign = EXTREMES[value]
+    others = [sign * place[axis] for other, place in places.image.items() if other != name]
+    return min(others, default=-inf) - sign * places.image[name][axis] - bounds.level
+
+
+def _between_margin(
+    place: tuple[float, float],
+    one: tuple[float, float],
+    other: tuple[float, float],
+    bounds: Bounds,
+) -> float:
+    dx, dy = other[0] - one[0], other[1] - one[1]
+    px, py = place[0] - one[0], place[1] - one[1]
+    length = hypot(dx, dy)
+    if length == 0:
+        return -inf
+    share, offset = (px * dx + py * dy) / length, abs(px * dy - py * dx) / length
+    ends = bounds.between_ends * length
+    return min(share - ends, length - ends - share, bounds.between_offset * length - offset)
+
+
+def _gap_margin(a: str, b: str, value: str, places: Places, bounds: Bounds) -> float:
+    size = (places.scale[a] + places.scale[b]) / 2
+    apart = dist(places.ground[a], places.ground[b])
+    against, near = (size * (1 + bound) for bound in (bounds.against, bounds.near))
+    margin = {
+        "against": against - apart,
+        "near": min(apart - against, near - apart),
+        "apart from": apart - near,
+    }[value]
+    return margin * _image_scale(places, (a, b))
+
+
+def _nearer_margin(a: str, b: str, c: str, value: str, places: Places, bounds: Bounds) -> float:
+    one, other = (dist(places.ground[a], places.ground[name]) for name in (b, c))
+    if value == "nearer to":
+        margin = other / bounds.nearer - one
+    else:
+        margin = min(one - other / bounds.nearer, other - one / bounds.nearer)
+    return margin * _image_scale(places, (a, b), (a, c)) / (1 + 1 / bounds.nearer)
+
+
+def _cover_margin(a: str, b: str, value: str, places: Places, bounds: Bounds) -> float:
+    front, back = (a, b) if value == "in front of" else (b, a)
+    lower = places.image[front][1] > places.image[back][1]
+    is_close = dist(places.image[a], places.image[b]) < bounds.cover_distance
+    return FAINT if lower and is_close and places.fraction[back] < bounds.covered else -FAINT
+
+
+def _image_scale(places: Places, *pairs: tuple[str, str]) -> float:
+    """Return the length in the image of a unit on the ground, measured between pairs of objects."""
+    image, ground = (
+        sum(dist(where[a], where[b]) for a, b in pairs) for where in (places.image, places.ground)
+    )
+    return image / ground if ground else 0.0
