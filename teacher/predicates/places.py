@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data.records import Scene
 from data.world.visibility import MIN_VISIBLE
@@ -37,12 +38,12 @@ def object_region(scene: Scene, frame: int, index: int) -> str:
     """Return the region of an object's center in a 3x3 grid, or "out of view"."""
     if not scene.in_view[frame, index]:
         return OUT_OF_VIEW
-    return _cell(scene, scene.image_positions[frame, index])
+    return region_at(scene.image_positions[frame, index] / scene.image_size)
 
 
-def _cell(scene: Scene, point: np.ndarray) -> str:
-    cell = point / scene.image_size * 3
-    column, row = np.clip(np.floor(cell), 0, 2).astype(int)
+def region_at(place: ArrayLike) -> str:
+    """Return the region of a place (x, y) in shares of the image's width and height."""
+    column, row = np.clip(np.floor(np.multiply(place, 3)), 0, 2).astype(int)
     return REGIONS[row][column]
 
 
@@ -67,7 +68,7 @@ def close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
     return tuple(
         Closeness(
             (scene.objects[i].noun_phrase, scene.objects[j].noun_phrase),
-            _cell(scene, (places[i] + places[j]) / 2),
+            region_at((places[i] + places[j]) / 2 / scene.image_size),
         )
         for i, j in combinations(seen, 2)
         if np.linalg.norm(ground[i] - ground[j]) < VERY_CLOSE * mean_scale(scene, i, j)
