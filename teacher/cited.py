@@ -34,7 +34,7 @@ from teacher.reading.tagging import (
 )
 from teacher.sections import SECTIONS
 
-CITED_VERSION = "1"
+CITED_VERSION = "2"
 """Changes with the form of cited rationales and the rules for the words around slots."""
 SLOT = "{}"
 ANALYSIS = "Candidate analysis"

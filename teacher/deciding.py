@@ -3,6 +3,7 @@ false of every distractor."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import erf, hypot, sqrt
 
@@ -12,11 +13,11 @@ from teacher.predicates.facts import Relation, RelationalPredicates, View
 from teacher.predicates.relations import CHANGES
 
 SEEN_ERROR, PREDICTED_ERROR = 0.02, 0.3
-"""Errors of the places of objects with which a reader is assumed to see a frame (share of the
-image's width or height), and to predict the target (share of the object's path from the cut). The
-tiny base has about these."""
+"""Standard deviations, along each axis, of the places of objects as a reader is assumed to see them
+(share of the image's width or height), and of what it adds to them when it predicts the target
+(share of the object's path from the cut). Those of the tiny base are about as large."""
 UNKNOWN_PATH = 1.0
-"""Path that is assumed for an object that is not visible at the cut."""
+"""Path that is assumed for an object that is not visible both at the cut and at the target."""
 CLEARER = 1.25
 """A second statement is added to one that suffices if the right answer becomes at least this many
 times as likely."""
@@ -37,19 +38,21 @@ class Decision:
 
 
 def choose_statements(predicates: RelationalPredicates) -> Decision:
-    """Choose a smallest set of statements that excludes as many distractors as possible, or one
-    with a statement more if it is clearer.
+    """Choose a smallest set of statements that excludes as many distractors as possible, or two
+    statements instead of one if they are clearer.
 
-    Of the sets of a size, the one is chosen with which a reader most likely finds the target. This
-    reader sees the places of objects with normally distributed errors, `SEEN_ERROR`, and predicts
-    the target with further errors, `PREDICTED_ERROR`. It is right if every statement holds in the
-    predicted state and in the target as it sees it, and if it sees one to be false of each
-    distractor.
+    Of the sets of a size, the one is chosen with which a reader most likely finds the target; of
+    equal ones, the first in alphabetical order. This reader sees the places of objects with
+    normally distributed errors, `SEEN_ERROR`, and predicts the target with further errors,
+    `PREDICTED_ERROR`. It finds the target if it finds every statement true of the predicted state
+    and of the target, and one statement false of each distractor. The probabilities of these events
+    are multiplied, as if they were independent.
     """
     wrong = [view for view in predicates.views if view.letter != predicates.answer]
     statements = [s for s in sorted(predicates.target.statements) if s.kind not in CHANGES]
     holds = np.array([_probability_of_truth(s, predicates) for s in statements])
-    excludes = np.array([[_probability_of_falsity(s, v) for v in wrong] for s in statements])
+    excludes = np.array([[probability_of_falsity(s, v) for v in wrong] for s in statements])
+    excludes = excludes.reshape(len(statements), len(wrong))
     possible = excludes.any(axis=0)
     rivals = tuple(v.letter for v, excluded in zip(wrong, possible, strict=True) if not excluded)
     chosen = _choose_set(holds, excludes[:, possible]) if possible.any() else ()
@@ -68,6 +71,7 @@ def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:
     with_one = holds * excludes.prod(axis=1)
     missed = 1 - excludes
     with_two = np.outer(holds, holds) * (1 - missed[:, None] * missed[None]).prod(axis=2)
+    np.fill_diagonal(with_two, 0)
     if with_one.max() and with_one.max() * CLEARER >= with_two.max():
         return (int(with_one.argmax()),)
     if with_two.max():
@@ -77,24 +81,32 @@ def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:
     return tuple(int(k) for k in (holds[:, None] * excludes).argmax(axis=0))
 
 
-def _probability_of_truth(statement: Relation, predicates: RelationalPredicates) -> float:
-    """Return the probability that a reader finds a true statement true, both of the state that it
-    predicts and of the target."""
-    margin = predicates.target.margins[statement]
-    errors = [
-        SEEN_ERROR + PREDICTED_ERROR * predicates.paths.get(name, UNKNOWN_PATH)
-        for name in statement.objects
-    ]
-    seen = hypot(*[SEEN_ERROR] * len(statement.objects))
-    return _normal_cdf(margin / hypot(*errors)) * _normal_cdf(margin / seen)
-
-
-def _probability_of_falsity(statement: Relation, view: View) -> float:
+def probability_of_falsity(statement: Relation, view: View) -> float:
     """Return the probability that a reader finds a statement false of a candidate; 0 if it is
     true."""
     if statement in view.statements:
         return 0.0
-    return _normal_cdf(-view.margins[statement] / hypot(*[SEEN_ERROR] * len(statement.objects)))
+    # Only statements that are true of the target have margins.
+    margin = -view.margins.get(statement, 0.0)
+    return _normal_cdf(margin / hypot(*[SEEN_ERROR] * len(_involved(statement, view))))
+
+
+def _probability_of_truth(statement: Relation, predicates: RelationalPredicates) -> float:
+    """Return the probability that a reader finds a true statement true, both of the state that it
+    predicts and of the target."""
+    margin = predicates.target.margins[statement]
+    involved = _involved(statement, predicates.target)
+    paths = [predicates.paths.get(name, UNKNOWN_PATH) for name in involved]
+    predicted = hypot(*[SEEN_ERROR + PREDICTED_ERROR * path for path in paths])
+    seen = hypot(*[SEEN_ERROR] * len(involved))
+    return _normal_cdf(margin / predicted) * _normal_cdf(margin / seen)
+
+
+def _involved(statement: Relation, view: View) -> Sequence[str]:
+    """Return the objects whose places decide whether a statement is true of a frame."""
+    if statement.kind == "extreme":
+        return [o.object for o in view.objects if o.target_sight == "shown"] or statement.objects
+    return statement.objects
 
 
 def _normal_cdf(z: float) -> float:

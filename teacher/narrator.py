@@ -14,7 +14,7 @@ from teacher.predicates.facts import Predicates, RelationalPredicates
 from teacher.writers.paper import Detail, Writer
 from teacher.writers.relational import RelationalWriter
 
-NARRATOR_VERSION = "11"
+NARRATOR_VERSION = "10"
 SHORT, LONG = 110, 250
 """A rationale with more than LONG words is written again with less detail, one of fewer than SHORT
 words with more. SHORT is well above the minimum, 80 words (paper, Rationale construction)."""

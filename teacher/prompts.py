@@ -19,7 +19,7 @@ from teacher.predicates.facts import Predicates, Relation, RelationalPredicates
 from teacher.predicates.relations import find_topic
 from teacher.sections import SECTIONS
 
-PROMPT_VERSION = "4"
+PROMPT_VERSION = "3"
 
 SYSTEM = (files("teacher") / "templates" / "system_prompt.txt").read_text().rstrip()
 CITED = (files("teacher") / "templates" / "cited_prompt.txt").read_text().rstrip()

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from conf.schema import TeacherConfig
     from data.store import Store
 
-VERSIONS = {"paper": "1", "relational": "1"}
-"""Version of each vocabulary. It changes whenever the same scene gives other predicates."""
+VERSIONS = {"paper": "1", "relational": "2"}
+"""Version of each vocabulary. It changes whenever the same item gives other predicates or other
+deciding statements."""
 
 
 def name_vocabulary(cfg: TeacherConfig) -> str:

@@ -42,6 +42,7 @@ from data.tracks.selection.distractors import BUILDERS_VERSION
 from evaluation.metrics.reasons import PARTS, SUPPORTED, read_reasons
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
+from teacher.vocabulary import VERSIONS
 
 RECORD = Path(__file__).with_name("letters.parquet")
 BOTH = ("reasoning", "answer")
@@ -105,7 +106,7 @@ def main() -> None:
     preset = compose("train.sft", SftCommand, overrides)
     base = weights_digest(preset.student.model)
     # Results of other settings, other items or other rationales are not reused.
-    versions = {"builders": BUILDERS_VERSION, "narrator": NARRATOR_VERSION}
+    versions = {"builders": BUILDERS_VERSION, "narrator": NARRATOR_VERSION, "words": VERSIONS}
     variants = {
         name: training_settings("train.sft", SftCommand, [*(v.training or ()), *overrides])
         for name, v in VARIANTS.items()

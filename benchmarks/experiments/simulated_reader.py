@@ -29,7 +29,7 @@ from benchmarks.experiments.experiment import open_benchmark, print_header, prin
 from conf.failures import report_failures
 from data.records import FAMILIES, LETTERS, SelectionItem
 from data.store import Store
-from teacher.deciding import choose_statements
+from teacher.deciding import UNKNOWN_PATH, choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation
 from teacher.predicates.places import region_at
@@ -95,7 +95,7 @@ def answer(
     """Return the probability of a right answer by the rationale, and by the nearest candidate."""
     ground = fit_ground(case.candidates)
     target = case.candidates[case.item.answer]
-    errors = {name: seen + predicted * case.paths.get(name, 0.0) for name in target.image}
+    errors = {name: seen + predicted * case.paths.get(name, UNKNOWN_PATH) for name in target.image}
     expected = displace(target, errors, ground, rng)
     candidates = [
         displace(places, dict.fromkeys(places.image, seen), ground, rng)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from math import dist, hypot, inf
+from math import dist, inf
 
 from teacher.predicates.facts import REGIONS, Relation
-from teacher.predicates.relations import VALUES, Bounds, Places
+from teacher.predicates.relations import VALUES, Bounds, Places, between_margin
 
 FAINT = 0.01
-"""Margin of a statement that is true or false because an object is hidden or missing. It is small,
-because a reader easily overlooks this."""
+"""Margin of a statement that is true or false because an object is hidden or missing. It is assumed
+to be small: a reader may overlook this, or take another object for the missing one."""
 CELLS = {value: (x, y) for y, row in enumerate(REGIONS) for x, value in enumerate(row)}
 """Column and row of each region."""
 EXTREMES = {"leftmost": (0, 1), "rightmost": (0, -1), "topmost": (1, 1), "lowest": (1, -1)}
@@ -21,8 +21,10 @@ def measure_margin(statement: Relation, places: Places, bounds: Bounds) -> float
     the image's width or height: not negative if the statement is true of a frame, negative if it is
     false.
 
-    The statement stays true, or false, if one of its objects moves by less than this in the image.
-    For gaps and "nearer to", which are measured on the ground, this holds approximately.
+    A statement about regions, sides, heights or extremes stays true, or false, if one of its
+    objects moves by less than this in the image. One that an object is between two others does if
+    this object moves. For gaps and "nearer to", which are measured on the ground, this holds
+    approximately. Margins of what is hidden, or hides another object, are constant (`FAINT`).
 
     Args:
         statement: Any statement of a frame, but no change since the cut.
@@ -42,7 +44,7 @@ def measure_margin(statement: Relation, places: Places, bounds: Bounds) -> float
     if kind == "extreme":
         return _extreme_margin(objects[0], value, places, bounds)
     if kind == "between":
-        return _between_margin(*(places.image[name] for name in objects), bounds)
+        return between_margin(*(places.image[name] for name in objects), bounds)
     if kind == "gap":
         return _gap_margin(*objects, value, places, bounds)
     if kind == "nearer":
@@ -75,22 +77,6 @@ def _extreme_margin(name: str, value: str, places: Places, bounds: Bounds) -> fl
     axis, sign = EXTREMES[value]
     others = [sign * place[axis] for other, place in places.image.items() if other != name]
     return min(others, default=-inf) - sign * places.image[name][axis] - bounds.level
-
-
-def _between_margin(
-    place: tuple[float, float],
-    one: tuple[float, float],
-    other: tuple[float, float],
-    bounds: Bounds,
-) -> float:
-    dx, dy = other[0] - one[0], other[1] - one[1]
-    px, py = place[0] - one[0], place[1] - one[1]
-    length = hypot(dx, dy)
-    if length == 0:
-        return -inf
-    share, offset = (px * dx + py * dy) / length, abs(px * dy - py * dx) / length
-    ends = bounds.between_ends * length
-    return min(share - ends, length - ends - share, bounds.between_offset * length - offset)
 
 
 def _gap_margin(a: str, b: str, value: str, places: Places, bounds: Bounds) -> float:

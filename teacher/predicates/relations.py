@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations, permutations
+from math import hypot, inf
 from typing import NamedTuple
 
 from data.records import Scene
@@ -174,7 +175,8 @@ def find_relations(places: Places, bounds: Bounds) -> set[Relation]:
     for a in names:
         others = [name for name in names if name != a]
         for b, c in combinations(others, 2):
-            if _is_between(places.image[a], places.image[b], places.image[c], bounds):
+            ends = places.image[b], places.image[c]
+            if between_margin(places.image[a], *ends, bounds) >= 0:
                 found.add(Relation("between", (a, b, c), "between"))
             one, other = distance[a, b], distance[a, c]
             if other >= bounds.nearer * one:
@@ -208,7 +210,7 @@ def find_changes(
             continue
         for b, c in combinations([name for name in both if name != a], 2):
             was, comes = (
-                _is_between(places.image[a], places.image[b], places.image[c], bounds)
+                between_margin(*(places.image[name] for name in (a, b, c)), bounds) >= 0
                 for places in (earlier, later)
             )
             if comes and not was:
@@ -236,20 +238,22 @@ def _covering(places: Places, a: str, b: str, bounds: Bounds) -> str | None:
     return front if is_close and places.fraction[back] < bounds.covered else None
 
 
-def _is_between(
+def between_margin(
     place: tuple[float, float],
     one: tuple[float, float],
     other: tuple[float, float],
     bounds: Bounds,
-) -> bool:
+) -> float:
+    """Return the distance of a place from the bounds of "between" two others, as a share of the
+    image; it is negative if the place is not between them."""
     dx, dy = other[0] - one[0], other[1] - one[1]
     px, py = place[0] - one[0], place[1] - one[1]
-    square = dx * dx + dy * dy
-    if square == 0:
-        return False
-    share, offset = (px * dx + py * dy) / square, abs(px * dy - py * dx) / square
-    ends = bounds.between_ends
-    return ends <= share <= 1 - ends and offset <= bounds.between_offset
+    length = hypot(dx, dy)
+    if length == 0:
+        return -inf
+    along, offset = (px * dx + py * dy) / length, abs(px * dy - py * dx) / length
+    ends = bounds.between_ends * length
+    return min(along - ends, length - ends - along, bounds.between_offset * length - offset)
 
 
 def _find_extremes(image: Mapping[str, tuple[float, float]], bounds: Bounds) -> Iterator[Relation]:

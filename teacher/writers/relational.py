@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import yaml
 
-from teacher.deciding import Decision
+from teacher.deciding import Decision, probability_of_falsity
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
@@ -194,9 +194,10 @@ class RelationalWriter(Writer):
 
     def find_false(self, view: View) -> Relation | None:
         """Return the deciding statement that is most clearly false of a candidate."""
-        false = [s for s in self.statements if normalize_relation(s) not in view.statements]
-        # Statements that are not true of the target have no margin.
-        return min(false, key=lambda s: view.margins.get(normalize_relation(s), 0.0), default=None)
+        clearness = {
+            s: probability_of_falsity(normalize_relation(s), view) for s in self.statements
+        }
+        return max((s for s in clearness if clearness[s]), key=clearness.get, default=None)
 
     def contrast(self, s: Relation, view: View) -> str:
         """State how a candidate differs from a deciding statement that is false of it."""

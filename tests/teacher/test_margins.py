@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from teacher.deciding import choose_statements
+from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import REGIONS, Relation, RelationalPredicates
 from teacher.predicates.margins import measure_margin
 from teacher.predicates.relations import (
@@ -18,6 +19,8 @@ from teacher.predicates.relations import (
     find_relations,
     normalize_relation,
 )
+from teacher.prompts import format_facts
+from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 from tests.teacher.test_relations import A, B, C, places, random_places
 
@@ -156,7 +159,7 @@ def test_clear_statements_are_chosen() -> None:
                 assert choose_with_margins(predicates, statement, 1e6, 0.01) == (statement,)
         chosen = choose_statements(predicates).statements
         if len(chosen) == 1:
-            assert choose_with_margins(predicates, *chosen, 1e-6, 1) != chosen
+            assert chosen[0] not in choose_with_margins(predicates, *chosen, 1e-6, 1)
     assert tried > 10
 
 
@@ -169,3 +172,24 @@ def test_objects_with_short_paths_are_preferred() -> None:
         before += any(name in s.objects for s in choose_statements(predicates).statements)
         after += any(name in s.objects for s in choose_statements(longer).statements)
     assert after < before
+
+
+def test_item_whose_objects_all_look_alike_has_no_statements() -> None:
+    scene = synthetic.random_scene(np.random.default_rng(3))
+    twins = replace(scene, objects=(scene.objects[0],) * len(scene.objects))
+    item = synthetic.item((45, 60, 75, 90))
+    predicates = extract_predicates(item, twins, {}.__getitem__, BOUNDS)
+    decision = choose_statements(predicates)
+    assert decision.statements == ()
+    assert decision.rivals == ("B", "C", "D")
+
+
+def test_prompts_have_the_deciding_statements_and_their_truth_in_each_candidate() -> None:
+    for item, predicates in random_cases(30, BOUNDS):
+        stated = format_facts(predicates, item)["deciding"]
+        for statement, fact in zip(choose_statements(predicates).statements, stated, strict=True):
+            assert all(name in fact["statement"] for name in statement.objects)
+            for view in predicates.views:
+                is_true = statement in view.statements
+                assert (fact["candidates"][view.letter] is True) == is_true
+        assert all(fact["candidates"][item.letter] is True for fact in stated)

@@ -206,6 +206,7 @@ def test_deciding_statements_are_a_smallest_set_or_a_clearer_pair() -> None:
             for size in range(len(chosen) + 1)
             if any(frozenset().union(*some) == possible for some in combinations(excluded, size))
         )
+        assert len(set(decision.statements)) == len(chosen)
         sizes.append(len(chosen))
         smallest.append(next(suffices))
         assert (smallest[-1], sizes[-1]) == (1, 2) or smallest[-1] == sizes[-1]
