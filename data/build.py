@@ -48,6 +48,7 @@ from data.tracks.build_items import (
 from data.tracks.retrieval import future
 from data.tracks.retrieval.database import make_databases
 from data.tracks.shortfalls import count_records, summarize_store
+from data.world.displacement import visible_positions
 from data.world.physics import GENERATOR_VERSION
 from data.world.scenes import make_scenes
 
@@ -118,6 +119,13 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(partial, name)))
         queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
         if not items and not queries:
+            names = [name for ids in scene_ids.values() for name in ids]
+            if not any(visible_positions(scene_of(name))[1].any() for name in names):
+                raise UserError(
+                    f"no scene of the benchmark {cfg.name} shows an object: move "
+                    "benchmark.world.camera, or benchmark.world.parts, which may hide the objects",
+                    code="impossible-world",
+                )
             reasons = "".join(f" ({count} {what})" for what, count in invalid.items() if count)
             raise UserError(
                 f"benchmark {cfg.name} would contain no item and no query{reasons}: raise "

@@ -35,7 +35,7 @@ placed at rest."""
 SLOW = 0.3
 """Minimum speed (simulator units/s) of an object at its planned collision."""
 
-NO_PLACE = "no place is found for an object"
+NO_PLACE = "no place is found where an object overlaps no other and collides as planned"
 
 
 def slide(

@@ -115,15 +115,16 @@ def test_rebound_height_grows_with_the_restitution_of_the_floor() -> None:
     assert more < 1.0 - RADIUS
 
 
-def test_object_slides_down_a_ramp_with_the_acceleration_of_its_slope() -> None:
-    ramp = PartConfig([0.0, 0.0, 1.0], [8.0, 2.0, 0.1], tilt=20.0, friction=0.5)
+@pytest.mark.parametrize("tilt", [20.0, 44.0])
+def test_object_slides_down_a_ramp_with_the_acceleration_of_its_slope(tilt: float) -> None:
+    ramp = PartConfig([0.0, 0.0, 3.0], [8.0, 2.0, 0.1], tilt=tilt, friction=0.5)
     physics = PhysicsConfig(frames=20, object_friction=0.3)
     world = WorldConfig(physics=physics, parts={"ramp": ramp})
     cube = SceneObject("cube", "rubber", "red")
     top = surface_height([part_box(ramp)], np.array([-2.0, 0.0]))
-    body = Body(cube, (-2.0, 0.0), 0.0, height=top + 0.3)
+    slope = np.radians(tilt)
+    body = Body(cube, (-2.0, 0.0), 0.0, height=top + 0.3 / np.cos(slope))
     velocities = shared_simulator().simulate([body], world).velocities[:, 0]
-    slope = np.radians(20)
     gain = 9.81 * (np.sin(slope) - 0.5 * 0.3 * np.cos(slope))
     speeds = np.linalg.norm(velocities, axis=-1)
     assert (speeds[19] - speeds[9]) * 25 / 10 == pytest.approx(gain, rel=0.1)

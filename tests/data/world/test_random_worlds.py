@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from data.records import Scene, SceneObject
 from data.world.parts import world_boxes
 from data.world.physics import Body, shared_simulator
 from data.world.sampling import record_scene, sample_scene, simulate_without
-from data.world.shapes import CUBE_HALF, RADIUS, half_height, rotation_matrix
+from data.world.shapes import BOUNDING_RADIUS, CUBE_HALF, RADIUS, half_height, rotation_matrix
 from tests.data.simulated import CLEVRER, simulate_scene
 
 ROOM = {
@@ -136,6 +137,30 @@ def test_fast_objects_stay_in_a_closed_room() -> None:
     motion = shared_simulator().simulate(bodies, world)
     assert np.linalg.norm(motion.velocities[-1], axis=-1).max() > 0.5
     assert np.abs(motion.positions[..., :2]).max() < 1.95
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_collisions_are_recorded_exactly_when_objects_touch(seed: int) -> None:
+    """At a collision, two objects are as near as their sizes allow, but for the way that they move
+    in a frame. Spheres that come so near have a collision before."""
+    world = random_world(seed)
+    scene = simulate_scene(seed, 0, world)
+    speed = np.linalg.norm(scene.velocities, axis=-1).max(axis=0) / world.physics.fps
+    sizes = [
+        (RADIUS * scale, BOUNDING_RADIUS[each.shape] * scale)
+        for each, scale in zip(scene.objects, scene.object_scales, strict=True)
+    ]
+    first = {frozenset(c.objects): c.frame for c in reversed(scene.collisions)}
+    for a, b in combinations(range(len(scene.objects)), 2):
+        distance = np.linalg.norm(scene.positions[:, a] - scene.positions[:, b], axis=-1)
+        step = speed[a] + speed[b]
+        frame = first.get(frozenset((a, b)))
+        if frame is not None:
+            assert distance[frame] < sizes[a][1] + sizes[b][1] + step
+            assert distance[: max(frame - 1, 0)].min(initial=np.inf) > CUBE_HALF
+        if scene.objects[a].shape == scene.objects[b].shape == "sphere":
+            touching = np.flatnonzero(distance < sizes[a][0] + sizes[b][0] - 0.005)
+            assert not touching.size or (frame is not None and frame <= touching[0] + 1)
 
 
 @pytest.mark.parametrize("index", range(4))
