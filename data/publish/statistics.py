@@ -149,7 +149,7 @@ def format_statistics(statistics: dict[str, Any]) -> str:
         f"Event frames:         {' '.join(f'{q:g}' for q in scenes['event frames'])} "
         "(minimum, quartiles, maximum)\n"
         f"Answers:              {_join(statistics['answers'])}",
-        "Accuracy of baselines, %; velocity and time ahead predict from the record\n"
+        "Accuracy of baselines, %; only velocity predicts, from the moment and true velocities\n"
         + baselines.astype({"items": int}).to_string(float_format="{:.1f}".format, na_rep="-"),
         "Accuracy of shortcuts on the test split, %\n" + format_shortcuts(statistics["shortcuts"]),
         "Candidates: median displacement in px from the target to the nearest distractor and\n"
