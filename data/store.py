@@ -46,7 +46,7 @@ from data.records import (
     SelectionItem,
 )
 from data.render import RENDERERS
-from data.tracks.selection.distractors import BUILDERS_VERSION
+from data.tracks.selection.distractors import BUILDERS_VERSIONS
 from data.world.physics import GENERATOR_VERSION
 
 MANIFEST = "manifest.json"
@@ -69,7 +69,7 @@ def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
     return {
         "generator": GENERATOR_VERSION,
         "renderer": renderer.version if is_rendered else f"{config['simulator']}'s own frames",
-        "builders": BUILDERS_VERSION,
+        "builders": BUILDERS_VERSIONS[config["distractors"]],
     }
 
 

@@ -38,7 +38,7 @@ from conf.schema import SftCommand
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR
-from data.tracks.selection.distractors import BUILDERS_VERSION
+from data.tracks.selection.distractors import BUILDERS_VERSIONS
 from evaluation.metrics.reasons import PARTS, SUPPORTED, read_reasons
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
@@ -106,7 +106,7 @@ def main() -> None:
     preset = compose("train.sft", SftCommand, overrides)
     base = weights_digest(preset.student.model)
     # Results of other settings, other items or other rationales are not reused.
-    versions = {"builders": BUILDERS_VERSION, "narrator": NARRATOR_VERSION, "words": VERSIONS}
+    versions = {"builders": BUILDERS_VERSIONS, "narrator": NARRATOR_VERSION, "words": VERSIONS}
     variants = {
         name: training_settings("train.sft", SftCommand, [*(v.training or ()), *overrides])
         for name, v in VARIANTS.items()

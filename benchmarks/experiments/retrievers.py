@@ -30,7 +30,7 @@ from benchmarks.experiments.experiment import (
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import ContrastiveCommand
-from data.tracks.selection.distractors import BUILDERS_VERSION
+from data.tracks.selection.distractors import BUILDERS_VERSIONS
 from evaluation.metrics.results import RetrievalResult, from_json
 from models.fingerprints import settings_key, weights_digest
 
@@ -59,7 +59,7 @@ def main() -> None:
     identity = {
         "benchmark": args.benchmark,
         "base": weights_digest(preset.retriever.model),
-        "settings": settings_key(settings | {"builders": BUILDERS_VERSION}),
+        "settings": settings_key(settings | {"builders": BUILDERS_VERSIONS}),
     }
     experiment = Experiment(args, identity, "variant", "train.contrastive", "evaluation.retrieve")
 

@@ -37,7 +37,7 @@ from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota, named_rng, shuffle_candidates
 from data.tracks.retrieval import counterfactual, future
 from data.tracks.selection import event, time, window
-from data.tracks.selection.distractors import BUILDERS_VERSION, Family, Timing
+from data.tracks.selection.distractors import BUILDERS_VERSIONS, Family, Timing
 from data.tracks.selection.pooling import add_reserve, choose_items
 from data.tracks.shortcuts import item_scores, order_target_first
 from data.world.physics import GENERATOR_VERSION
@@ -66,7 +66,8 @@ def make_items_and_queries(
     quotas = {name: _with_reserve(cfg, name, quota) for name, quota in cell_quotas(cfg).items()}
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
     recipe = cfg.distractors, cfg.selection.observation
-    inputs = [GENERATOR_VERSION, BUILDERS_VERSION, scene_ids, *recipe, *settings]
+    version = BUILDERS_VERSIONS[cfg.distractors]
+    inputs = [GENERATOR_VERSION, version, scene_ids, *recipe, *settings]
     paths = {
         name: part_path(folder, [*inputs, name, asdict(quota)]) for name, quota in quotas.items()
     }

@@ -29,7 +29,7 @@ APART = 10.0
 """Gap (simulator units) of a frame in which fewer than two objects are visible."""
 LIMIT, TOLERANCE = 1.75, 0.015
 """The count of targets of a rank may differ from a quarter of all items by `LIMIT`, and by this
-share of the items. Without the second term, a cell could reach counts that no item improves."""
+share of the items."""
 START = 0.75
 """Maximum distance from 0 of the counts at the start."""
 
@@ -169,14 +169,18 @@ class Balance:
 
         Returns:
             The index of the choice, or None if each would make the count of a rank differ too much
-            from a quarter of the items (see `LIMIT`).
+            from a quarter of the items (see `LIMIT`) and the counts less even as a whole.
         """
         shares = rank_shares(scores).swapaxes(0, 1)
         excess = self.counts + shares - (self.items + 1) / 4
-        allowed = np.abs(excess).max(axis=(1, 2)) <= LIMIT + TOLERANCE * self.items
+        unevenness = (excess**2).sum(axis=(1, 2))
+        # Without the second condition, a cell could reach counts at which it refuses every item.
+        allowed = (np.abs(excess).max(axis=(1, 2)) <= LIMIT + TOLERANCE * self.items) | (
+            unevenness < ((self.counts - self.items / 4) ** 2).sum()
+        )
         if not allowed.any():
             return None
-        best = int(np.where(allowed, (excess**2).sum(axis=(1, 2)), np.inf).argmin())
+        best = int(np.where(allowed, unevenness, np.inf).argmin())
         self.counts = self.counts + shares[best]
         self.items += 1
         return best

@@ -16,9 +16,9 @@ from data.world.displacement import (
     visible_positions,
 )
 
-BUILDERS_VERSION = "7"
-"""Version of the code that makes items and queries. Increase it when a change gives other items or
-queries for the same scenes."""
+BUILDERS_VERSIONS = {"paper": "7", "balanced": "8"}
+"""Version of the code that makes items and queries, by the recipe of the distractors. Increase it
+when a change gives other items or queries for the same scenes."""
 
 Pool = tuple[Iterable[Candidate], int]
 """Possible distractors in order of preference, and the maximum number of them to use."""

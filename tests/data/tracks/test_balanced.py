@@ -334,6 +334,19 @@ def test_balance_keeps_every_count_within_the_limit() -> None:
     assert [balance.choose(only_lowest) is None for _ in range(4)][-1]
 
 
+def test_balance_accepts_items_that_make_the_counts_more_even() -> None:
+    """If the targets have the lowest rank in all scores too seldom, no item of some other ranks is
+    within the limit, but most make the counts more even."""
+    random = rng()
+    balance = Balance(random)
+    balance.counts = np.tile([-LIMIT, LIMIT / 3, LIMIT / 3, LIMIT / 3], (len(SCORES), 1))
+    accepted = [
+        balance.choose(random.normal(size=(len(SCORES), 12, 4))) is not None for _ in range(40)
+    ]
+    assert sum(accepted) > 30
+    assert np.abs(balance.counts - balance.items / 4).max() < LIMIT
+
+
 def test_choice_from_a_pool_fills_quotas_and_removes_a_joint_shortcut() -> None:
     random = rng()
     scores = random.normal(size=(600, len(SCORES), 4))
