@@ -64,7 +64,7 @@ CHOICES = 4
 """Number of statements of which the one that fewest candidates agree with is chosen."""
 
 WEIGHTS = {
-    "region": 8, "gap": 4, "side": 2, "height": 2, "nearer": 1, "sight": 1, "between": 1,
+    "region": 10, "gap": 2, "side": 2, "height": 2, "nearer": 1, "sight": 1, "between": 1,
     "extreme": 1,
 }  # fmt: skip
 """Relative frequencies of the kinds of statements, close to those in rationales."""
