@@ -10,7 +10,8 @@ from math import erf, hypot, sqrt
 import numpy as np
 
 from teacher.predicates.facts import Relation, RelationalPredicates, View
-from teacher.predicates.relations import CHANGES
+from teacher.predicates.margins import measure_margin
+from teacher.predicates.relations import CHANGES, Bounds
 
 SEEN_ERROR, PREDICTED_ERROR = 0.02, 0.3
 """Standard deviations, along each axis, of the places of objects as a reader is assumed to see them
@@ -56,7 +57,8 @@ def choose_statements(predicates: RelationalPredicates) -> Decision:
     wrong = [view for view in predicates.views if view.letter != predicates.answer]
     statements = [s for s in sorted(predicates.target.statements) if s.kind not in CHANGES]
     holds = np.array([_probability_of_truth(s, predicates) for s in statements])
-    excludes = np.array([[probability_of_falsity(s, v) for v in wrong] for s in statements])
+    bounds = predicates.bounds
+    excludes = np.array([[probability_of_falsity(s, v, bounds) for v in wrong] for s in statements])
     excludes = excludes.reshape(len(statements), len(wrong))
     possible = excludes.any(axis=0)
     rivals = tuple(v.letter for v, excluded in zip(wrong, possible, strict=True) if not excluded)
@@ -86,27 +88,27 @@ def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:
     return tuple(int(k) for k in (holds[:, None] * excludes).argmax(axis=0))
 
 
-def probability_of_falsity(statement: Relation, view: View) -> float:
+def probability_of_falsity(statement: Relation, view: View, bounds: Bounds) -> float:
     """Return the probability that a reader finds a statement false of a candidate; 0 if it is
     true."""
-    if statement in view.statements:
-        return 0.0
-    # Only statements that are true of the target have margins.
-    margin = -view.margins.get(statement, 0.0)
+    return 0.0 if statement in view.statements else probability_of_sight(statement, view, bounds)
+
+
+def probability_of_sight(statement: Relation, view: View, bounds: Bounds) -> float:
+    """Return the probability that a reader finds a statement true of a candidate if it is true, or
+    false if it is false."""
+    margin = abs(measure_margin(statement, view.places, bounds))
     return _normal_cdf(margin / _error(statement, [SEEN_ERROR] * len(_involved(statement, view))))
 
 
 def _probability_of_truth(statement: Relation, predicates: RelationalPredicates) -> float:
     """Return the probability that a reader finds a true statement true, both of the state that it
     predicts and of the target."""
-    margin = predicates.target.margins[statement]
-    involved = _involved(statement, predicates.target)
-    paths = [predicates.paths.get(name, UNKNOWN_PATH) for name in involved]
-    predicted = [SEEN_ERROR + PREDICTED_ERROR * path for path in paths]
-    seen = [SEEN_ERROR] * len(involved)
-    return _normal_cdf(margin / _error(statement, predicted)) * _normal_cdf(
-        margin / _error(statement, seen)
-    )
+    target, bounds = predicates.target, predicates.bounds
+    paths = [predicates.paths.get(name, UNKNOWN_PATH) for name in _involved(statement, target)]
+    error = _error(statement, [SEEN_ERROR + PREDICTED_ERROR * path for path in paths])
+    predicted = _normal_cdf(measure_margin(statement, target.places, bounds) / error)
+    return predicted * probability_of_sight(statement, target, bounds)
 
 
 def _error(statement: Relation, errors: Sequence[float]) -> float:
@@ -118,7 +120,7 @@ def _error(statement: Relation, errors: Sequence[float]) -> float:
 def _involved(statement: Relation, view: View) -> Sequence[str]:
     """Return the objects whose places decide whether a statement is true of a frame."""
     if statement.kind == "extreme":
-        return [o.object for o in view.objects if o.target_sight == "shown"] or statement.objects
+        return [*view.places.image] or statement.objects
     return statement.objects
 
 

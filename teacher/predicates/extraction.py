@@ -19,7 +19,6 @@ from teacher.predicates.facts import (
     RelationalPredicates,
     View,
 )
-from teacher.predicates.margins import measure_margin
 from teacher.predicates.motion import (
     describe_meeting,
     find_collision_courses,
@@ -36,13 +35,7 @@ from teacher.predicates.places import (
     object_sight,
     square_position,
 )
-from teacher.predicates.relations import (
-    CHANGES,
-    Bounds,
-    Places,
-    find_changes,
-    find_relations,
-)
+from teacher.predicates.relations import Bounds, Places, find_changes, find_relations
 
 STAYS, SHIFTS = 8.0, 60.0
 """Upper bounds of the displacement (px of the square image) of an object that "stays", and of one
@@ -114,6 +107,7 @@ def extract_predicates(
         paths=paths,
         observed=observed,
         views=views,
+        bounds=bounds,
     )
 
 
@@ -127,7 +121,7 @@ def _describe_views(
     """Return the relations at the cut, the paths of the objects, and the views of the
     candidates."""
     earlier = Places.of(scene, cut)
-    views, places = [], []
+    views = []
     for letter, candidate in zip(LETTERS, item.candidates, strict=True):
         other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
         index = {key: k for k, key in enumerate(other.object_keys)}
@@ -140,12 +134,8 @@ def _describe_views(
         relations = find_relations(later, bounds)
         relations |= find_changes(earlier, later, at_rest, bounds)
         close = close_pairs(other, candidate.frame)
-        views.append(View(letter, objects, close, tuple(sorted(relations)), {}))
-        places.append(later)
-    statements = [s for s in sorted(views[item.answer].statements) if s.kind not in CHANGES]
-    for view, later in zip(views, places, strict=True):
-        view.margins.update({s: measure_margin(s, later, bounds) for s in statements})
-    at_target = places[item.answer].image
+        views.append(View(letter, objects, close, tuple(sorted(relations)), later))
+    at_target = views[item.answer].places.image
     both = earlier.image.keys() & at_target.keys()
     paths = {name: dist(earlier.image[name], at_target[name]) for name in sorted(both)}
     return tuple(sorted(find_relations(earlier, bounds))), paths, tuple(views)

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from teacher.predicates.relations import Bounds, Places
 
 SPEEDS = ("slowly", "steadily", "quickly")
 """Words for speeds below each of the bounds of a scene; above these, it is VERY_FAST."""
@@ -153,16 +156,15 @@ class View:
     """A frame as a reader of a rationale sees it, with what has changed since the cut.
 
     `objects` are the item's objects, with this frame as the target; an object that the frame's
-    scene lacks is out of view. `relations` are normalized and sorted. `margins` has, for each
-    statement that is true of the target, how clearly it is true or false of this frame (see
-    `teacher.predicates.margins`).
+    scene lacks is out of view. `relations` are normalized and sorted. `places` are the places of
+    the frame's visible objects.
     """
 
     letter: str
     objects: tuple[ObjectFacts, ...]
     close: tuple[Closeness, ...]
     relations: tuple[Relation, ...]
-    margins: dict[Relation, float]
+    places: Places
 
     @cached_property
     def statements(self) -> frozenset[Relation]:
@@ -187,13 +189,14 @@ class RelationalPredicates(Predicates):
     width at the cut, `observed` are the relations at the cut, and `views` are the candidates as a
     reader sees them. That of the answer is the view of the target. `paths` are the distances in the
     image, as shares of its width and height, of the objects that are visible at the cut and the
-    target from one to the other.
+    target from one to the other. `bounds` are those of the words for relations.
     """
 
     left_to_right: tuple[str, ...]
     paths: dict[str, float]
     observed: tuple[Relation, ...]
     views: tuple[View, ...]
+    bounds: Bounds
 
     @property
     def target(self) -> View:

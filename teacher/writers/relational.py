@@ -194,8 +194,9 @@ class RelationalWriter(Writer):
 
     def find_false(self, view: View) -> Relation | None:
         """Return the deciding statement that is most clearly false of a candidate."""
+        bounds = self.facts.bounds
         clearness = {
-            s: probability_of_falsity(normalize_relation(s), view) for s in self.statements
+            s: probability_of_falsity(normalize_relation(s), view, bounds) for s in self.statements
         }
         return max((s for s in clearness if clearness[s]), key=clearness.get, default=None)
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from teacher import deciding
 from teacher.deciding import choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import REGIONS, Relation, RelationalPredicates
@@ -127,17 +129,13 @@ def test_statements_about_unseen_objects_are_hardly_clear() -> None:
 def choose_with_margins(
     predicates: RelationalPredicates, statement: Relation, factor: float, others: float
 ) -> tuple[Relation, ...]:
-    """Choose after the margins of a statement, and those of all others, were multiplied."""
-    views = tuple(
-        replace(
-            view,
-            margins={
-                s: m * (factor if s == statement else others) for s, m in view.margins.items()
-            },
-        )
-        for view in predicates.views
-    )
-    return choose_statements(replace(predicates, views=views)).statements
+    """Choose with the margins of a statement, and those of all others, multiplied."""
+
+    def measure_scaled(s: Relation, where: Places, bounds: Bounds) -> float:
+        return measure_margin(s, where, bounds) * (factor if s == statement else others)
+
+    with patch.object(deciding, "measure_margin", measure_scaled):
+        return choose_statements(predicates).statements
 
 
 def test_clear_statements_are_chosen() -> None:

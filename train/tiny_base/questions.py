@@ -12,16 +12,18 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     narrate    a whole rationale with its answer, without any picture
 
 None of them is the selection task: no answer about pictures says which candidate is the target.
-Statements about pictures are chosen at random, not because they decide the item; those of `explain`
-are true of at least two candidates. Of a few statements, the one that fewest candidates agree with
-is chosen: if most agreed, copying the prediction would describe most candidates. `match` teaches to
-compare what a text says of a candidate with what it has predicted. `narrate` teaches the language
-of rationales, in both vocabularies, and how an answer follows from what a text says of the
-candidates.
+Statements about pictures are sampled, not chosen because they decide the item; those of `explain`
+are true of at least two candidates. Of the sampled statements of a kind, the one that fewest
+candidates agree with is used. If most agreed, copying the prediction would describe most
+candidates, and the model would not learn to find the objects that the candidates show at different
+places. `match` teaches to compare what a text says of a candidate with what it has predicted.
+`narrate` teaches the language of rationales, in both vocabularies, and how an answer follows from
+what a text says of the candidates.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -29,7 +31,7 @@ import numpy as np
 
 from data.records import SelectionItem
 from models.student.prompts import response
-from teacher.deciding import Decision
+from teacher.deciding import Decision, probability_of_sight
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.facts import Relation, RelationalPredicates, View
 from teacher.predicates.relations import (
@@ -60,8 +62,6 @@ PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
 compared with all candidates."""
 OPTIONS = 12
 """Number of statements that are sampled about a picture."""
-CHOICES = 4
-"""Number of statements of which the one that fewest candidates agree with is chosen."""
 
 WEIGHTS = {
     "region": 10, "gap": 2, "side": 2, "height": 2, "nearer": 1, "sight": 1, "between": 1,
@@ -275,7 +275,13 @@ def sample_shared_statements(p: RelationalPredicates, rng: np.random.Generator) 
 
 
 def choose_rarest(p: RelationalPredicates, statements: Sequence[Relation]) -> Relation:
-    """Return the statement that fewest candidates agree with, of the first `CHOICES` that not all
-    candidates agree with; the first statement if there are none."""
-    divisive = [s for s in statements if len(agreeing(p, [s])) < len(p.views)]
-    return min((divisive or statements)[:CHOICES], key=lambda s: len(agreeing(p, [s])))
+    """Return the statement of the first one's kind that fewest candidates agree with; of several,
+    the one that a reader with errors of places most likely finds true and false of the right
+    candidates."""
+
+    def rank(statement: Relation) -> tuple[int, float]:
+        normalized = normalize_relation(statement)
+        seen = [probability_of_sight(normalized, view, p.bounds) for view in p.views]
+        return len(agreeing(p, [statement])), -math.prod(seen)
+
+    return min((s for s in statements if s.kind == statements[0].kind), key=rank)
