@@ -5,8 +5,8 @@ left". It returns JSON: for each section, sentences such as
 
     {"text": "Since {}, it is clear that {}", "facts": ["s1", "s3"]}
 
-Code fills the slots in order, so that the stated facts hold by construction. The words around the
-slots may state no fact and no number of their own.
+Code fills the slots in order, so that the stated facts hold by construction. Around the slots, only
+a few connecting words are allowed (`CONNECTIVES`), so that a sentence states nothing else.
 """
 
 from __future__ import annotations
@@ -20,18 +20,7 @@ from jsonschema import Draft202012Validator
 
 from data.records import LETTERS, SelectionItem
 from teacher.narrator import list_clauses
-from teacher.numbers.detection import find_numbers
 from teacher.predicates.facts import Predicates
-from teacher.reading.tagging import (
-    COLOR_WORDS,
-    COLUMNS,
-    MATERIAL_WORDS,
-    MIDDLE,
-    PLURALS,
-    ROWS,
-    SHAPE_WORDS,
-    find_tags,
-)
 from teacher.sections import SECTIONS
 
 CITED_VERSION = "2"
@@ -44,25 +33,17 @@ in the candidate analysis."""
 MAX_SENTENCES, MAX_FACTS, MAX_CHARACTERS = 8, 3, 160
 """Maximum numbers of sentences in a section, of facts in a sentence, and of the characters around
 its slots."""
-PLAIN_TAGS = {
-    *("word", "comma", "semicolon", "and", "break", "be", "which", "pronoun", "ignore"),
+CONNECTIVES = {
+    *("and", "so", "because", "since", "as", "while", "whereas", "when", "then", "thus", "hence"),
+    *("therefore", "thereby", "accordingly", "consequently", "also", "moreover", "furthermore"),
+    *("finally", "next", "now", "meanwhile", "here", "indeed", "likewise", "similarly"),
+    *("it", "its", "the", "this", "that", "these", "those", "they", "their", "which", "what", "we"),
+    *("is", "are", "be", "means", "follows", "implies", "suggests", "indicates", "explains"),
+    *("know", "known", "given", "clear", "clearly", "evident", "evidently"),
+    *("result", "reason", "consequence", "conclusion", "fact", "facts", "evidence", "case"),
+    *("to", "for", "from", "of", "in", "by", "turn", "way"),
 }
-"""Tags of the reader that state nothing, so that they may stand around slots."""
-PREPOSITIONS = {"to", "for", "like", "from", "of", "on", "at", "in", "after", "before", "about"}
-"""Prepositions that may stand around slots; others state places."""
-FACT_WORDS = {
-    *(*ROWS, *COLUMNS, *MIDDLE, *COLOR_WORDS, *MATERIAL_WORDS, *SHAPE_WORDS, *PLURALS),
-    *("candidate", "candidates", "image", "images", "answer"),
-}
-"""Words that state a part of a fact."""
-CONNECTING = {"finally", "follows", "hence"}
-"""Words that state nothing here, although the reader gives them a tag."""
-DENYING = {
-    *("no", "not", "never", "hardly", "unless", "if", "false", "untrue", "wrong", "deny", "denies"),
-    *("doubt", "doubtful", "unlikely", "impossible", "without", "instead", "except", "only", "all"),
-    *("refuses", "fails", "opposite", "contrary", "rather", "least", "most", "every", "none"),
-}
-"""Words that could deny or limit the fact in a slot."""
+"""The words that may stand around slots. None of them states a fact or denies one."""
 
 
 class CitationError(ValueError):
@@ -116,7 +97,7 @@ def compose_rationale(response: str, facts: Mapping[str, str], answer: str) -> s
 
     Raises:
         CitationError: The response does not follow the schema, cites an unknown fact, has another
-            number of slots than of facts, or states a fact or a number around its slots.
+            number of slots than of facts, or has other words than `CONNECTIVES` around its slots.
     """
     try:
         cited = json.loads(response)
@@ -145,7 +126,7 @@ def _fill(sentence: Mapping[str, Any], facts: Mapping[str, str]) -> str:
         raise CitationError(f"{len(literals) - 1} slots for {len(cited)} facts")
     for literal in literals:
         if stated := next(_find_statements(literal), None):
-            raise CitationError(f"states a fact outside a slot: {stated!r}")
+            raise CitationError(f"only connecting words may stand outside slots: {stated!r}")
     filled = literals[0]
     for fact, literal in zip(cited, literals[1:], strict=True):
         filled += facts[fact] + literal
@@ -153,11 +134,7 @@ def _fill(sentence: Mapping[str, Any], facts: Mapping[str, str]) -> str:
 
 
 def _find_statements(literal: str) -> Iterator[str]:
-    """Yield the words around slots that state a fact or a number, or that could deny a fact."""
-    yield from (literal[start:stop] for start, stop in find_numbers(literal))
-    yield from sorted(set(re.findall(r"[a-z]+", literal.lower())) & (FACT_WORDS | DENYING))
-    for tag in find_tags(literal, 0, len(literal)):
-        if tag.name not in PLAIN_TAGS and tag.words not in PREPOSITIONS | CONNECTING:
-            yield tag.words
-    if "{" in literal or "}" in literal or "\n" in literal:
-        yield literal
+    """Yield the words and other characters around slots that may not stand there."""
+    words = re.findall(r"\w+", literal)
+    yield from (word for word in words if word.lower() not in CONNECTIVES)
+    yield from re.findall(r"[^\w ,;:-]", literal)

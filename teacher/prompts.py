@@ -13,7 +13,7 @@ from typing import Any
 
 from conf.schema import TeacherConfig
 from data.records import SelectionItem
-from teacher.cited import list_facts
+from teacher.cited import CONNECTIVES, list_facts
 from teacher.deciding import choose_statements
 from teacher.predicates.facts import Predicates, Relation, RelationalPredicates
 from teacher.predicates.relations import find_topic
@@ -45,7 +45,12 @@ def build_messages(
 def _build_cited_messages(
     predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
 ) -> list[dict[str, str]]:
-    system = CITED.format(sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words)
+    system = CITED.format(
+        sections=", ".join(SECTIONS),
+        low=cfg.min_words,
+        high=cfg.max_words,
+        connectives=", ".join(sorted(CONNECTIVES)),
+    )
     facts = "\n".join(f"{key}: {clause}" for key, clause in list_facts(predicates, item).items())
     user = f"Question: {item.question}\nFacts:\n{facts}\nAnswer to reach: {item.letter}"
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]

@@ -18,7 +18,7 @@ from teacher.rationale_log import read_rationales
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from teacher.vocabulary import describe_item
+from teacher.vocabulary import describe_item, name_vocabulary
 from tests.teacher.faulty_server import FaultyServer, teacher_at
 from tests.teacher.memory_store import MemoryStore
 from tests.teacher.test_predicates import random_cases
@@ -71,21 +71,33 @@ def change(section: str, sentence: dict[str, Any]) -> Callable[[Cited], None]:
 @pytest.mark.parametrize(
     ("mutate", "reason"),
     [
-        (change("Scene parse", {"text": "the red cube, {}", "facts": ["s1"]}), "outside a slot"),
-        (change("Scene parse", {"text": "{} near the left", "facts": ["s1"]}), "outside a slot"),
-        (change("Scene parse", {"text": "{} left", "facts": ["s1"]}), "outside a slot: 'left'"),
-        (change("Scene parse", {"text": "{} to the north", "facts": ["s1"]}), "outside a slot"),
+        (change("Scene parse", {"text": "the red cube, {}", "facts": ["s1"]}), "outside slots"),
+        (change("Scene parse", {"text": "{} near the left", "facts": ["s1"]}), "outside slots"),
+        (change("Scene parse", {"text": "{} left", "facts": ["s1"]}), "outside slots: 'left'"),
+        (change("Scene parse", {"text": "{} to the north", "facts": ["s1"]}), "outside slots"),
         (change("Prediction", {"text": "it is false that {}", "facts": ["p1"]}), "'false'"),
-        (change("Prediction", {"text": "unless {}", "facts": ["p1"]}), "outside a slot"),
+        (change("Prediction", {"text": "unless {}", "facts": ["p1"]}), "outside slots"),
         (change("Prediction", {"text": "twice {}", "facts": ["p1"]}), "'twice'"),
-        (change("Prediction", {"text": "A agrees, {}", "facts": ["p1"]}), "outside a slot"),
+        (change("Prediction", {"text": "A agrees, {}", "facts": ["p1"]}), "outside slots"),
         (change("Prediction", {"text": "{} and {}", "facts": ["p1"]}), "2 slots for 1 facts"),
+        *(
+            (change("Outcome", {"text": text, "facts": ["r1"]}), "outside slots")
+            for text in (
+                "the crimson orb makes {}",
+                "so the leader overtakes and {}",
+                "it bounces, hence {}",
+                "it vanishes, so {}",
+                "the box is ahead, so {}",
+                "{} (as B)",
+                "{}, as in A",
+            )
+        ),
         (change("Prediction", {"text": "{}", "facts": ["p99"]}), "unknown fact: p99"),
         (change("Prediction", {"text": "{}", "facts": ["s1"]}), "not a cited rationale"),
         (change("Candidate analysis", {"text": "{}", "facts": ["B"]}), "candidates out of order"),
         (lambda cited: cited.pop("Outcome"), "not a cited rationale"),
         (lambda cited: cited.update(Extra=[]), "not a cited rationale"),
-        (change("Outcome", {"text": "{x} {}", "facts": ["r1"]}), "outside a slot"),
+        (change("Outcome", {"text": "{x} {}", "facts": ["r1"]}), "outside slots"),
     ],
 )
 def test_response_that_states_more_than_its_facts_is_refused(
@@ -114,7 +126,7 @@ def test_server_is_asked_for_cited_rationales(
             server.rationales[user["content"]] = response
     narration = narrate_store(store, cfg)
     assert narration.figures["accepted"] == 12
-    assert all(r.predicates == "relational 1" for r in narration.rationales)
+    assert all(r.predicates == name_vocabulary(cfg) for r in narration.rationales)
     assert all("{" not in r.text for r in narration.rationales)
     fields = server.requests[0]["structured_outputs"]
     assert fields == {"json": cited_schema()}

@@ -151,7 +151,8 @@ def test_false_word_is_contradicted(rationales, source, kind):
 
 
 def add_extremes(text, predicates):
-    """Add to the prediction which object is leftmost and so on: the narrator says it rarely."""
+    """Add to the prediction which object is leftmost and so on: the narrator does not always say
+    it."""
     extremes = [s for s in sorted(predicates.target.statements) if s.kind == "extreme"]
     stated = "".join(f" The {s.objects[0]} will be {s.value}." for s in extremes)
     return text.replace("\nCandidate analysis:", f"{stated}\nCandidate analysis:")
@@ -167,7 +168,7 @@ def test_false_relation_is_contradicted(rationales, kind):
             add_extremes(text, predicates), predicates, Random(item_id)
         )
     ]
-    assert sum(detected) >= 0.97 * len(detected) > 5
+    assert sum(detected) >= 0.99 * len(detected) > 5
 
 
 @pytest.mark.slow

@@ -114,6 +114,36 @@ def test_lower_object_covers_one_that_is_partly_hidden() -> None:
     assert values(find_relations(unknown, BOUNDS), "cover") == set()
 
 
+@pytest.mark.parametrize(
+    ("fraction", "distance", "covers"),
+    [(0.89, 0.11, True), (0.91, 0.11, False), (0.89, 0.13, False)],
+)
+def test_covering_follows_its_bounds(fraction: float, distance: float, covers: bool) -> None:
+    where = places(a=(0.5, 0.5), b=(0.5, 0.5 - distance))
+    hidden = where._replace(fraction={A: 1.0, B: fraction})
+    found = values(find_relations(hidden, BOUNDS), "cover")
+    assert found == ({((A, B), "in front of")} if covers else set())
+
+
+@pytest.mark.parametrize(("lead", "is_leftmost"), [(0.041, True), (0.039, False)])
+def test_extremes_follow_their_bound(lead: float, is_leftmost: bool) -> None:
+    found = find_relations(places(a=(0.5 - lead, 0.2), b=(0.5, 0.5), c=(0.8, 0.8)), BOUNDS)
+    assert (((A,), "leftmost") in values(found, "extreme")) == is_leftmost
+
+
+@pytest.mark.parametrize(
+    ("place", "edges"),
+    [
+        ((0.059, 0.5), {"left"}), ((0.061, 0.5), set()), ((0.941, 0.5), {"right"}),
+        ((0.939, 0.5), set()), ((0.5, 0.059), {"top"}), ((0.5, 0.061), set()),
+        ((0.5, 0.941), {"bottom"}), ((0.5, 0.939), set()), ((0.059, 0.941), {"left", "bottom"}),
+    ],
+)  # fmt: skip
+def test_edges_follow_their_bound(place: tuple[float, float], edges: set[str]) -> None:
+    found = find_changes(places(a=(0.5, 0.5)), places(a=place), set(), BOUNDS)
+    assert values(found, "edge") == {((A,), f"reaches the {edge} edge") for edge in edges}
+
+
 def test_changes_of_an_object_that_passes_another() -> None:
     earlier = places(a=(0.2, 0.5), b=(0.5, 0.5), c=(0.9, 0.5))
     for height, value in (
