@@ -119,7 +119,8 @@ def reason_table(reasons: Mapping[str, ReasonSummary]) -> Table:
             number = of_part.claims
             rows.append(
                 {
-                    "name": f"{DETAIL}{part}", "Claims": f"{number.value:.1f} [{number.low:.1f}, {number.high:.1f}]",
+                    "name": f"{DETAIL}{part}",
+                    "Claims": f"{number.value:.1f} [{number.low:.1f}, {number.high:.1f}]",
                     "Supported": of_part.supported, "Contradicted": of_part.contradicted,
                 }
             )  # fmt: skip
