@@ -16,7 +16,7 @@ from conf.files import write_json, write_text
 from data.records import COLORS, MATERIALS, Rationale, SelectionItem
 from teacher.prompts import format_facts
 from teacher.validation.validator import WORD
-from teacher.vocabulary import choose_vocabulary, describe_item
+from teacher.vocabulary import choose_vocabulary, describe_item, name_vocabulary
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -229,7 +229,7 @@ def write_report(
     from data.publish.contact_sheets import SheetRows, draw_sheet
     from data.store import write_atomically
 
-    text = format_figures(figures)
+    text = f"predicates: {name_vocabulary(cfg)}\n\n{format_figures(figures)}"
     write_json(folder / "report.json", figures)
     write_text(folder / "report.txt", text + "\n")
     items = {item.item_id: item for item in store.selection("train")}

@@ -102,7 +102,8 @@ def test_page_shows_random_rationales_beside_their_frames(micro_store, tmp_path)
         return write_report(micro_store, rationales, figures, 4, shown, tmp_path).read_text()
 
     page = write(narration.rationales, 0)
-    assert (tmp_path / "report.txt").read_text() == format_figures(figures) + "\n"
+    written = (tmp_path / "report.txt").read_text()
+    assert written == f"predicates: paper 1\n\n{format_figures(figures)}\n"
     assert json.loads((tmp_path / "report.json").read_text())["accepted"] == len(
         narration.rationales
     )
