@@ -55,7 +55,11 @@ def choose_statements(predicates: RelationalPredicates) -> Decision:
     were independent.
     """
     wrong = [view for view in predicates.views if view.letter != predicates.answer]
-    statements = [s for s in sorted(predicates.target.statements) if s.kind not in CHANGES]
+    statements = [
+        s
+        for s in sorted(predicates.target.statements)
+        if s.kind not in CHANGES and not all(s in view.statements for view in wrong)
+    ]
     holds = np.array([_probability_of_truth(s, predicates) for s in statements])
     bounds = predicates.bounds
     excludes = np.array([[probability_of_falsity(s, v, bounds) for v in wrong] for s in statements])

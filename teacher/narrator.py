@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from data.records import SelectionItem
-from teacher.deciding import choose_statements
+from teacher.deciding import Decision, choose_statements
 from teacher.predicates.facts import Predicates, RelationalPredicates
 from teacher.writers.paper import Detail, Writer
 from teacher.writers.relational import RelationalWriter
@@ -31,30 +31,20 @@ def write_rationale(
     The same arguments give the same text. Another `attempt` chooses other phrasings.
     """
     keys = (seed, item.item_id, attempt)
-    relational = isinstance(predicates, RelationalPredicates)
-    sparse, brief = (RELATIONAL_SPARSE, RELATIONAL_BRIEF) if relational else (SPARSE, BRIEF)
-    text = make_writer(predicates, item, sparse, *keys).text()
+    decision = _decide(predicates)
+    sparse, brief = (SPARSE, BRIEF) if decision is None else (RELATIONAL_SPARSE, RELATIONAL_BRIEF)
+    text = _make_writer(predicates, decision, sparse, *keys).text()
     if len(text.split()) > LONG:
-        text = make_writer(predicates, item, brief, *keys).text()
+        text = _make_writer(predicates, decision, brief, *keys).text()
     if len(text.split()) < SHORT:
-        text = make_writer(predicates, item, FULL, *keys, padded=True).text()
+        text = _make_writer(predicates, decision, FULL, *keys, padded=True).text()
     return text
-
-
-def make_writer(
-    predicates: Predicates, item: SelectionItem, *args: Any, padded: bool = False
-) -> Writer:
-    """Return a writer for the vocabulary of predicates. All texts of an item rest on the same
-    deciding statements."""
-    if isinstance(predicates, RelationalPredicates):
-        decision = choose_statements(predicates)
-        return RelationalWriter(predicates, decision, *args, padded=padded)
-    return Writer(predicates, *args, padded=padded)
 
 
 def list_clauses(predicates: Predicates, item: SelectionItem) -> dict[str, list[str]]:
     """Return the clauses from which a rationale can be made, by section, in full detail."""
-    return make_writer(predicates, item, FULL, item.item_id, "clauses").sections()
+    writer = _make_writer(predicates, _decide(predicates), FULL, item.item_id, "clauses")
+    return writer.sections()
 
 
 def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
@@ -62,5 +52,20 @@ def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str,
 
     The same arguments give the same lines.
     """
-    writer = make_writer(predicates, item, SPARSE, item.item_id, "matches")
+    writer = _make_writer(predicates, _decide(predicates), SPARSE, item.item_id, "matches")
     return tuple(writer.match(c) for c in predicates.candidates)
+
+
+def _decide(predicates: Predicates) -> Decision | None:
+    """Return the statements on which all relational texts of an item rest; None for the paper's
+    vocabulary."""
+    return choose_statements(predicates) if isinstance(predicates, RelationalPredicates) else None
+
+
+def _make_writer(
+    predicates: Predicates, decision: Decision | None, *args: Any, padded: bool = False
+) -> Writer:
+    """Return a writer for the vocabulary of predicates."""
+    if decision is not None:
+        return RelationalWriter(predicates, decision, *args, padded=padded)
+    return Writer(predicates, *args, padded=padded)

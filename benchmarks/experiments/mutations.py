@@ -209,6 +209,7 @@ GAPS = {
     "well apart from": ["near", "in touch with"],
 }
 COVERS = {"in front of": ["behind"], "behind": ["in front of"]}
+OPPOSITE_EDGES = {"left": "right", "right": "left", "top": "bottom", "bottom": "top"}
 EXTREMES = {
     "leftmost": "rightmost", "rightmost": "leftmost", "topmost": "lowest", "lowest": "topmost"
 }  # fmt: skip
@@ -220,8 +221,9 @@ def replace_extremes(text: str, predicates: Predicates, rng: Random) -> Iterator
 
 
 def swap_subjects(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """In "a is between b and c", exchange a and b: then b lies at an end."""
-    pattern = rf"({OBJECT})( (?:is |will be )?between )({OBJECT})(?= and )"
+    """In "a is between b and c" or "a comes between b and c", exchange a and b: then b lies at an
+    end."""
+    pattern = rf"({OBJECT})( (?:is |will be |comes )?between )({OBJECT})(?= and )"
     for match in re.finditer(pattern, text, re.IGNORECASE):
         yield replace_match(text, match, f"{match[3]}{match[2]}{match[1]}")
 
@@ -231,6 +233,23 @@ def swap_distances(text: str, predicates: Predicates, rng: Random) -> Iterator[M
     pattern = rf"(?<!not )((?:nearer|closer) to )({OBJECT})( than to )({OBJECT})"
     for match in re.finditer(pattern, text):
         yield replace_match(text, match, f"{match[1]}{match[4]}{match[3]}{match[2]}")
+
+
+def unbalance_distances(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    """Replace "about as near to b as to c" with "nearer to b than to c"."""
+    for match in re.finditer(rf"about as near to ({OBJECT}) as to ({OBJECT})", text):
+        yield replace_match(text, match, f"nearer to {match[1]} than to {match[2]}")
+
+
+def replace_edges(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    for match in re.finditer(rf"(?<=reaches the )({'|'.join(OPPOSITE_EDGES)})(?= edge)", text):
+        yield replace_match(text, match, OPPOSITE_EDGES[match[0]])
+
+
+def show_unseen(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    """Give an object that is out of sight a place."""
+    for match in re.finditer(r"(?<!not )\bout of sight\b", text):
+        yield replace_match(text, match, rng.choice(ALL_REGIONS))
 
 
 def replace_answer(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
@@ -268,7 +287,10 @@ RELATION_MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutat
     "cover": lambda text, p, rng: replace_relations(text, COVERS, rng),
     "between": swap_subjects,
     "nearer": swap_distances,
+    "as near": unbalance_distances,
     "extreme": replace_extremes,
+    "edge": replace_edges,
+    "sight": show_unseen,
 }
 """The same for words of relations, which only relational rationales have."""
 
