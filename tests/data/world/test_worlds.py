@@ -30,13 +30,14 @@ from conf.schema.world import (
 )
 from data.build import check_quota_names, ensure_items
 from data.parallel import Workers
-from data.records import FPS, FRAMES, SPEED_BOUNDS
+from data.records import FPS, FRAMES, SPEED_BOUNDS, SceneObject
 from data.render.bullet import BulletRenderer
 from data.render.frame_cache import render_frames
 from data.store import Store
 from data.world import sliding
 from data.world.camera import Camera
 from data.world.events import find_motion_onsets
+from data.world.physics import Body, shared_simulator
 from data.world.sampling import FALLEN, REMEDIES, check_sample, sample_scene
 from data.world.shapes import RADIUS
 from data.world.starts import RejectedError
@@ -70,6 +71,35 @@ def test_presets_have_the_motions_that_they_are_named_after() -> None:
     hidden = [(s.visible_fraction < 0.05) & s.in_view for s in screen]
     reappears = [h[:-1] & ~h[1:] for h in hidden]
     assert sum(bool(r.any()) for r in reappears) >= 2
+
+
+def test_near_magnifies_objects_twofold() -> None:
+    near, standard = (Camera.from_settings(preset_world(n).camera) for n in ("near", "clevrer"))
+    assert near.magnification == pytest.approx(2 * standard.magnification, rel=1e-3)
+
+
+def test_metal_pushes_rubber_away_in_the_world_of_masses() -> None:
+    """The striking sphere goes on if it is the heavier one, and comes back if it is the lighter."""
+    world = preset_world("masses")
+    for striking, resting in (("metal", "rubber"), ("rubber", "metal")):
+        bodies = [
+            Body(SceneObject("sphere", striking, "red"), (0.0, -1.0), 0, (0.0, 2.0)),
+            Body(SceneObject("sphere", resting, "blue"), (0.0, 0.0), 0),
+        ]
+        motion = shared_simulator().simulate(bodies, world, frames=30)
+        (hit,) = motion.collisions
+        before, after = (motion.velocities[hit.frame + k, 0, 1] for k in (-1, 1))
+        assert (after > before / 3) == (striking == "metal")
+
+
+def test_dusk_has_the_scenes_of_the_standard_world_in_less_light() -> None:
+    dusk, standard = (simulate_scene(0, 3, preset_world(name)) for name in ("dusk", "clevrer"))
+    np.testing.assert_array_equal(dusk.positions, standard.positions)
+    dark, bright = (
+        BulletRenderer(192, 128, preset_world(name)).render(scene, 10)
+        for name, scene in (("dusk", dusk), ("clevrer", standard))
+    )
+    assert np.mean(dark) < np.mean(bright) - 30
 
 
 @pytest.mark.parametrize("suite", ["movi_a", "physion"])
