@@ -120,7 +120,8 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
         if not items and not queries:
             names = [name for ids in scene_ids.values() for name in ids]
-            if not any(visible_positions(scene_of(name))[1].any() for name in names):
+            is_simulated = cfg.simulator == "bullet"
+            if is_simulated and not any(visible_positions(scene_of(n))[1].any() for n in names):
                 raise UserError(
                     f"no scene of the benchmark {cfg.name} shows an object: move "
                     "benchmark.world.camera, or benchmark.world.parts, which may hide the objects",

@@ -13,6 +13,7 @@ from data.records import Rationale
 from teacher.narrate import ensure_rationales, narrate_store
 from teacher.rationale_log import Journal, read_rationales
 from teacher.sections import GRAMMAR, GRAMMAR_VERSION
+from teacher.vocabulary import name_vocabulary
 from tests.teacher import synthetic
 from tests.teacher.faulty_server import teacher_at
 from tests.teacher.memory_store import make_store
@@ -303,7 +304,7 @@ def test_rationales_of_another_vocabulary_are_named_and_not_used(tmp_path, caplo
         second = narrate_store(store, relational)
     assert "3 responses of the vocabulary paper 1; they are not used" in caplog.text
     assert path.read_bytes().startswith(kept)
-    assert {r.predicates for r in second.rationales} == {"relational 1"}
+    assert {r.predicates for r in second.rationales} == {name_vocabulary(relational)}
     assert narrate_store(store, TEMPLATE).rationales == first.rationales
     with Journal(path) as journal:
         journal.append([replace(second.rationales[0], predicates="relational 0")])
