@@ -19,8 +19,8 @@ SEEN_ERROR, PREDICTED_ERROR = 0.02, 0.3
 (share of the object's path from the cut). Those of the tiny base are about as large."""
 RELATION_FACTOR = 3.0
 """Factor on these errors for statements about relations, which readers find less surely than where
-one object is. The tiny base is right in 88% of its statements about regions of candidates, and in
-26 to 63% of those about relations."""
+one object is. Of the statements of a tiny base about candidates, 88% of those about regions were
+right, and 26 to 63% of those about sides, heights and gaps."""
 UNKNOWN_PATH = 1.0
 """Path that is assumed for an object that is not visible both at the cut and at the target."""
 CLEARER = 1.25
