@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from conf.runs import rank, world_size
 
 if TYPE_CHECKING:
     import torch
+    from torch.nn import Parameter
 
 
 @contextmanager
@@ -45,8 +46,35 @@ def rank_device() -> torch.device:
     return PartialState(cpu=not torch.cuda.is_available()).device
 
 
-def split_batch(batch: int, micro_batch: int = 1) -> int:
+def average_gradients(parameters: Iterable[Parameter]) -> None:
+    """Replace the gradients by their means over all ranks.
+
+    A gradient that only some ranks have is 0 on the others; one that no rank has stays None, so
+    that the optimizer leaves its parameter unchanged.
+    """
+    if world_size() == 1:
+        return
+    import torch
+    from torch import distributed
+
+    rank_device()
+    parameters = [*parameters]
+    present = torch.tensor([float(p.grad is not None) for p in parameters])
+    distributed.all_reduce(present)
+    trained = [p for p, ranks in zip(parameters, present.tolist(), strict=True) if ranks]
+    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in trained]
+    joined = torch.cat([g.flatten() for g in gradients])
+    distributed.all_reduce(joined)
+    means = (joined / world_size()).split([p.numel() for p in trained])
+    for parameter, mean in zip(trained, means, strict=True):
+        parameter.grad = mean.view_as(parameter)
+
+
+def split_batch(batch: int, micro_batch: int = 1, key: str = "train.batch") -> int:
     """Return the number of micro-batches per rank of a step of `batch` samples over all ranks.
+
+    Args:
+        key: The setting of `batch`, for the error message.
 
     Raises:
         UserError: The batch cannot be split into full micro-batches, equally many on each rank.
@@ -55,8 +83,8 @@ def split_batch(batch: int, micro_batch: int = 1) -> int:
     if batch % samples:
         parts = f" in micro-batches of train.micro_batch={micro_batch}" if micro_batch > 1 else ""
         raise UserError(
-            f"train.batch={batch} cannot be split over {world_size()} ranks{parts}: set "
-            f"train.batch to a multiple of {samples}, such as "
+            f"{key}={batch} cannot be split over {world_size()} ranks{parts}: set "
+            f"{key} to a multiple of {samples}, such as "
             f"{max(1, round(batch / samples)) * samples}, or change the number of ranks",
             code="uneven-batch",
         )

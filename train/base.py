@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from conf.entry import Run, command
-from conf.runs import finished_metrics
+from conf.runs import finished_metrics, rank
 from conf.schema import BaseCommand
 
 log = logging.getLogger(__name__)
@@ -28,14 +28,18 @@ def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
     from data.render.frame_cache import FrameReader
     from models import compat, loading
+    from models.distributed import main_first, split_batch
     from models.precision import resolve_precision
     from train.common.held_out import shuffled
     from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
     from train.tiny_base.generated_answers import measure_generated_answers
-    from train.tiny_base.training import build_trainer
+    from train.tiny_base.training import STAGES, build_trainer
 
+    for stage in STAGES:
+        split_batch(getattr(cfg.train, stage).batch, key=f"train.{stage}.batch")
     compat.keep_freed_memory()
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    with main_first():
+        store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     frames = FrameReader(store, cfg.student.image_size)
     training, held_out = split_items(store, frames)
     sampler = ItemSampler(training, frames, cfg.student.frames, cfg.seed)
@@ -49,6 +53,8 @@ def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
     measured = shuffled(held_out, cfg.seed)[: cfg.train.validation_items]
     trainer = build_trainer(cfg, run, model, processor, sampler, measured)
     trainer.run()
+    if rank() > 0:
+        return {}
     log.info("measuring the base on %d items of held-out scenes", len(measured))
     metrics = trainer.probe.measure("words")
     metrics |= measure_generated_answers(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from conf.runs import rank, world_size
 from data.records import LETTERS, SelectionItem
 from data.render.frame_cache import FrameReader
 from data.store import Store
@@ -14,14 +15,11 @@ from teacher.predicates.relations import Bounds
 from train.common.held_out import check_not_empty, held_out_scenes
 from train.student.dataset import prompt_corpus, uses_only
 from train.student.lazy_samples import seeded_rng
-from train.tiny_base.questions import KINDS, QUESTIONS, WITHOUT_PICTURES, Question
+from train.tiny_base.questions import KINDS, QUESTIONS, Question
 from train.tiny_base.samples import OracleSample, make_sample
 
 SILENT = Question("", "")
 """The question of the stages without words."""
-TEXT_FACTOR = 3
-"""A step whose question shows no picture has this many times as many samples. Such a sample takes
-about a third of the time of one with pictures."""
 CORPUS_ITEMS = 800
 """Number of items whose texts the tokenizer is trained on."""
 
@@ -56,13 +54,11 @@ class ItemSampler:
     seed: int
 
     def batch(self, stage: str, step: int, size: int) -> list[OracleSample]:
-        """Return the samples of a step, `size` of them if they show pictures. All ask the same kind
-        of question, so that they show the same number of pictures."""
+        """Return this rank's samples of a step with `size` samples over all ranks. All ask the same
+        kind of question, so that they show the same number of pictures."""
         samples = []
         kind = [*KINDS][step % len(KINDS)] if stage == "words" else None
-        if kind in WITHOUT_PICTURES:
-            size *= TEXT_FACTOR
-        for position in range(step * size, (step + 1) * size):
+        for position in range(step * size + rank(), (step + 1) * size, world_size()):
             epoch, index = divmod(position, len(self.items))
             order = seeded_rng(self.seed, stage, epoch).permutation(len(self.items))
             samples.append(self.sample(self.items[order[index]], kind, f"{stage} {epoch}"))

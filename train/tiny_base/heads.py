@@ -7,7 +7,8 @@ picture. The heads are linear, so the base itself has to represent what they pre
                centre of an object is in the token, where in the token and in the image, and the
                displacement between the two frames of the picture
     "known"    visual tokens after the layer `MIDDLE`: place, whether the object moves, velocity,
-               displacements ahead, and displacement since the end of the clip
+               displacements ahead, and, in a candidate, displacement since the end of the clip
+               and distance from the object's places in the earlier candidates
     "spelled"  names of objects in a text after the layer `MIDDLE`: colour, material and shape, as
                in "seen", so that attention can compare a name with visual tokens
     "named"    names of objects in a text after the layer `NAMING`: in which pictures the object is
@@ -34,7 +35,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
 from data.records import LETTERS
-from train.tiny_base.oracle_targets import AHEAD
+from train.tiny_base.oracle_targets import AHEAD, UNSEEN_DISTANCE
 from train.tiny_base.trace import (
     NAMING,
     PRECEDING,
@@ -49,11 +50,9 @@ PICTURES = 1 + len(LETTERS)
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
 DISPLACEMENTS = ("velocity", *AHEADS, "since")
 SCALES = {"place": 3.0, "offset": 3.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
-    DISPLACEMENTS, 5.0
+    (*DISPLACEMENTS, "apart"), 5.0
 )
 """Factors on places and displacements, so that their losses are of similar size."""
-UNSEEN_DISTANCE = 0.3
-"""Distance, as a share of the image, that counts for a candidate that does not show an object."""
 BEND = 0.1
 """Scaled error above which the loss of a place or displacement is linear."""
 MOVING = 0.012
@@ -76,6 +75,8 @@ class OracleTargets:
             to the centre of the picture.
         inside: (N, 2) place in the token, from -0.5 to 0.5, or beyond at the border of the picture.
         tracked: (K, 3) row, token of a candidate, and token of the same object in the clip.
+        recognised: (_, 4) row, token of an object in a candidate, index of an earlier candidate,
+            and token of the same object there, or -1 where it is not visible.
         names: (M, 2) row and position of a name's last token.
         name_words: (M,) the named object's colour, material and shape, by kind.
         found: (M, PICTURES) token of the named object in each picture, or -1 where it is not
@@ -106,6 +107,8 @@ class OracleTargets:
             otherwise of the word "shows".
         following: (_, 3) row, position before the first mention of an object in a scene parse, and
             token of the object at the end of the clip.
+        introduced: (_, 3) row, position before the first mention of an object, and token of the
+            object in the last candidate that shows it.
     """
 
     visual: Tensor
@@ -116,6 +119,7 @@ class OracleTargets:
     truth: dict[str, Tensor]
     inside: Tensor
     tracked: Tensor
+    recognised: Tensor
     names: Tensor
     name_words: dict[str, Tensor]
     found: Tensor
@@ -133,6 +137,7 @@ class OracleTargets:
     verdicts: Tensor
     comparisons: Tensor
     following: Tensor
+    introduced: Tensor
 
 
 class OracleHeads(nn.Module):
@@ -159,7 +164,7 @@ class OracleHeads(nn.Module):
             return nn.ModuleDict({name: nn.Linear(hidden, n) for name, n in widths.items()})
 
         self.seen = heads({"presence": 1, "inside": 2, "shift": 2, "place": 2})
-        self.known = heads({"place": 2, "moving": 1} | dict.fromkeys(DISPLACEMENTS, 2))
+        self.known = heads({"place": 2, "moving": 1, "apart": 1} | dict.fromkeys(DISPLACEMENTS, 2))
         self.named = heads({"visible": PICTURES, "places": 2 * PICTURES, "future": 2})
         self.spoken = heads({"place": 2, "velocity": 2, "offset": 2})
         self.spread = nn.Linear(hidden, 1)
@@ -192,7 +197,7 @@ class OracleHeads(nn.Module):
         truth = targets.truth
         losses = {
             name: distance(self.known[name](known), truth[name], SCALES[name])
-            for name in ("place", *DISPLACEMENTS)
+            for name in ("place", "apart", *DISPLACEMENTS)
         }
         observed = ~truth["velocity"][:, 0].isnan()
         if observed.any():
@@ -213,7 +218,8 @@ class OracleHeads(nn.Module):
             `color`, `material` and `shape` (N,), whether the word is right; `moving` and, for
             moving objects, `heading` (one of eight), likewise; and errors as shares of the image:
             `place_error`, and `<displacement>_error` beside `<displacement>_still`, the error of
-            staying put, of objects that are displaced.
+            staying put, of objects that are displaced, and `apart_error` beside `apart_constant`,
+            the error of the median.
         """
         truth = targets.truth
         row, token = targets.objects.T
@@ -241,6 +247,10 @@ class OracleHeads(nn.Module):
             displaced = moves & ~distances.isnan() if name != "since" else distances > MOVING
             found[f"{name}_error"] = (read[name] - truth[name]).norm(dim=1)[displaced]
             found[f"{name}_still"] = distances[displaced]
+        apart = truth["apart"][:, 0]
+        compared = ~apart.isnan()
+        found["apart_error"] = (read["apart"][:, 0] - apart)[compared].abs()
+        found["apart_constant"] = (apart - apart.nanmedian())[compared].abs()
         return found
 
     def spelled_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
@@ -311,6 +321,8 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     second before  PRECEDING 1    token of a text -> the second token before it
     label          PRECEDING 2    visual token of a candidate -> its letter in the prompt
     track          TRACKING 0     object in a candidate -> the same object at the end of the clip
+    recognise k    TRACKING 2+k   object in a candidate -> the same object in candidate k, an
+                                  earlier one, or, if it does not show the object, the first token
     letter         TRACKING 1     name in a text about a candidate -> the candidate's letter there
     find k         NAMING k       name -> the object in picture k, or, if the picture does not show
                                   it, the first token of the sequence
@@ -324,6 +336,8 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     verdict        SPEAKING 0     token before a letter in an outcome -> "agrees" of this candidate
     following      SPEAKING 1     token before a new name in a scene parse -> the object at the end
                                   of the clip
+    introduced     SPEAKING 2     token before a new name -> the object in the last candidate that
+                                  shows it
 
     The two preceding tokens allow later layers to find what followed an earlier use of the same
     words. The letters allow a text about a candidate to find the candidate's visual tokens.
@@ -333,6 +347,12 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     if len(row):
         query, key = targets.visual[row, start], targets.visual[row, end]
         losses["track"] = -trace.log_attention(TRACKING, 0, row, query, key).mean()
+    for k in range(len(LETTERS) - 1):
+        row, start, _, end = targets.recognised[targets.recognised[:, 2] == k].T
+        if len(row):
+            query, key = targets.visual[row, start], locate_objects(row, end, targets)
+            weights = trace.log_attention(TRACKING, 2 + k, row, query, key)
+            losses[f"recognise {k}"] = -weights.mean()
     for head in range(PICTURES):
         named = targets.has_picture[targets.names[:, 0], head]
         row, query = targets.names[named].T
@@ -343,6 +363,8 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     before, second_before = (torch.stack([row, position, position - k], dim=1) for k in (1, 2))
     row, query, token = targets.following.T
     following = torch.stack([row, query, targets.visual[row, token]], dim=1)
+    row, query, token = targets.introduced.T
+    introduced = torch.stack([row, query, targets.visual[row, token]], dim=1)
     row, query, token = targets.shown.T
     shown = torch.stack([row, query, locate_objects(row, token, targets)], dim=1)
     for name, layer, head, pairs in (
@@ -357,6 +379,7 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         ("owner", RECALLING, 3, targets.owners),
         ("verdict", SPEAKING, 0, targets.verdicts),
         ("following", SPEAKING, 1, following),
+        ("introduced", SPEAKING, 2, introduced),
     ):
         row, query, key = pairs.T
         if len(row):

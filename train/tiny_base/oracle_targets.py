@@ -8,7 +8,7 @@ token that contains its centre.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -27,6 +27,8 @@ RATE = 10
 FARTHEST = 1.0
 """Displacements above this share of the image are left out: the object is far outside of it."""
 UNKNOWN = (float("nan"), float("nan"))
+UNSEEN_DISTANCE = 0.3
+"""Distance, as a share of the image, that counts for a candidate that does not show an object."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class ObjectTarget:
         ahead: Displacement during each number of frames of `AHEAD`; NaN in images.
         since: Displacement from the object's place at the end of the clip; NaN in the clip and in
             images of other scenes.
+        apart: Mean distance from the object's places in the earlier candidates; NaN in the clip and
+            in the first candidate.
     """
 
     name: str
@@ -55,6 +59,7 @@ class ObjectTarget:
     velocity: tuple[float, float] = UNKNOWN
     ahead: tuple[tuple[float, float], ...] = (UNKNOWN,) * len(AHEAD)
     since: tuple[float, float] = UNKNOWN
+    apart: float = float("nan")
 
     def cell(self, grid: int) -> int:
         """Return the index of the object's token in its picture, which has grid x grid tokens."""
@@ -99,6 +104,20 @@ def image_targets(
         place, visible = _place(scene, frame, k), _fraction(scene, frame, k)
         name = scene.objects[k].noun_phrase
         yield ObjectTarget(name, picture, place, visible, since=since)
+
+
+def compare_images(images: Sequence[Sequence[ObjectTarget]]) -> Iterator[ObjectTarget]:
+    """Yield the targets of candidates, each with its distance from the earlier candidates."""
+    for k, image in enumerate(images):
+        earlier = [{t.name: t.place for t in targets} for targets in images[:k]]
+        for target in image:
+            distances = [
+                float(np.hypot(*np.subtract(target.place, places[target.name])))
+                if target.name in places
+                else UNSEEN_DISTANCE
+                for places in earlier
+            ]
+            yield replace(target, apart=float(np.mean(distances)) if distances else UNKNOWN[0])
 
 
 def future_displacements(scene: Scene, frame: int, later: int) -> dict[str, tuple[float, float]]:
@@ -177,7 +196,7 @@ def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, torch.Tensor]:
 
     Returns:
         `color`, `material` and `shape` (N,) indices; `place`, `shift`, `velocity`, `since` and
-        `ahead_<h>` (N, 2) for each h of `AHEAD`.
+        `ahead_<h>` (N, 2) for each h of `AHEAD`; `apart` (N, 1).
     """
     stacked = name_words([t.name for t in targets])
 
@@ -188,4 +207,5 @@ def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, torch.Tensor]:
         stacked[name] = pairs([getattr(t, name) for t in targets])
     for k, h in enumerate(AHEAD):
         stacked[f"ahead_{h}"] = pairs([t.ahead[k] for t in targets])
+    stacked["apart"] = torch.tensor([t.apart for t in targets]).reshape(-1, 1)
     return stacked

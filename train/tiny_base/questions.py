@@ -197,7 +197,6 @@ KINDS: dict[str, MakeQuestion] = {
     "parse": parse, "predict": predict, "describe": describe, "compare": compare,
     "explain": explain, "match": match, "narrate": narrate,
 }  # fmt: skip
-WITHOUT_PICTURES = ("match", "narrate")
 
 
 def make_statement_writer(

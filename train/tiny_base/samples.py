@@ -31,6 +31,7 @@ from train.tiny_base.oracle_targets import (
     UNKNOWN,
     ObjectTarget,
     clip_targets,
+    compare_images,
     future_displacements,
     image_targets,
     most_visible_per_token,
@@ -77,11 +78,13 @@ def make_sample(
         observed = observed_states(scene, find_cut(scene, item.prefix_start, item.prefix_stop))
         future = future_displacements(scene, item.prefix_stop, item.target_frame)
     if question.candidates:
+        images = []
         for picture, (letter, c) in enumerate(zip(LETTERS, item.candidates, strict=True), last + 1):
             follows = original_scene_id(c.scene_id) == original_scene_id(item.scene_id)
             before = (scene, item.prefix_stop) if follows and clip else None
-            targets += image_targets(frames.scene(c.scene_id), c.frame, picture, before)
+            images.append([*image_targets(frames.scene(c.scene_id), c.frame, picture, before)])
             parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
+        targets += compare_images(images)
     parts.append(f"\n{question.text}")
     sample = conversation(item.item_id, parts, question.answer, clip)
     return OracleSample(sample, tuple(targets), last, observed, future, question.predicts_target)
@@ -244,6 +247,7 @@ def stack_samples(
         truth=truth,
         inside=scaled - scaled.floor().clamp(0, grid - 1) - 0.5,
         tracked=integers([*track_objects(samples, objects, grid)], 3),
+        recognised=integers([*recognise_objects(samples, objects, grid)], 4),
         names=integers([(m.row, m.position) for m in mentions], 2),
         name_words=name_words([m.name for m in mentions]),
         found=integers([m.found for m in mentions], PICTURES),
@@ -274,6 +278,7 @@ def stack_samples(
         verdicts=integers(pairs["verdicts"], 3),
         comparisons=integers(pairs["comparisons"], 3),
         following=integers([*find_following(mentions)], 3),
+        introduced=integers([*find_introduced(mentions)], 3),
     )
 
 
@@ -295,6 +300,30 @@ def find_following(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, in
         if m.section == "Scene parse" and (m.row, m.name) not in mentioned and m.found[0] >= 0:
             yield m.row, m.first - 1, m.found[0]
         mentioned.add((m.row, m.name))
+
+
+def find_introduced(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
+    """Yield the row, the position before the first mention of an object, and the object's visual
+    token in the last candidate that shows it."""
+    mentioned = set()
+    for m in mentions:
+        shown = [token for token in m.found[1:] if token >= 0]
+        if (m.row, m.name) not in mentioned and shown:
+            yield m.row, m.first - 1, shown[-1]
+        mentioned.add((m.row, m.name))
+
+
+def recognise_objects(
+    samples: Sequence[OracleSample], objects: Sequence[tuple[int, ObjectTarget]], grid: int
+) -> Iterator[tuple[int, int, int, int]]:
+    """Yield the row, the visual token of each object in a candidate, the index of each earlier
+    candidate, and the token of the same object there, or -1 if it is not visible there."""
+    shown = [shown_objects(s) for s in samples]
+    for row, t in objects:
+        first = samples[row].last + 1
+        for k in range(t.picture - first):
+            earlier = shown[row].get((first + k, t.name))
+            yield row, t.token(grid), k, earlier.token(grid) if earlier else -1
 
 
 def track_objects(

@@ -5,6 +5,9 @@
     motion   the whole model learns from clips and candidates where objects are and where they go
     words    the model learns to answer questions in words; the targets of both other stages remain
 
+Several ranks share each batch: every rank computes the losses of its samples, and the gradients are
+averaged. Only the main rank evaluates and writes.
+
 All stages see the same items. The order of the items, the questions and the candidates depend only
 on the seed and the step, so that a resumed run continues as if it had never stopped.
 """
@@ -27,8 +30,10 @@ from transformers import PreTrainedModel, ProcessorMixin
 
 from conf.entry import Run
 from conf.errors import UserError
+from conf.runs import rank
 from conf.schema import BaseCommand, BaseTrainConfig, StageConfig
 from data.records import COLORS, MATERIALS, SHAPES, SelectionItem
+from models.distributed import average_gradients
 from models.student.collator import IGNORED
 from teacher.predicates.facts import COMPASS
 from train.common.curves import plot_curves
@@ -134,6 +139,7 @@ class BaseTrainer:
         self.cfg, self.model, self.heads = cfg, model, heads
         self.collate, self.sampler, self.probe, self.folder = collate, sampler, probe, folder
         self.tokenizer_digest = tokenizer_digest
+        self.parameters = [*model.parameters(), *heads.parameters()]
         self.stage, self.step = 0, 0
 
     def run(self) -> None:
@@ -147,18 +153,17 @@ class BaseTrainer:
             self._save()
 
     def _new_optimizer(self) -> torch.optim.AdamW:
-        parameters = [*self.model.parameters(), *self.heads.parameters()]
         groups = [
-            {"params": [p for p in parameters if p.dim() > 1]},
+            {"params": [p for p in self.parameters if p.dim() > 1]},
             # Biases and the weights of norms do not decay.
-            {"params": [p for p in parameters if p.dim() <= 1], "weight_decay": 0.0},
+            {"params": [p for p in self.parameters if p.dim() <= 1], "weight_decay": 0.0},
         ]
         betas = (0.9, self.cfg.adam_beta2)
         return torch.optim.AdamW(groups, betas=betas, weight_decay=self.cfg.weight_decay)
 
     def _run_stage(self, name: str, stage: StageConfig) -> None:
         interval = max(1, math.ceil(stage.steps / self.cfg.evaluations))
-        bar = tqdm(total=stage.steps, initial=self.step, desc=name, unit="step")
+        bar = tqdm(total=stage.steps, initial=self.step, desc=name, unit="step", disable=rank() > 0)
         with bar:
             while self.step < stage.steps:
                 losses = self._train_step(name, stage)
@@ -166,6 +171,8 @@ class BaseTrainer:
                 total = sum(losses.values())
                 bar.update()
                 bar.set_postfix_str(f"loss {total:.3f}")
+                if rank() > 0:
+                    continue
                 done = sum(getattr(self.cfg, s).steps for s in STAGES[: self.stage]) + self.step
                 record = {"step": done, "stage": name, "loss": total}
                 if self.step % interval == 0 or self.step == stage.steps:
@@ -193,6 +200,7 @@ class BaseTrainer:
             )
         self.optimizer.zero_grad()
         loss.backward()
+        average_gradients(self.parameters)
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.cfg.max_grad_norm)
         self.optimizer.step()
         return {k: v.item() for k, v in losses.items()}
@@ -203,6 +211,8 @@ class BaseTrainer:
 
     def _save(self) -> None:
         """Write the checkpoint and the curves."""
+        if rank() > 0:
+            return
         state = {
             "stage": self.stage,
             "step": self.step,
@@ -221,7 +231,8 @@ class BaseTrainer:
         path = self.folder / STATE
         journal = self.folder / JOURNAL
         if not path.exists():
-            journal.unlink(missing_ok=True)
+            if rank() == 0:
+                journal.unlink(missing_ok=True)
             return
         state = torch.load(path, weights_only=True)
         if state["tokenizer"] != self.tokenizer_digest:
@@ -234,7 +245,8 @@ class BaseTrainer:
         self.model.load_state_dict(state["model"])
         self.heads.load_state_dict(state["heads"])
         self.optimizer.load_state_dict(state["optimizer"])
-        os.truncate(journal, state["journal"])
+        if rank() == 0:
+            os.truncate(journal, state["journal"])
         log.info("resuming at step %d of stage %s", self.step, [*STAGES, "end"][self.stage])
 
 

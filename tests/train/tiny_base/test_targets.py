@@ -11,7 +11,7 @@ import torch
 from data.records import LETTERS, sample_prefix_frames
 from data.store import Store
 from teacher.predicates.motion import find_cut, motion_start
-from train.tiny_base.data import TEXT_FACTOR, ItemSampler
+from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import (
     locate_objects,
 )
@@ -20,14 +20,16 @@ from train.tiny_base.oracle_targets import (
     AHEAD,
     RATE,
     UNKNOWN,
+    UNSEEN_DISTANCE,
     ObjectTarget,
     clip_targets,
+    compare_images,
     future_displacements,
     image_targets,
     most_visible_per_token,
     observed_states,
 )
-from train.tiny_base.questions import KINDS, WITHOUT_PICTURES
+from train.tiny_base.questions import KINDS
 from train.tiny_base.samples import (
     shown_objects,
     spoken_state,
@@ -126,6 +128,47 @@ def test_names_end_where_the_text_names_objects(samples, collate, processor) -> 
                 )
                 assert token == t.picture * GRID**2 + t.cell(GRID)
                 assert place.tolist() == pytest.approx(t.place, abs=1e-6)
+
+
+def test_candidates_are_compared_with_the_earlier_ones() -> None:
+    def image(**places: tuple[float, float]) -> list[ObjectTarget]:
+        return [ObjectTarget(name, 0, place) for name, place in places.items()]
+
+    images = [image(a=(0.1, 0.1), b=(0.5, 0.5)), image(a=(0.4, 0.5)), image(a=(0.4, 0.5), b=(1, 1))]
+    found = [*compare_images(images)]
+    assert [t.name for t in found] == ["a", "b", "a", "a", "b"]
+    assert [t.place for t in found] == [t.place for image in images for t in image]
+    apart = [t.apart for t in found]
+    assert np.isnan(apart[:2]).all()
+    assert apart[2:] == pytest.approx([0.5, 0.25, (0.5**0.5 + UNSEEN_DISTANCE) / 2])
+
+
+def test_objects_are_recognised_in_the_earlier_candidates(sampler, collate) -> None:
+    samples = [sampler.sample(item, "compare", "test") for item in sampler.items[:6]]
+    _, targets = collate(samples)
+    assert len(targets.recognised) > 20
+    for row, token, earlier, other in targets.recognised.tolist():
+        first = samples[row].last + 1
+        picture = token // GRID**2 - first
+        assert 0 <= earlier < picture < len(LETTERS)
+        # A token of this coarse grid can contain several objects.
+        names = [t.name for t in samples[row].targets if t.token(GRID) == token]
+        shown = shown_objects(samples[row])
+        there = [shown.get((first + earlier, name)) for name in names]
+        assert other in [t.token(GRID) if t else -1 for t in there]
+
+
+def test_new_names_refer_to_the_object_in_the_last_candidate_that_shows_it(
+    sampler, collate
+) -> None:
+    samples = [sampler.sample(item, "explain", "test") for item in sampler.items[:6]]
+    _, targets = collate(samples)
+    assert len(targets.introduced) > 10
+    positions = {(row, at): m for m, (row, at) in enumerate(targets.names.tolist())}
+    for row, before, token in targets.introduced.tolist():
+        name = min(at for r, at in positions if r == row and at > before)
+        found = targets.found[positions[row, name], 1:].tolist()
+        assert token == [t for t in found if t >= 0][-1]
 
 
 def test_scene_parses_refer_to_the_object_that_they_name_next(sampler, collate) -> None:
@@ -256,7 +299,12 @@ def test_samples_depend_on_seed_and_step_only(sampler: ItemSampler) -> None:
     assert sorted(epoch) == sorted(item.item_id for item in sampler.items)
 
 
-def test_steps_ask_more_questions_without_pictures(sampler: ItemSampler) -> None:
-    for step, kind in enumerate(KINDS):
-        expected = 2 * TEXT_FACTOR if kind in WITHOUT_PICTURES else 2
-        assert len(sampler.batch("words", step, 2)) == expected
+def test_ranks_share_the_samples_of_a_step(sampler: ItemSampler, monkeypatch) -> None:
+    whole = [s.sample.response for s in sampler.batch("words", 3, 4)]
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    parts = []
+    for rank in ("0", "1"):
+        monkeypatch.setenv("RANK", rank)
+        parts.append([s.sample.response for s in sampler.batch("words", 3, 4)])
+    assert parts == [whole[::2], whole[1::2]]
