@@ -107,8 +107,8 @@ class OracleTargets:
             otherwise of the word "shows".
         following: (_, 3) row, position before the first mention of an object in a scene parse, and
             token of the object at the end of the clip.
-        introduced: (_, 3) row, position before the first mention of an object, and token of the
-            object in the last candidate that shows it.
+        introduced: (_, 3) row, position before the first mention of an object in a text and in its
+            predictions, and token of the object in the last candidate that shows it.
     """
 
     visual: Tensor
@@ -336,8 +336,8 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     verdict        SPEAKING 0     token before a letter in an outcome -> "agrees" of this candidate
     following      SPEAKING 1     token before a new name in a scene parse -> the object at the end
                                   of the clip
-    introduced     SPEAKING 2     token before a new name -> the object in the last candidate that
-                                  shows it
+    introduced     SPEAKING 2     token before a name that is new in a text, or in its predictions
+                                  -> the object in the last candidate that shows it
 
     The two preceding tokens allow later layers to find what followed an earlier use of the same
     words. The letters allow a text about a candidate to find the candidate's visual tokens.

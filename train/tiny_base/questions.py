@@ -6,17 +6,17 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     parse      the objects at the end of a clip, and their motion
     predict    where each object will be at the target, and how the objects will lie to each other
     describe   where each candidate shows each object, and how they lie to each other
-    compare    for each of two statements, which candidates agree with it
+    compare    for each of two candidates, the statements that tell it apart from the others, and
+               which candidates agree with them
     explain    the steps of a rationale about a statement that is true of the target
     match      as `compare`, without any picture
     narrate    a whole rationale with its answer, without any picture
 
 None of them is the selection task: no answer about pictures says which candidate is the target.
-Statements about pictures are sampled, not chosen because they decide the item; those of `explain`
-are true of at least two candidates. Of the sampled statements of a kind, the one that fewest
-candidates agree with is used. If most agreed, copying the prediction would describe most
-candidates, and the model would not learn to find the objects that the candidates show at different
-places. `match` teaches to compare what a text says of a candidate with what it has predicted.
+`compare` asks about candidates sampled at random, whichever is the target. Its statements are
+chosen as those that decide an item, so that the model learns to find the objects that tell
+candidates apart. The statements of `explain` are sampled, and true of at least two candidates. Of
+the sampled statements of a kind, the one that fewest candidates agree with is used. `match` teaches to compare what a text says of a candidate with what it has predicted.
 `narrate` teaches the language of rationales, in both vocabularies, and how an answer follows from
 what a text says of the candidates.
 """
@@ -31,7 +31,7 @@ import numpy as np
 
 from data.records import SelectionItem
 from models.student.prompts import response
-from teacher.deciding import Decision, probability_of_sight
+from teacher.deciding import Decision, choose_statements, probability_of_sight
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.facts import Relation, RelationalPredicates, View
 from teacher.predicates.relations import (
@@ -60,6 +60,8 @@ SPARSE = Detail(parsed=3, analysed=2, predicted=1, pairs=1)
 PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
 """Maximum numbers of relations in a prediction and about each candidate, and of statements that are
 compared with all candidates."""
+SUPPOSED_PATH = 0.2
+"""Path of objects to a supposed target, as a share of the image; a typical path to the target."""
 OPTIONS = 12
 """Number of statements that are sampled about a picture."""
 
@@ -136,23 +138,23 @@ def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Genera
 
 
 def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
-    """Ask which candidates agree with statements, each true of some candidate and chosen by
-    `choose_rarest`."""
-    blocks: dict[Relation, str] = {}  # by normalized statement
+    """Ask for the statements that would decide the item if a candidate were the target, and which
+    candidates agree with them, for two candidates."""
+    blocks = []
     for k in rng.permutation(len(p.views))[:COMPARED]:
-        options = sample_statements(p, p.views[k], rng, OPTIONS)
-        options = [s for s in options if normalize_relation(s) not in blocks]
-        if not options:
+        supposed = suppose_target(p, p.views[k].letter)
+        statements = choose_statements(supposed).statements
+        if not statements:
             continue
-        statement = choose_rarest(p, options)
-        writer = make_statement_writer(p, item, rng, [statement])
-        parts = [f"candidate {view.letter} {judge(writer, view)}" for view in p.views]
-        blocks[normalize_relation(statement)] = (
-            f"Prediction: {join_sentences([writer.statement(writer.statements[0], 'will be')])}\n"
-            f"Candidate analysis: {join_sentences(parts)}\n"
-            f"Outcome: {join_sentences([name_agreeing(p, [statement])])}"
+        writer = make_statement_writer(p, item, rng, statements)
+        predicted = [writer.statement(s, "will be") for s in writer.statements]
+        analysed = [f"candidate {view.letter} {judge(writer, view)}" for view in p.views]
+        blocks.append(
+            f"Prediction: {join_sentences(predicted)}\n"
+            f"Candidate analysis: {join_sentences(analysed)}\n"
+            f"Outcome: {join_sentences([name_agreeing(p, statements)])}"
         )
-    return Question(COMPARE, "\n".join(blocks.values()), predicts_target=False)
+    return Question(COMPARE, "\n".join(blocks), predicts_target=False)
 
 
 def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
@@ -209,6 +211,19 @@ def make_statement_writer(
     """Return a writer of the narrator's phrases about the given statements."""
     decision = Decision(tuple(statements), ())
     return RelationalWriter(p, decision, detail, item.item_id, int(rng.integers(2**31)))
+
+
+def suppose_target(p: RelationalPredicates, letter: str) -> RelationalPredicates:
+    """Return predicates as if a candidate were the target, and all objects had moved equally far.
+    What candidates show of objects that are not in the scene is left out."""
+    names = {o.object for o in p.objects}
+    candidates = tuple(replace(c, agrees=c.letter == letter) for c in p.candidates)
+    views = tuple(
+        replace(v, relations=tuple(r for r in v.relations if names.issuperset(r.objects)))
+        for v in p.views
+    )
+    paths = dict.fromkeys(names, SUPPOSED_PATH)
+    return replace(p, candidates=candidates, views=views, paths=paths)
 
 
 def judge(writer: RelationalWriter, view: View) -> str:

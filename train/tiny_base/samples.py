@@ -303,14 +303,15 @@ def find_following(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, in
 
 
 def find_introduced(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
-    """Yield the row, the position before the first mention of an object, and the object's visual
-    token in the last candidate that shows it."""
+    """Yield the row, the position before the first mention of an object in a text and in its
+    predictions, and the object's visual token in the last candidate that shows it."""
     mentioned = set()
     for m in mentions:
         shown = [token for token in m.found[1:] if token >= 0]
-        if (m.row, m.name) not in mentioned and shown:
+        key = m.row, m.name, m.section == "Prediction"
+        if key not in mentioned and shown:
             yield m.row, m.first - 1, shown[-1]
-        mentioned.add((m.row, m.name))
+        mentioned.add(key)
 
 
 def recognise_objects(
