@@ -8,6 +8,7 @@ from torch import nn
 from transformers import PreTrainedModel
 from transformers.models.qwen3_vl.modeling_qwen3_vl import eager_attention_forward
 
+from models import attention
 from models.attention import (
     BY_FRAME,
     MATMUL,
@@ -78,15 +79,23 @@ def causal(length: int, dtype: torch.dtype) -> torch.Tensor:
     return torch.full((length, length), torch.finfo(dtype).min, dtype=dtype).triu(1)[None, None]
 
 
-def test_products_equal_the_librarys_eager_attention() -> None:
+@pytest.mark.parametrize("queries", [33, 20, 1])
+@pytest.mark.parametrize("block", [8, 11, 64])
+def test_products_equal_the_librarys_eager_attention(queries, block, monkeypatch) -> None:
+    """The last queries attend to all keys before them, of which some are padding."""
+    monkeypatch.setattr(attention, "MATMUL_BLOCK", block)
     query, key, value = heads(2, 4, 33, 16)
+    query = query[:, :, -queries:].detach().requires_grad_()
     key, value = key[:, :2].detach().requires_grad_(), value[:, :2].detach().requires_grad_()
     layer = Layer()
     layer.num_key_value_groups = 2
     layer.eval()
-    inputs, mask = (query, key, value), causal(33, torch.float32)
+    mask = causal(33, torch.float32).repeat(2, 1, 1, 1)
+    mask[1, :, :, : 33 - 28] = torch.finfo(mask.dtype).min
+    inputs, mask = (query, key, value), mask[:, :, -queries:]
+    # The results of padding, whose keys are all masked, are never read.
     ours, theirs = (
-        attend(layer, *inputs, mask, scaling=0.25)[0]
+        attend(layer, *inputs, mask, scaling=0.25)[0][:, -28:]
         for attend in (attend_by_matmul, eager_attention_forward)
     )
     check_equal(ours, theirs, inputs)
@@ -123,7 +132,6 @@ def loss_of(model: PreTrainedModel, batch: dict) -> torch.Tensor:
 def test_every_pass_over_the_frames_is_one_call(samples, processor, model, monkeypatch) -> None:
     choose_attention(model, "bf16", LENGTH)
     shapes = []
-    from models import attention
 
     def counted(module, query, *args, **settings):
         shapes.append(query.shape)
@@ -142,7 +150,8 @@ def test_attention_depends_on_precision_and_length(model) -> None:
     for precision, length, expected in (
         ("bf16", MATMUL_MAX_TOKENS, MATMUL),
         ("bf16", MATMUL_MAX_TOKENS + 1, "sdpa"),
-        ("fp32", MATMUL_MAX_TOKENS, "sdpa"),
+        ("fp32", MATMUL_MAX_TOKENS, MATMUL),
+        ("fp32", MATMUL_MAX_TOKENS + 1, "sdpa"),
     ):
         choose_attention(model, precision, length)
         assert (text._attn_implementation, vision._attn_implementation) == (expected, BY_FRAME)
