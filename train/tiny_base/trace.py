@@ -56,8 +56,8 @@ class Trace:
             cosine,
             sine,
         )
-        queries, keys = queries[:, 0, start:], keys[:, 0]
-        scores = (queries @ keys.mT).float() / math.sqrt(keys.shape[-1])
+        queries, keys = queries[:, 0, start:] / math.sqrt(keys.shape[-1]), keys[:, 0]
+        scores = (queries @ keys.mT).float()
         position = torch.arange(keys.shape[1], device=keys.device)
         hidden = (position > position[start:, None]) | (self.mask[:, None] == 0)
         # Rows of padding are not masked: a row of -inf would give NaN. They are never read.

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import one_hot
 
+from data.records import LETTERS
 from train.tiny_base.heads import (
     PICTURES,
     SCALES,
@@ -108,7 +109,7 @@ def test_measures_of_what_is_right_and_of_staying_put(samples, collate, deep_mod
         assert len(measures[name])
         assert measures[name].float().mean() == 1
     errors = [name for name in measures if name.endswith("_error")]
-    assert len(errors) == 2 + len(AHEAD)
+    assert len(errors) == 3 + len(AHEAD)
     for name in errors:
         assert measures[name].max() < 1e-5
 
@@ -116,9 +117,12 @@ def test_measures_of_what_is_right_and_of_staying_put(samples, collate, deep_mod
     assert still["color"].float().mean() < 1
     observed = ~truth["velocity"][:, 0].isnan()
     assert still["moving"].tolist() == (~moves[observed]).tolist()
-    for name in errors[1:]:
+    for name in errors[1:-1]:
         unmoved = still[name.replace("_error", "_still")]
         torch.testing.assert_close(still[name], unmoved)
+    apart = truth["apart"][~truth["apart"].isnan()]
+    torch.testing.assert_close(still["apart_error"], apart)
+    torch.testing.assert_close(still["apart_constant"], (apart - apart.median()).abs())
 
 
 def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, heads) -> None:
@@ -147,7 +151,8 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
         "before", "second before", "track", *(f"find {k}" for k in range(PICTURES)), "subject",
-        "find shown", "label", "letter", "repeat", "verdict", "comparison", "owner",
+        "find shown", "label", "letter", "repeat", "verdict", "comparison", "owner", "introduced",
+        *(f"recognise {k}" for k in range(len(LETTERS) - 1)),
     }  # fmt: skip
     assert not any(loss.item() for loss in losses.values())
 
