@@ -16,9 +16,10 @@ None of them is the selection task: no answer about pictures says which candidat
 `compare` asks about candidates sampled at random, whichever is the target. Its statements are
 chosen as those that decide an item, so that the model learns to find the objects that tell
 candidates apart. The statements of `explain` are sampled, and true of at least two candidates. Of
-the sampled statements of a kind, the one that fewest candidates agree with is used. `match` teaches to compare what a text says of a candidate with what it has predicted.
-`narrate` teaches the language of rationales, in both vocabularies, and how an answer follows from
-what a text says of the candidates.
+the sampled statements of a kind, the one that fewest candidates agree with is used. `match` teaches
+to compare what a text says of a candidate with what it has predicted. `narrate` teaches the
+language of rationales, in both vocabularies, and how an answer follows from what a text says of the
+candidates.
 """
 
 from __future__ import annotations

@@ -142,12 +142,12 @@ def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, hea
     assert totals[-1] < 0.8 * totals[0]
 
 
-def test_pointing_is_lossless_if_all_attention_is_on_the_object(samples, collate) -> None:
+def test_pointing_is_lossless_if_all_attention_is_on_the_object(sampler, collate) -> None:
     class Certain:
         def log_attention(self, layer, head, row, query, key):
             return torch.zeros(len(row))
 
-    _, targets = collate(samples)
+    _, targets = collate([sampler.sample(i, "compare", "test") for i in sampler.items[:8]])
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
         "before", "second before", "track", *(f"find {k}" for k in range(PICTURES)), "subject",
