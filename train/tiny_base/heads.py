@@ -49,7 +49,7 @@ PICTURES = 1 + len(LETTERS)
 """Pictures in which a named object is found: the last one of the clip, and the candidates."""
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
 DISPLACEMENTS = ("velocity", *AHEADS, "since")
-SCALES = {"place": 3.0, "offset": 3.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
+SCALES = {"place": 6.0, "offset": 3.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
     (*DISPLACEMENTS, "apart"), 5.0
 )
 """Factors on places and displacements, so that their losses are of similar size."""
