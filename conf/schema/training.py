@@ -138,11 +138,11 @@ def stage(steps: int, batch: int, lr: float) -> StageConfig:
 
 @dataclass
 class BaseTrainConfig(Settings):
-    eyes: StageConfig = stage(4000, 8, 2e-3)
+    eyes: StageConfig = stage(3000, 8, 2e-3)
     """The vision tower learns to see objects in single pictures."""
-    motion: StageConfig = stage(2000, 8, 1e-3)
+    motion: StageConfig = stage(2500, 8, 1e-3)
     """The whole model learns where objects are and where they go."""
-    words: StageConfig = stage(5000, 8, 1e-3)
+    words: StageConfig = stage(7000, 8, 1e-3)
     """The model learns to answer questions in words."""
     weight_decay: float = setting(0.05, least=0)
     """Weight decay of AdamW."""
@@ -152,7 +152,7 @@ class BaseTrainConfig(Settings):
     """Maximum norm of the gradient of the model's weights, to which it is clipped."""
     precision: str = setting("auto", ("auto", "bf16", "fp32"))
     """Precision of the forward and backward pass, as in `train.sft`."""
-    evaluations: int = setting(20, least=1)
+    evaluations: int = setting(10, least=1)
     """Number of evaluations and checkpoints of each stage."""
     validation_items: int = setting(160, least=1)
     """Number of items, from held-out scenes, of an evaluation."""

@@ -16,7 +16,7 @@ None of them is the selection task: no answer about pictures says which candidat
 `compare` asks about candidates sampled at random, whichever is the target. Its statements are
 chosen as those that decide an item, so that the model learns to find the objects that tell
 candidates apart. The statements of `explain` are sampled, and true of at least two candidates. Of
-the sampled statements of a kind, the one that fewest candidates agree with is used. `match` teaches
+the sampled statements, the one that fewest candidates agree with is used. `match` teaches
 to compare what a text says of a candidate with what it has predicted. `narrate` teaches the
 language of rationales, in both vocabularies, and how an answer follows from what a text says of the
 candidates.
@@ -290,13 +290,12 @@ def sample_shared_statements(p: RelationalPredicates, rng: np.random.Generator) 
 
 
 def choose_rarest(p: RelationalPredicates, statements: Sequence[Relation]) -> Relation:
-    """Return the statement of the first one's kind that fewest candidates agree with; of several,
-    the one that a reader with errors of places most likely finds true and false of the right
-    candidates."""
+    """Return the statement that fewest candidates agree with; of several, the one that a reader
+    with errors of places most likely finds true and false of the right candidates."""
 
     def rank(statement: Relation) -> tuple[int, float]:
         normalized = normalize_relation(statement)
         seen = [probability_of_sight(normalized, view, p.bounds) for view in p.views]
         return len(agreeing(p, [statement])), -math.prod(seen)
 
-    return min((s for s in statements if s.kind == statements[0].kind), key=rank)
+    return min(statements, key=rank)
