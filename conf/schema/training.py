@@ -153,7 +153,9 @@ class BaseTrainConfig(Settings):
     precision: str = setting("auto", ("auto", "bf16", "fp32"))
     """Precision of the forward and backward pass, as in `train.sft`."""
     evaluations: int = setting(10, least=1)
-    """Number of evaluations and checkpoints of each stage."""
+    """Number of evaluations of each stage. A checkpoint follows each evaluation."""
+    checkpoint_steps: int = setting(200, least=1)
+    """Number of steps between two checkpoints."""
     validation_items: int = setting(160, least=1)
     """Number of items, from held-out scenes, of an evaluation."""
     log_steps: int = setting(20, least=1)

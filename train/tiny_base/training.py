@@ -179,8 +179,11 @@ class BaseTrainer:
                     record |= {f"eval_{k}": v for k, v in self.probe.measure(name).items()}
                     self._log(record | {f"loss {k}": v for k, v in losses.items()})
                     self._save()
-                elif self.step % self.cfg.log_steps == 0:
+                    continue
+                if self.step % self.cfg.log_steps == 0:
                     self._log(record)
+                if self.step % self.cfg.checkpoint_steps == 0:
+                    self._save()
 
     def _train_step(self, name: str, stage: StageConfig) -> dict[str, float]:
         """Take one optimizer step, and return the losses."""

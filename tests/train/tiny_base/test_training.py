@@ -35,7 +35,7 @@ STAGE = StageConfig(steps=4, batch=2, lr=1e-3)
 def cfg(micro, micro_store: Store, student_cfg) -> BaseCommand:
     train = BaseTrainConfig(
         eyes=STAGE, motion=STAGE, words=replace(STAGE, steps=8), precision="fp32",
-        evaluations=2, validation_items=4, log_steps=1,
+        evaluations=2, checkpoint_steps=3, validation_items=4, log_steps=1,
     )  # fmt: skip
     student = replace(student_cfg, architecture=SIZES, frames=4)
     return BaseCommand(
