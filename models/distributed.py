@@ -70,6 +70,16 @@ def average_gradients(parameters: Iterable[Parameter]) -> None:
         parameter.grad = mean.view_as(parameter)
 
 
+def end_ranks() -> None:
+    """Wait for all ranks, and end their communication. A rank that exits without this can abort the
+    others."""
+    if world_size() > 1:
+        from torch import distributed
+
+        distributed.barrier()
+        distributed.destroy_process_group()
+
+
 def split_batch(batch: int, micro_batch: int = 1, key: str = "train.batch") -> int:
     """Return the number of micro-batches per rank of a step of `batch` samples over all ranks.
 

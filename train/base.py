@@ -28,7 +28,7 @@ def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
     from data.render.frame_cache import FrameReader
     from models import compat, loading
-    from models.distributed import main_first, split_batch
+    from models.distributed import end_ranks, main_first, split_batch
     from models.precision import resolve_precision
     from train.common.held_out import shuffled
     from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
@@ -53,6 +53,7 @@ def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
     measured = shuffled(held_out, cfg.seed)[: cfg.train.validation_items]
     trainer = build_trainer(cfg, run, model, processor, sampler, measured)
     trainer.run()
+    end_ranks()
     if rank() > 0:
         return {}
     log.info("measuring the base on %d items of held-out scenes", len(measured))
