@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,7 @@ from data.records import LETTERS, sample_prefix_frames
 from data.store import Store
 from teacher.predicates.motion import find_cut, motion_start
 from train.tiny_base.data import ItemSampler
-from train.tiny_base.heads import (
-    locate_objects,
-)
+from train.tiny_base.heads import OracleTargets, locate_objects
 from train.tiny_base.mentions import TokenizedText
 from train.tiny_base.oracle_targets import (
     AHEAD,
@@ -158,27 +157,30 @@ def test_objects_are_recognised_in_the_earlier_candidates(sampler, collate) -> N
         assert other in [t.token(GRID) if t else -1 for t in there]
 
 
+def next_names(targets: OracleTargets, pairs: torch.Tensor) -> Iterator[tuple[int, list[int]]]:
+    """Yield the token of each of `pairs`, and the tokens of the object that is named next."""
+    positions = {(row, at): m for m, (row, at) in enumerate(targets.names.tolist())}
+    for row, before, token in pairs.tolist():
+        name = min(at for r, at in positions if r == row and at > before)
+        yield token, targets.found[positions[row, name]].tolist()
+
+
 def test_new_names_refer_to_the_object_in_the_last_candidate_that_shows_it(
     sampler, collate
 ) -> None:
     samples = [sampler.sample(item, "explain", "test") for item in sampler.items[:6]]
     _, targets = collate(samples)
     assert len(targets.introduced) > 10
-    positions = {(row, at): m for m, (row, at) in enumerate(targets.names.tolist())}
-    for row, before, token in targets.introduced.tolist():
-        name = min(at for r, at in positions if r == row and at > before)
-        found = targets.found[positions[row, name], 1:].tolist()
-        assert token == [t for t in found if t >= 0][-1]
+    for token, found in next_names(targets, targets.introduced):
+        assert token == [t for t in found[1:] if t >= 0][-1]
 
 
 def test_scene_parses_refer_to_the_object_that_they_name_next(sampler, collate) -> None:
     samples = [sampler.sample(item, "parse", "test") for item in sampler.items[:6]]
     _, targets = collate(samples)
     assert len(targets.following) > 10
-    positions = {(row, at): m for m, (row, at) in enumerate(targets.names.tolist())}
-    for row, before, token in targets.following.tolist():
-        name = min(at for r, at in positions if r == row and at > before)
-        assert targets.found[positions[row, name], 0] == token
+    for token, found in next_names(targets, targets.following):
+        assert token == found[0]
 
 
 def test_pictures_refer_to_the_letters_of_their_candidates(sampler, collate, processor) -> None:
