@@ -100,6 +100,8 @@ class OracleTargets:
         repeats: (_, 3) row, position before a name that the text has mentioned before, and position
             of the first token of its last mention.
         text_tokens: (_, 2) row and position of the tokens of texts.
+        state_words: (_, 2) row and position of the tokens of words for places, motion and relations
+            in texts.
         verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
             of the word that says that the candidate agrees.
         comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
@@ -134,6 +136,7 @@ class OracleTargets:
     prompt_letters: Tensor
     repeats: Tensor
     text_tokens: Tensor
+    state_words: Tensor
     verdicts: Tensor
     comparisons: Tensor
     following: Tensor
@@ -288,6 +291,14 @@ class OracleHeads(nn.Module):
             name: distance(head(spoken), truth[name], SCALES[name])
             for name, head in self.spoken.items()
         }
+
+    def spoken_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+        """Return `spoken_place_error`, the error of the place that the heads read at the tokens
+        that describe a named object, as a share of the image."""
+        row, at = targets.spoken.T
+        read = self.spoken["place"](self.norms["spoken"](hidden[row, at])).float()
+        errors = (read / SCALES["place"] - targets.spoken_state[:, :2]).norm(dim=1)
+        return {"spoken_place_error": errors[~errors.isnan()]}
 
     def named_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return what the heads read at names: `named_visible`, whether they tell if a picture

@@ -14,10 +14,19 @@ import numpy as np
 import torch
 
 from data.records import COLORS, MATERIALS, SHAPES, Scene
+from teacher.predicates.facts import COMPASS
 from teacher.predicates.motion import motion_start
 
 WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
 """The words of a noun phrase, in their order."""
+STATE_WORDS = {
+    "heading": COMPASS,
+    "region": ("top", "left", "right", "center", "bottom"),
+    "speed": ("slowly", "steadily", "quickly", "rests", "stationary"),
+    "gap": ("against", "apart"),
+    "height": ("above", "below", "level"),
+}
+"""Words for places, motion and relations."""
 CLEARLY_VISIBLE = 0.3
 """An object has a target if its visible fraction is above this."""
 AHEAD = (10, 25, 50)

@@ -14,6 +14,7 @@ from train.tiny_base.samples import OracleCollator, OracleSample
 from train.tiny_base.trace import (
     MIDDLE,
     NAMING,
+    SPEAKING,
     encode_pictures,
     select_tokens,
     trace_forward,
@@ -87,6 +88,7 @@ class Probe:
                     of_kind = torch.isin(labels, ids)
                     found[f"words_{words}/{kind}"].append((predicted == labels)[of_kind].float())
                 measures = self.heads.named_measures(trace.outputs[NAMING], targets)
+                measures |= self.heads.spoken_measures(trace.outputs[SPEAKING], targets)
                 for name, values in measures.items():
                     found[f"{name}/{kind}"].append(values)
         return average(found)

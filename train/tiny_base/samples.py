@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from transformers import ProcessorMixin
+from transformers import PreTrainedTokenizerBase, ProcessorMixin
 
 from data.records import (
     LETTERS,
@@ -28,6 +28,7 @@ from teacher.predicates.motion import find_cut
 from train.tiny_base.heads import PICTURES, OracleTargets
 from train.tiny_base.mentions import Mention, TokenizedText
 from train.tiny_base.oracle_targets import (
+    STATE_WORDS,
     UNKNOWN,
     ObjectTarget,
     clip_targets,
@@ -96,6 +97,7 @@ class OracleCollator:
     def __init__(self, processor: ProcessorMixin, max_length: int) -> None:
         self._processor = processor
         self._collate = Collator(processor, max_length)
+        self._state_ids = state_tokens(processor.tokenizer)
 
     def __call__(self, samples: Sequence[OracleSample]) -> tuple[dict[str, Any], OracleTargets]:
         batch = self._collate([s.sample for s in samples])
@@ -107,13 +109,17 @@ class OracleCollator:
         mentions: list[LocatedMention] = []
         pairs: dict[str, list[tuple[int, ...]]] = {
             "prompt_letters": [*self._find_letters(ids, visual, samples, grid)],
-            "text_tokens": [], "verdicts": [], "comparisons": [],
+            "text_tokens": [], "state_words": [], "verdicts": [], "comparisons": [],
         }  # fmt: skip
         for row, (sample, text) in enumerate(zip(samples, texts, strict=True)):
             # The token that ends the turn follows the response.
             start = ids.shape[1] - len(text) - 1
             mentions += locate_mentions(sample, text, row, start, grid)
-            pairs["text_tokens"] += [(row, start + k) for k in range(len(text))]
+            tokens = range(start, start + len(text))
+            pairs["text_tokens"] += [(row, k) for k in tokens]
+            pairs["state_words"] += [
+                (row, k) for k in tokens if int(ids[row, k]) in self._state_ids
+            ]
             pairs["verdicts"] += [
                 (row, start + letter - 1, start + agrees) for letter, agrees in text.verdicts()
             ]
@@ -135,6 +141,13 @@ class OracleCollator:
             for letter, picture in zip(letters, tokens[sample.last + 1 :], strict=False):
                 before = (ids[row, : picture[0]] == letter).nonzero()
                 yield from ((row, int(token), int(before[-1])) for token in picture)
+
+
+def state_tokens(tokenizer: PreTrainedTokenizerBase) -> set[int]:
+    """Return the tokens of the words for places, motion and relations."""
+    words = [word for words in STATE_WORDS.values() for word in words]
+    words += [f"{row}-{column}" for row in ("top", "bottom") for column in ("left", "right")]
+    return {i for word in words for i in tokenizer.encode(f" {word}", add_special_tokens=False)}
 
 
 @dataclass(frozen=True)
@@ -275,6 +288,7 @@ def stack_samples(
         prompt_letters=integers(pairs["prompt_letters"], 3),
         repeats=integers([*find_repeats(mentions)], 3),
         text_tokens=integers(pairs["text_tokens"], 2),
+        state_words=integers(pairs["state_words"], 2),
         verdicts=integers(pairs["verdicts"], 3),
         comparisons=integers(pairs["comparisons"], 3),
         following=integers([*find_following(mentions)], 3),

@@ -32,15 +32,14 @@ from conf.entry import Run
 from conf.errors import UserError
 from conf.runs import rank
 from conf.schema import BaseCommand, BaseTrainConfig, StageConfig
-from data.records import COLORS, MATERIALS, SHAPES, SelectionItem
+from data.records import SelectionItem
 from models.distributed import average_gradients
 from models.student.collator import IGNORED
-from teacher.predicates.facts import COMPASS
 from train.common.curves import plot_curves
 from train.common.journal import CURVES, JOURNAL, read_journal
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import OracleHeads, OracleTargets, pointing_losses
-from train.tiny_base.oracle_targets import WORDS
+from train.tiny_base.oracle_targets import STATE_WORDS, WORDS
 from train.tiny_base.probe import Probe
 from train.tiny_base.questions import KINDS
 from train.tiny_base.samples import OracleCollator
@@ -59,9 +58,10 @@ log = logging.getLogger(__name__)
 
 STAGES = ("eyes", "motion", "words")
 STATE = "state.pt"
-DENSE, POINTING, NAMED = 0.5, 1.0, 3.0
-"""Weights of losses in the stage of words, relative to the loss of the words: those of what visual
-tokens and names show, those of attention, and those of places and motion in texts."""
+DENSE, POINTING, NAMED, DESCRIBED = 0.5, 1.0, 3.0, 1.0
+"""Weights of losses in the stage of words, relative to the loss of all words: those of what visual
+tokens and names show, those of attention, those of places and motion in texts, and that of the
+words for places, motion and relations, which are a tenth of all words."""
 
 
 def eyes_losses(
@@ -100,6 +100,12 @@ def words_losses(
         losses |= {f"spelled {kind}": DENSE * loss for kind, loss in spelled.items()}
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()
     losses["words"] = cross_entropy(predicted, following, ignore_index=IGNORED)
+    row, at = targets.state_words.T
+    if len(row):
+        # The logits and labels are those of the last tokens.
+        at = at - (batch["input_ids"].shape[1] - labels.shape[1])
+        state = cross_entropy(logits[row, at - 1].float(), labels[row, at])
+        losses["state words"] = DESCRIBED * state
     return losses
 
 
@@ -289,18 +295,8 @@ def build_trainer(
 
 def first_tokens(processor: ProcessorMixin) -> dict[str, list[int]]:
     """Return the first tokens of the words for objects, places, motion and relations, by kind."""
-    kinds = {
-        "color": COLORS,
-        "material": MATERIALS,
-        "shape": SHAPES,
-        "heading": COMPASS,
-        "region": ("top", "left", "right", "center", "bottom"),
-        "speed": ("slowly", "steadily", "quickly", "rests", "stationary"),
-        "gap": ("against", "apart"),
-        "height": ("above", "below", "level"),
-    }
     encode = processor.tokenizer.encode
     return {
         kind: [encode(f" {word}", add_special_tokens=False)[0] for word in words]
-        for kind, words in kinds.items()
+        for kind, words in (WORDS | STATE_WORDS).items()
     }
