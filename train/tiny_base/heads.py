@@ -20,33 +20,21 @@ picture. The heads are linear, so the base itself has to represent what they pre
                that another object has it beside it, its displacement from this object
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
-at the tower's output and motion in the middle layers. Further losses train attention heads to
-attend to given tokens (`pointing_losses`).
+at the tower's output and motion in the middle layers. Attention heads are trained too (see
+`train.tiny_base.pointing`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
-from data.records import LETTERS
-from train.tiny_base.oracle_targets import AHEAD, UNSEEN_DISTANCE
-from train.tiny_base.trace import (
-    NAMING,
-    PRECEDING,
-    RECALLING,
-    SPEAKING,
-    TRACKING,
-    Trace,
-)
+from train.tiny_base.oracle_targets import AHEAD, PICTURES, UNSEEN_DISTANCE, OracleTargets
 
-PICTURES = 1 + len(LETTERS)
-"""Pictures in which a named object is found: the last one of the clip, and the candidates."""
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
 DISPLACEMENTS = ("velocity", *AHEADS, "since")
 SCALES = {"place": 6.0, "offset": 3.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
@@ -58,89 +46,6 @@ BEND = 0.1
 MOVING = 0.012
 """An object moves if its velocity, as a share of the image in 10 frames, is above this. Measures of
 displacements leave out objects that are displaced by less."""
-
-
-@dataclass(frozen=True)
-class OracleTargets:
-    """Targets of a batch of B samples with T visual tokens each, N objects at visual tokens, K
-    pairs of tokens to track, and M names in texts. Tokens are indices into `visual`.
-
-    Attributes:
-        visual: (B, T) positions of the visual tokens in the sequence.
-        start: (B,) positions of the first tokens, before which a sequence is padded.
-        has_picture: (B, PICTURES) whether the prompt has the picture.
-        presence: (B, T) 1 where the centre of an object is in the token, otherwise 0.
-        objects: (N, 2) row of the batch and token.
-        truth: Properties of the N objects, see `oracle_targets.stack_targets`; places are relative
-            to the centre of the picture.
-        inside: (N, 2) place in the token, from -0.5 to 0.5, or beyond at the border of the picture.
-        tracked: (K, 3) row, token of a candidate, and token of the same object in the clip.
-        recognised: (_, 4) row, token of an object in a candidate, index of an earlier candidate,
-            and token of the same object there, or -1 where it is not visible.
-        names: (M, 2) row and position of a name's last token.
-        name_words: (M,) the named object's colour, material and shape, by kind.
-        found: (M, PICTURES) token of the named object in each picture, or -1 where it is not
-            visible.
-        shown: (_, 3) row, position of a name, and token of the object in the picture that the text
-            speaks of, or -1 where it is not visible.
-        places: (M, 2 * PICTURES) its places relative to the centre of each picture, NaN where it is
-            not visible.
-        future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
-        spoken: (S, 2) row and position of the tokens that describe a named object, from the end of
-            its name on.
-        spoken_state: (S, 6) place and velocity of the object there, and its displacement from its
-            owner, or NaN.
-        subjects: (_, 3) row, position after a name, and position of the name.
-        owners: (_, 3) row, position of a token that describes the sphere in "the cube has the
-            sphere left of it", and position of the cube's name.
-        text_letters: (_, 3) row, position of a name where the text speaks of a candidate, and
-            position of the candidate's letter in the text.
-        prompt_letters: (_, 3) row, position of a visual token of a candidate, and position of its
-            letter in the prompt.
-        repeats: (_, 3) row, position before a name that the text has mentioned before, and position
-            of the first token of its last mention.
-        text_tokens: (_, 2) row and position of the tokens of texts.
-        state_words: (_, 2) row and position of the tokens of words for places, motion and relations
-            in texts.
-        verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
-            of the word that says that the candidate agrees.
-        comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
-            and position of the end of the predicted place of the same object if both are the same,
-            otherwise of the word "shows".
-        following: (_, 3) row, position before the first mention of an object in a scene parse, and
-            token of the object at the end of the clip.
-        introduced: (_, 3) row, position before the first mention of an object in a text and in its
-            predictions, and token of the object in the last candidate that shows it.
-    """
-
-    visual: Tensor
-    start: Tensor
-    has_picture: Tensor
-    presence: Tensor
-    objects: Tensor
-    truth: dict[str, Tensor]
-    inside: Tensor
-    tracked: Tensor
-    recognised: Tensor
-    names: Tensor
-    name_words: dict[str, Tensor]
-    found: Tensor
-    shown: Tensor
-    places: Tensor
-    future: Tensor
-    spoken: Tensor
-    spoken_state: Tensor
-    subjects: Tensor
-    owners: Tensor
-    text_letters: Tensor
-    prompt_letters: Tensor
-    repeats: Tensor
-    text_tokens: Tensor
-    state_words: Tensor
-    verdicts: Tensor
-    comparisons: Tensor
-    following: Tensor
-    introduced: Tensor
 
 
 class OracleHeads(nn.Module):
@@ -321,86 +226,6 @@ class OracleHeads(nn.Module):
             "named_future_error": future[displaced],
             "named_future_still": still[displaced],
         }
-
-
-def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
-    """Return the losses of attention heads: the negative logarithm of the attention weight from a
-    token to the token that it should attend to.
-
-    loss           layer, head    from -> to
-    before         PRECEDING 0    token of a text -> the token before it
-    second before  PRECEDING 1    token of a text -> the second token before it
-    label          PRECEDING 2    visual token of a candidate -> its letter in the prompt
-    track          TRACKING 0     object in a candidate -> the same object at the end of the clip
-    recognise k    TRACKING 2+k   object in a candidate -> the same object in candidate k, an
-                                  earlier one, or, if it does not show the object, the first token
-    letter         TRACKING 1     name in a text about a candidate -> the candidate's letter there
-    find k         NAMING k       name -> the object in picture k, or, if the picture does not show
-                                  it, the first token of the sequence
-    find shown     NAMING 5       name -> likewise, in the picture that the text describes
-    subject        RECALLING 0    token that describes an object -> the object's name
-    repeat         RECALLING 1    token before a repeated name -> the name's last mention
-    comparison     RECALLING 2    end of a place in a candidate -> the end of the predicted place if
-                                  both are the same, otherwise the word "shows"
-    owner          RECALLING 3    token that describes the sphere in "the cube has the sphere left
-                                  of it" -> the cube's name
-    verdict        SPEAKING 0     token before a letter in an outcome -> "agrees" of this candidate
-    following      SPEAKING 1     token before a new name in a scene parse -> the object at the end
-                                  of the clip
-    introduced     SPEAKING 2     token before a name that is new in a text, or in its predictions
-                                  -> the object in the last candidate that shows it
-
-    The two preceding tokens allow later layers to find what followed an earlier use of the same
-    words. The letters allow a text about a candidate to find the candidate's visual tokens.
-    """
-    losses = {}
-    row, start, end = targets.tracked.T
-    if len(row):
-        query, key = targets.visual[row, start], targets.visual[row, end]
-        losses["track"] = -trace.log_attention(TRACKING, 0, row, query, key).mean()
-    for k in range(len(LETTERS) - 1):
-        row, start, _, end = targets.recognised[targets.recognised[:, 2] == k].T
-        if len(row):
-            query, key = targets.visual[row, start], locate_objects(row, end, targets)
-            weights = trace.log_attention(TRACKING, 2 + k, row, query, key)
-            losses[f"recognise {k}"] = -weights.mean()
-    for head in range(PICTURES):
-        named = targets.has_picture[targets.names[:, 0], head]
-        row, query = targets.names[named].T
-        if len(row):
-            key = locate_objects(row, targets.found[named, head], targets)
-            losses[f"find {head}"] = -trace.log_attention(NAMING, head, row, query, key).mean()
-    row, position = targets.text_tokens.T
-    before, second_before = (torch.stack([row, position, position - k], dim=1) for k in (1, 2))
-    row, query, token = targets.following.T
-    following = torch.stack([row, query, targets.visual[row, token]], dim=1)
-    row, query, token = targets.introduced.T
-    introduced = torch.stack([row, query, targets.visual[row, token]], dim=1)
-    row, query, token = targets.shown.T
-    shown = torch.stack([row, query, locate_objects(row, token, targets)], dim=1)
-    for name, layer, head, pairs in (
-        ("before", PRECEDING, 0, before),
-        ("second before", PRECEDING, 1, second_before),
-        ("label", PRECEDING, 2, targets.prompt_letters),
-        ("letter", TRACKING, 1, targets.text_letters),
-        ("find shown", NAMING, PICTURES, shown),
-        ("subject", RECALLING, 0, targets.subjects),
-        ("repeat", RECALLING, 1, targets.repeats),
-        ("comparison", RECALLING, 2, targets.comparisons),
-        ("owner", RECALLING, 3, targets.owners),
-        ("verdict", SPEAKING, 0, targets.verdicts),
-        ("following", SPEAKING, 1, following),
-        ("introduced", SPEAKING, 2, introduced),
-    ):
-        row, query, key = pairs.T
-        if len(row):
-            losses[name] = -trace.log_attention(layer, head, row, query, key).mean()
-    return losses
-
-
-def locate_objects(row: Tensor, token: Tensor, targets: OracleTargets) -> Tensor:
-    """Return the positions of visual tokens in the sequence, and that of its first token for -1."""
-    return targets.visual[row, token].where(token >= 0, targets.start[row])
 
 
 def distance(predicted: Tensor, true: Tensor, scale: float) -> Tensor:

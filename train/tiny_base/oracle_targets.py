@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from data.records import COLORS, MATERIALS, SHAPES, Scene
+from data.records import COLORS, LETTERS, MATERIALS, SHAPES, Scene
 from teacher.predicates.facts import COMPASS
 from teacher.predicates.motion import motion_start
 
@@ -35,6 +36,8 @@ RATE = 10
 """A velocity is the displacement during this many frames."""
 FARTHEST = 1.0
 """Displacements above this share of the image are left out: the object is far outside of it."""
+PICTURES = 1 + len(LETTERS)
+"""Pictures in which a named object is found: the last one of the clip, and the candidates."""
 UNKNOWN = (float("nan"), float("nan"))
 UNSEEN_DISTANCE = 0.3
 """Distance, as a share of the image, that counts for a candidate that does not show an object."""
@@ -78,6 +81,89 @@ class ObjectTarget:
     def token(self, grid: int) -> int:
         """Return the index of the object's token among the visual tokens of all pictures."""
         return self.picture * grid**2 + self.cell(grid)
+
+
+@dataclass(frozen=True)
+class OracleTargets:
+    """Targets of a batch of B samples with T visual tokens each, N objects at visual tokens, K
+    pairs of tokens to track, and M names in texts. Tokens are indices into `visual`.
+
+    Attributes:
+        visual: (B, T) positions of the visual tokens in the sequence.
+        start: (B,) positions of the first tokens, before which a sequence is padded.
+        has_picture: (B, PICTURES) whether the prompt has the picture.
+        presence: (B, T) 1 where the centre of an object is in the token, otherwise 0.
+        objects: (N, 2) row of the batch and token.
+        truth: Properties of the N objects, see `stack_targets`; places are relative
+            to the centre of the picture.
+        inside: (N, 2) place in the token, from -0.5 to 0.5, or beyond at the border of the picture.
+        tracked_to_clip: (K, 3) row, token of a candidate, and token of the same object in the clip.
+        tracked_to_candidates: (_, 4) row, token of an object in a candidate, index of an earlier
+            candidate, and token of the same object there, or -1 where it is not visible.
+        names: (M, 2) row and position of a name's last token.
+        name_words: (M,) the named object's colour, material and shape, by kind.
+        found: (M, PICTURES) token of the named object in each picture, or -1 where it is not
+            visible.
+        shown: (_, 3) row, position of a name, and token of the object in the picture that the text
+            speaks of, or -1 where it is not visible.
+        places: (M, 2 * PICTURES) its places relative to the centre of each picture, NaN where it is
+            not visible.
+        future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
+        spoken: (S, 2) row and position of the tokens that describe a named object, from the end of
+            its name on.
+        spoken_state: (S, 6) place and velocity of the object there, and its displacement from its
+            owner, or NaN.
+        subjects: (_, 3) row, position after a name, and position of the name.
+        owners: (_, 3) row, position of a token that describes the sphere in "the cube has the
+            sphere left of it", and position of the cube's name.
+        text_letters: (_, 3) row, position of a name where the text speaks of a candidate, and
+            position of the candidate's letter in the text.
+        prompt_letters: (_, 3) row, position of a visual token of a candidate, and position of its
+            letter in the prompt.
+        repeats: (_, 3) row, position before a name that the text has mentioned before, and position
+            of the first token of its last mention.
+        text_tokens: (_, 2) row and position of the tokens of texts.
+        state_words: (_, 2) row and position of the tokens of words for places, motion and relations
+            in texts.
+        verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
+            of the word that says that the candidate agrees.
+        comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
+            and position of the end of the predicted place of the same object if both are the same,
+            otherwise of the word "shows".
+        next_in_clip: (_, 3) row, position before the first mention of an object in a scene parse,
+            and token of the object at the end of the clip.
+        next_in_candidates: (_, 3) row, position before the first mention of an object in a text and
+            in its predictions, and token of the object in the last candidate that shows it.
+    """
+
+    visual: Tensor
+    start: Tensor
+    has_picture: Tensor
+    presence: Tensor
+    objects: Tensor
+    truth: dict[str, Tensor]
+    inside: Tensor
+    tracked_to_clip: Tensor
+    tracked_to_candidates: Tensor
+    names: Tensor
+    name_words: dict[str, Tensor]
+    found: Tensor
+    shown: Tensor
+    places: Tensor
+    future: Tensor
+    spoken: Tensor
+    spoken_state: Tensor
+    subjects: Tensor
+    owners: Tensor
+    text_letters: Tensor
+    prompt_letters: Tensor
+    repeats: Tensor
+    text_tokens: Tensor
+    state_words: Tensor
+    verdicts: Tensor
+    comparisons: Tensor
+    next_in_clip: Tensor
+    next_in_candidates: Tensor
 
 
 def clip_targets(scene: Scene, frames: Sequence[int]) -> Iterator[ObjectTarget]:
@@ -190,7 +276,7 @@ def most_visible_per_token(targets: Sequence[ObjectTarget], grid: int) -> list[O
     return list(best.values())
 
 
-def name_words(names: Sequence[str]) -> dict[str, torch.Tensor]:
+def name_words(names: Sequence[str]) -> dict[str, Tensor]:
     """Return the indices (N,) of the colours, materials and shapes in the noun phrases of N
     objects."""
     words = np.array([name.split() for name in names]).reshape(-1, 3)
@@ -200,7 +286,7 @@ def name_words(names: Sequence[str]) -> dict[str, torch.Tensor]:
     }
 
 
-def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, torch.Tensor]:
+def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, Tensor]:
     """Return the properties of N targets as tensors.
 
     Returns:
@@ -209,7 +295,7 @@ def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, torch.Tensor]:
     """
     stacked = name_words([t.name for t in targets])
 
-    def pairs(values: list[tuple[float, float]]) -> torch.Tensor:
+    def pairs(values: list[tuple[float, float]]) -> Tensor:
         return torch.tensor(values, dtype=torch.float32).reshape(-1, 2)
 
     for name in ("place", "shift", "velocity", "since"):

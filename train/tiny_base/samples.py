@@ -25,12 +25,13 @@ from data.render.frame_cache import FrameReader
 from models.student.collator import Collator
 from models.student.prompts import Sample, conversation, load_clip
 from teacher.predicates.motion import find_cut
-from train.tiny_base.heads import PICTURES, OracleTargets
 from train.tiny_base.mentions import Mention, TokenizedText
 from train.tiny_base.oracle_targets import (
+    PICTURES,
     STATE_WORDS,
     UNKNOWN,
     ObjectTarget,
+    OracleTargets,
     clip_targets,
     compare_images,
     future_displacements,
@@ -259,8 +260,8 @@ def stack_samples(
         objects=at,
         truth=truth,
         inside=scaled - scaled.floor().clamp(0, grid - 1) - 0.5,
-        tracked=integers([*track_objects(samples, objects, grid)], 3),
-        recognised=integers([*recognise_objects(samples, objects, grid)], 4),
+        tracked_to_clip=integers([*track_to_clip(samples, objects, grid)], 3),
+        tracked_to_candidates=integers([*track_to_candidates(samples, objects, grid)], 4),
         names=integers([(m.row, m.position) for m in mentions], 2),
         name_words=name_words([m.name for m in mentions]),
         found=integers([m.found for m in mentions], PICTURES),
@@ -291,8 +292,8 @@ def stack_samples(
         state_words=integers(pairs["state_words"], 2),
         verdicts=integers(pairs["verdicts"], 3),
         comparisons=integers(pairs["comparisons"], 3),
-        following=integers([*find_following(mentions)], 3),
-        introduced=integers([*find_introduced(mentions)], 3),
+        next_in_clip=integers([*find_next_in_clip(mentions)], 3),
+        next_in_candidates=integers([*find_next_in_candidates(mentions)], 3),
     )
 
 
@@ -306,7 +307,7 @@ def find_repeats(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int,
         mentioned[m.row, m.name] = m.first
 
 
-def find_following(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
+def find_next_in_clip(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
     """Yield the row, the position before the first mention of an object in a scene parse, and the
     object's visual token at the end of the clip."""
     mentioned = set()
@@ -316,7 +317,7 @@ def find_following(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, in
         mentioned.add((m.row, m.name))
 
 
-def find_introduced(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
+def find_next_in_candidates(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
     """Yield the row, the position before the first mention of an object in a text and in its
     predictions, and the object's visual token in the last candidate that shows it."""
     mentioned = set()
@@ -328,7 +329,7 @@ def find_introduced(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, i
         mentioned.add(key)
 
 
-def recognise_objects(
+def track_to_candidates(
     samples: Sequence[OracleSample], objects: Sequence[tuple[int, ObjectTarget]], grid: int
 ) -> Iterator[tuple[int, int, int, int]]:
     """Yield the row, the visual token of each object in a candidate, the index of each earlier
@@ -341,7 +342,7 @@ def recognise_objects(
             yield row, t.token(grid), k, earlier.token(grid) if earlier else -1
 
 
-def track_objects(
+def track_to_clip(
     samples: Sequence[OracleSample], objects: Sequence[tuple[int, ObjectTarget]], grid: int
 ) -> Iterator[tuple[int, int, int]]:
     """Yield the row, the visual token in a candidate and that at the end of the clip of each object

@@ -38,8 +38,9 @@ from models.student.collator import IGNORED
 from train.common.curves import plot_curves
 from train.common.journal import CURVES, JOURNAL, read_journal
 from train.tiny_base.data import ItemSampler
-from train.tiny_base.heads import OracleHeads, OracleTargets, pointing_losses
-from train.tiny_base.oracle_targets import STATE_WORDS, WORDS
+from train.tiny_base.heads import OracleHeads
+from train.tiny_base.oracle_targets import STATE_WORDS, WORDS, OracleTargets
+from train.tiny_base.pointing import pointing_losses
 from train.tiny_base.probe import Probe
 from train.tiny_base.questions import KINDS
 from train.tiny_base.samples import OracleCollator

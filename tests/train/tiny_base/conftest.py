@@ -11,7 +11,8 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from teacher.predicates.motion import find_cut
 from train.tiny_base.data import ItemSampler
-from train.tiny_base.heads import PICTURES, OracleHeads
+from train.tiny_base.heads import OracleHeads
+from train.tiny_base.oracle_targets import PICTURES
 from train.tiny_base.samples import OracleCollator, OracleSample
 from train.tiny_base.trace import SPEAKING
 from train.tiny_base.training import first_tokens

@@ -7,19 +7,9 @@ import torch
 from torch.nn.functional import one_hot
 
 from data.records import LETTERS
-from train.tiny_base.heads import (
-    PICTURES,
-    SCALES,
-    UNSEEN_DISTANCE,
-    OracleHeads,
-    distance,
-    measure_spread,
-    octant,
-    pointing_losses,
-)
-from train.tiny_base.oracle_targets import (
-    AHEAD,
-)
+from train.tiny_base.heads import SCALES, OracleHeads, distance, measure_spread, octant
+from train.tiny_base.oracle_targets import AHEAD, PICTURES, UNSEEN_DISTANCE
+from train.tiny_base.pointing import pointing_losses
 from train.tiny_base.trace import (
     NAMING,
     PRECEDING,
@@ -131,7 +121,7 @@ def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, hea
     totals = []
     for _ in range(8):
         losses = words_losses(deep_model, heads, batch, targets)
-        assert {"words", "track", "find 0", "named places", "color", "since"} <= losses.keys()
+        assert {"words", "track clip", "find 0", "named places", "color", "since"} <= losses.keys()
         assert {"subject", "letter", "repeat", "verdict"} <= losses.keys()
         assert {"spoken place", "spelled color"} <= losses.keys()
         total = sum(losses.values())
@@ -150,9 +140,10 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(sampler, collate
     _, targets = collate([sampler.sample(i, "compare", "test") for i in sampler.items[:8]])
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
-        "before", "second before", "track", *(f"find {k}" for k in range(PICTURES)), "subject",
-        "find shown", "label", "letter", "repeat", "verdict", "comparison", "owner", "introduced",
-        *(f"recognise {k}" for k in range(len(LETTERS) - 1)),
+        "before", "second before", "track clip", *(f"find {k}" for k in range(PICTURES)), "subject",
+        "find shown", "label", "letter", "repeat", "verdict", "comparison", "owner",
+        "next in candidates",
+        *(f"track {k}" for k in range(len(LETTERS) - 1)),
     }  # fmt: skip
     assert not any(loss.item() for loss in losses.values())
 

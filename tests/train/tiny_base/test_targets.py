@@ -13,7 +13,6 @@ from data.records import LETTERS, sample_prefix_frames
 from data.store import Store
 from teacher.predicates.motion import find_cut, motion_start
 from train.tiny_base.data import ItemSampler
-from train.tiny_base.heads import OracleTargets, locate_objects
 from train.tiny_base.mentions import TokenizedText
 from train.tiny_base.oracle_targets import (
     AHEAD,
@@ -21,6 +20,7 @@ from train.tiny_base.oracle_targets import (
     UNKNOWN,
     UNSEEN_DISTANCE,
     ObjectTarget,
+    OracleTargets,
     clip_targets,
     compare_images,
     future_displacements,
@@ -28,6 +28,7 @@ from train.tiny_base.oracle_targets import (
     most_visible_per_token,
     observed_states,
 )
+from train.tiny_base.pointing import locate_objects
 from train.tiny_base.questions import KINDS
 from train.tiny_base.samples import (
     shown_objects,
@@ -145,8 +146,8 @@ def test_candidates_are_compared_with_the_earlier_ones() -> None:
 def test_objects_are_recognised_in_the_earlier_candidates(sampler, collate) -> None:
     samples = [sampler.sample(item, "compare", "test") for item in sampler.items[:6]]
     _, targets = collate(samples)
-    assert len(targets.recognised) > 20
-    for row, token, earlier, other in targets.recognised.tolist():
+    assert len(targets.tracked_to_candidates) > 20
+    for row, token, earlier, other in targets.tracked_to_candidates.tolist():
         first = samples[row].last + 1
         picture = token // GRID**2 - first
         assert 0 <= earlier < picture < len(LETTERS)
@@ -170,16 +171,16 @@ def test_new_names_refer_to_the_object_in_the_last_candidate_that_shows_it(
 ) -> None:
     samples = [sampler.sample(item, "explain", "test") for item in sampler.items[:6]]
     _, targets = collate(samples)
-    assert len(targets.introduced) > 10
-    for token, found in next_names(targets, targets.introduced):
+    assert len(targets.next_in_candidates) > 10
+    for token, found in next_names(targets, targets.next_in_candidates):
         assert token == [t for t in found[1:] if t >= 0][-1]
 
 
 def test_scene_parses_refer_to_the_object_that_they_name_next(sampler, collate) -> None:
     samples = [sampler.sample(item, "parse", "test") for item in sampler.items[:6]]
     _, targets = collate(samples)
-    assert len(targets.following) > 10
-    for token, found in next_names(targets, targets.following):
+    assert len(targets.next_in_clip) > 10
+    for token, found in next_names(targets, targets.next_in_clip):
         assert token == found[0]
 
 
