@@ -30,30 +30,30 @@ import numpy as np
 from benchmarks.experiments.experiment import open_benchmark, print_header, print_row
 from conf.failures import report_failures
 from conf.files import read_json_lines
-from data.records import FAMILIES, LETTERS
+from data.records import FAMILIES
 from data.store import Store
 from teacher.deciding import choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.relations import Bounds
-from teacher.sufficiency import find_predicted, is_consistent
+from teacher.sufficiency import find_predicted, is_consistent, measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 
 
 class Predicted(NamedTuple):
-    """What a response answers and predicts: the letters of the candidates of which the predictions
-    are true, and whether a predicted object decides the item; None if nothing is predicted."""
+    """What a response answers and predicts.
+
+    Attributes:
+        fitting: Letters of the candidates of which the predictions are true.
+        reader: The probability that a reader of the predictions picks the target.
+        chosen: Whether a predicted object decides the item; None if nothing is predicted.
+    """
 
     family: str
     target: str
     answer: str | None
     fitting: tuple[str, ...]
+    reader: float
     chosen: bool | None
-
-    @property
-    def reader(self) -> float:
-        """The probability that a reader of the predictions picks the target."""
-        fitting = self.fitting or LETTERS
-        return (self.target in fitting) / len(fitting)
 
 
 def main() -> None:
@@ -92,12 +92,14 @@ def read_predictions(run: Path, store: Store) -> Iterator[Predicted]:
         p = extract_predicates(item, store.scene(item.scene_id), store.scene, Bounds())
         if p is None:
             continue
-        predicted = find_predicted(line["text"], extract_claims(line["text"], p))
+        claims = extract_claims(line["text"], p)
+        predicted = find_predicted(line["text"], claims)
         fitting = tuple(v.letter for v in p.views if predicted and is_consistent(predicted, v))
         deciding = {name for s in choose_statements(p).statements for name in s.objects}
         names = {name for claim in predicted for name in claim.subjects}
+        reader = measure_sufficiency(line["text"], claims, p)
         chosen = not names.isdisjoint(deciding) if names else None
-        yield Predicted(item.family, item.letter, line["letter"], fitting, chosen)
+        yield Predicted(item.family, item.letter, line["letter"], fitting, reader, chosen)
 
 
 if __name__ == "__main__":
