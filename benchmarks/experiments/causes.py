@@ -94,10 +94,10 @@ def true_rationale(item: SelectionItem, store: Store, teacher: TeacherConfig) ->
 
 def end_after(rationale: str, section: str | None) -> str:
     """Return a rationale up to the end of a section; nothing if `section` is None."""
-    for heading, _, stop in split_sections(rationale):
-        if heading == section:
-            return rationale[:stop].rstrip() + "\n"
-    return ""
+    if section is None:
+        return ""
+    ends = {heading: stop for heading, _, stop in split_sections(rationale)}
+    return rationale[: ends[section]].rstrip() + "\n"
 
 
 class Student:

@@ -8,6 +8,7 @@ started again.
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -20,6 +21,8 @@ import pandas as pd
 from conf.compose import compose
 from conf.schema import BenchmarkConfig, SelectCommand
 from data.store import Store, open_store
+from evaluation.metrics.results import SelectionReport, from_json, variant_name
+from evaluation.reporting.run_responses import Responses, read_responses, reading
 
 Job = tuple[str, int]
 """A variant and a seed."""
@@ -146,6 +149,17 @@ def compose_benchmark(benchmark: str) -> BenchmarkConfig:
 def open_benchmark(store: Path, benchmark: str) -> Store:
     """Return the built benchmark of a preset."""
     return open_store(store / compose_benchmark(benchmark).store_name)
+
+
+def read_item_responses(folder: Path, mode: str, control: str | None = None) -> Responses:
+    """Return the responses of a run of `evaluation.select` by item id.
+
+    Raises:
+        UserError: The folder is not that of a finished run, or a file of it is damaged.
+    """
+    with reading(folder):
+        report = from_json(SelectionReport, json.loads((folder / "report.json").read_text()))
+    return read_responses(folder, "select", report).get(variant_name(mode, control), {})
 
 
 def run_command(command: Sequence[str]) -> None:

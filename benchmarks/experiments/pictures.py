@@ -18,9 +18,8 @@ from textwrap import wrap
 from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 
-from benchmarks.experiments.experiment import open_benchmark
+from benchmarks.experiments.experiment import open_benchmark, read_item_responses
 from conf.failures import report_failures
-from conf.files import read_json_lines
 from data.records import LETTERS, SelectionItem, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from data.store import Store
@@ -66,25 +65,13 @@ def main() -> None:
 
 
 def read_solutions(folder: Path, store: Store) -> list[Solution]:
-    """Return the responses of a run in reasoning mode, in the order of the items."""
-    if not (folder / "answers.jsonl").exists():
-        raise SystemExit(f"error: {folder} is not the folder of a run of evaluation.select")
-    log = [*read_json_lines(folder / "answers.jsonl")]
-    # The last key is that of the last evaluation in reasoning mode without a control.
-    keys = [
-        row["key"]
-        for row in log
-        if "asked" in row and row["mode"] == "reasoning" and not row["asked"].get("control")
-    ]
-    rows = {
-        row["item_id"]: row
-        for row in log
-        if "item_id" in row and row["key"] in keys[-1:] and not row["cut"]
-    }
+    """Return the responses of a run in reasoning mode that are not cut, in the order of the
+    items."""
+    responses = read_item_responses(folder, "reasoning")
     return [
-        Solution(item, rows[item.item_id]["letter"], rows[item.item_id]["text"])
+        Solution(item, response.letter, response.text)
         for item in store.selection("test")
-        if item.item_id in rows
+        if (response := responses.get(item.item_id)) and not response.truncated
     ]
 
 

@@ -8,7 +8,7 @@ of the items of a family:
 
     right       the answer is right
     predicts    the response predicts something
-    true        it does, and every prediction is true of the target
+    true        the response predicts something, and every prediction is true of the target
     decides     of the items whose predictions are true, the probability that a reader of these
                 alone picks the target (`dynapix.sufficiency`)
     reader      this probability in all items: the accuracy of a student that reads and compares
@@ -27,9 +27,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.experiments.experiment import open_benchmark, print_header, print_row
+from benchmarks.experiments.experiment import (
+    open_benchmark,
+    print_header,
+    print_row,
+    read_item_responses,
+)
 from conf.failures import report_failures
-from conf.files import read_json_lines
 from data.records import FAMILIES
 from data.store import Store
 from teacher.deciding import choose_statements
@@ -84,22 +88,22 @@ def main() -> None:
 
 def read_predictions(run: Path, store: Store) -> Iterator[Predicted]:
     """Yield what each response in reasoning mode predicts."""
-    items = {item.item_id: item for item in store.selection("test")}
-    for line in read_json_lines(run / "answers.jsonl"):
-        if line.get("mode") != "reasoning" or line.get("item_id") not in items:
+    responses = read_item_responses(run, "reasoning")
+    for item in store.selection("test"):
+        response = responses.get(item.item_id)
+        if response is None:
             continue
-        item = items[line["item_id"]]
         p = extract_predicates(item, store.scene(item.scene_id), store.scene, Bounds())
         if p is None:
             continue
-        claims = extract_claims(line["text"], p)
-        predicted = find_predicted(line["text"], claims)
+        claims = extract_claims(response.text, p)
+        predicted = find_predicted(response.text, claims)
         fitting = tuple(v.letter for v in p.views if predicted and is_consistent(predicted, v))
         deciding = {name for s in choose_statements(p).statements for name in s.objects}
         names = {name for claim in predicted for name in claim.subjects}
-        reader = measure_sufficiency(line["text"], claims, p)
+        reader = measure_sufficiency(response.text, claims, p)
         chosen = not names.isdisjoint(deciding) if names else None
-        yield Predicted(item.family, item.letter, line["letter"], fitting, reader, chosen)
+        yield Predicted(item.family, item.letter, response.letter, fitting, reader, chosen)
 
 
 if __name__ == "__main__":

@@ -29,17 +29,18 @@ from benchmarks.experiments.experiment import (
     open_benchmark,
     print_header,
     print_row,
+    read_item_responses,
     training_settings,
 )
 from conf.compose import compose
 from conf.failures import report_failures
-from conf.files import read_json_lines
 from conf.schema import SftCommand
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.selection.distractors import BUILDERS_VERSIONS
 from evaluation.metrics.reasons import PARTS, SUPPORTED, read_reasons
+from evaluation.reporting.run_responses import ItemResponse
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
 from teacher.vocabulary import VERSIONS
@@ -48,7 +49,7 @@ RECORD = Path(__file__).with_name("letters.parquet")
 BOTH = ("reasoning", "answer")
 RELATIONAL = "teacher.predicates=relational"
 EPOCHS = "train.epochs=1"
-"""One epoch of these benchmarks has about as many steps as four of `tiny`."""
+"""One epoch of `comparison` has about as many steps as four of `tiny`."""
 ZERO_SHOT = "zero-shot"
 UNCHANGED = "none"
 CONTROLS = ("candidate_only", "shuffled_prefix", MATCHED_ANCHOR)
@@ -148,34 +149,28 @@ def read_letters(
 ) -> list[dict[str, Any]]:
     """Return the rows of a run: the chosen letter for each test item in each mode, and what the
     response claims."""
-    log = [*read_json_lines(folder / "answers.jsonl")]
-    lines = [line for line in log if "item_id" in line]
-    keys = {
-        line["key"]: line["asked"].get("control") or UNCHANGED for line in log if "asked" in line
-    }
     suite = MATCHED_ANCHOR if control == MATCHED_ANCHOR else None
-    wanted = UNCHANGED if suite else control
-    answers = {(r["item_id"], r["mode"]): r for r in lines if keys[r["key"]] == wanted}
+    asked = None if suite or control == UNCHANGED else control
     rows = []
-    for item in store.selection("test", suite):
-        for mode in modes:
-            answer = answers[item.item_id, mode]
+    for mode in modes:
+        responses = read_item_responses(folder, mode, asked)
+        for item in store.selection("test", suite):
+            response = responses[item.item_id]
             row = {
                 "mode": mode, "control": control, "item_id": item.item_id, "family": item.family,
-                "scene_id": item.scene_id, "answer": item.letter, "letter": answer["letter"],
+                "scene_id": item.scene_id, "answer": item.letter, "letter": response.letter,
             }  # fmt: skip
-            claims = count_claims(item, answer, store) if control == UNCHANGED else ()
-            rows.append(row | dict(claims))
+            if mode == "reasoning" and control == UNCHANGED:
+                row |= dict(count_claims(item, response, store))
+            rows.append(row)
     return rows
 
 
 def count_claims(
-    item: SelectionItem, answer: dict[str, Any], store: Store
+    item: SelectionItem, response: ItemResponse, store: Store
 ) -> Iterator[tuple[str, Any]]:
     """Yield columns with what a response in reasoning mode claims (see `read_reasons`)."""
-    if answer["mode"] != "reasoning":
-        return
-    reasons = read_reasons(item, answer["text"], answer["letter"], store)
+    reasons = read_reasons(item, response.text, response.letter, store)
     if reasons is None:
         return
     for part in PARTS:

@@ -120,7 +120,7 @@ def displace(
 
     Args:
         errors: Standard deviation of each object's place, as a share of the image.
-        ground: (2, 2) displacement on the ground for a displacement in the image.
+        ground: (2, 2) matrix that maps a displacement in the image to one on the ground.
     """
     image, on_ground = {}, {}
     for name, place in places.image.items():
@@ -167,7 +167,8 @@ def state_topics(statements: tuple[Relation, ...], found: set[Relation]) -> set[
 
 
 def distance(one: Places, other: Places) -> float:
-    """Return the sum of the distances of the objects of two frames."""
+    """Return the sum of the distances between the places of each object in two frames. An object
+    that only one of them shows counts `LOST`."""
     names = one.image.keys() | other.image.keys()
     both = one.image.keys() & other.image.keys()
     return sum(dist(one.image[name], other.image[name]) for name in both) + LOST * (

@@ -18,7 +18,7 @@ from train.student.lazy_samples import seeded_rng
 from train.tiny_base.questions import KINDS, QUESTIONS, Question
 from train.tiny_base.samples import OracleSample, make_sample
 
-SILENT = Question("", "")
+NO_QUESTION = Question("", "")
 """The question of the stages without words."""
 CORPUS_ITEMS = 800
 """Number of items whose texts the tokenizer is trained on."""
@@ -53,7 +53,7 @@ class ItemSampler:
     frame_count: int
     seed: int
 
-    def batch(self, stage: str, step: int, size: int) -> list[OracleSample]:
+    def make_batch(self, stage: str, step: int, size: int) -> list[OracleSample]:
         """Return this rank's samples of a step with `size` samples over all ranks. All ask the same
         kind of question, so that they show the same number of pictures."""
         samples = []
@@ -61,14 +61,14 @@ class ItemSampler:
         for position in range(step * size + rank(), (step + 1) * size, world_size()):
             epoch, index = divmod(position, len(self.items))
             order = seeded_rng(self.seed, stage, epoch).permutation(len(self.items))
-            samples.append(self.sample(self.items[order[index]], kind, f"{stage} {epoch}"))
+            samples.append(self.make_sample(self.items[order[index]], kind, f"{stage} {epoch}"))
         return samples
 
-    def sample(self, item: SelectionItem, kind: str | None, key: str) -> OracleSample:
-        """Return a sample of an item (see `ask`)."""
-        return self.make(*self.ask(item, kind, key))
+    def make_sample(self, item: SelectionItem, kind: str | None, key: str) -> OracleSample:
+        """Return a sample of an item (see `ask_question`)."""
+        return self.show_question(*self.ask_question(item, kind, key))
 
-    def ask(
+    def ask_question(
         self, item: SelectionItem, kind: str | None, key: str
     ) -> tuple[SelectionItem, Question]:
         """Return an item with its candidates in random order, and a question about it.
@@ -80,12 +80,12 @@ class ItemSampler:
         rng = seeded_rng(self.seed, key, item.item_id)
         item = reorder_candidates(item, rng.permutation(len(LETTERS)).tolist())
         if kind is None:
-            return item, SILENT
+            return item, NO_QUESTION
         scene = self.frames.scene(item.scene_id)
         predicates = extract_predicates(item, scene, self.frames.scene, Bounds())
         return item, KINDS[kind](predicates, item, rng)
 
-    def make(self, item: SelectionItem, question: Question) -> OracleSample:
+    def show_question(self, item: SelectionItem, question: Question) -> OracleSample:
         """Return the sample of a question about an item."""
         return make_sample(item, question, self.frames, self.frame_count)
 
@@ -95,6 +95,8 @@ def tokenizer_corpus(sampler: ItemSampler) -> list[str]:
     items = sampler.items
     step = max(1, len(items) // CORPUS_ITEMS)
     answers = [
-        sampler.ask(item, kind, "tokenizer")[1].answer for item in items[::step] for kind in KINDS
+        sampler.ask_question(item, kind, "tokenizer")[1].answer
+        for item in items[::step]
+        for kind in KINDS
     ]
     return prompt_corpus(items, QUESTIONS) + answers

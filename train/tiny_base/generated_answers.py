@@ -52,9 +52,9 @@ def measure_generated_answers(
     found: dict[str, list[bool]] = defaultdict(list)
     for kind, section in SECTIONS.items():
         for k in range(0, len(items), BATCH):
-            asked = [sampler.ask(item, kind, "held out") for item in items[k : k + BATCH]]
+            asked = [sampler.ask_question(item, kind, "held out") for item in items[k : k + BATCH]]
             samples = [
-                replace(sampler.make(item, question).sample, response=None)
+                replace(sampler.show_question(item, question).sample, response=None)
                 for item, question in asked
             ]
             texts = generate(model, processor, collate(samples), limit, precision)

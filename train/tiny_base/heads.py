@@ -1,7 +1,8 @@
-"""Throw-away heads that train the tiny base on what the oracle knows, and their losses.
+"""Auxiliary heads that train the tiny base on what the oracle knows, and their losses.
 
-Words are a thin signal: a text names a few objects, while the oracle knows every object in every
-picture. The heads are linear, so the base itself has to represent what they predict. They read
+The heads are discarded after the training. A text names a few objects; the heads are trained on
+every visible object in every picture. They are linear, so the base itself has to represent what
+they predict. They read
 
     "seen"     visual tokens, as the vision tower gives them: colour, material, shape, whether the
                centre of an object is in the token, where in the token and in the image, and the
@@ -41,11 +42,12 @@ SCALES = {"place": 6.0, "offset": 3.0, "inside": 1.0, "shift": 15.0} | dict.from
     (*DISPLACEMENTS, "apart"), 5.0
 )
 """Factors on places and displacements, so that their losses are of similar size."""
-BEND = 0.1
+SMOOTH_L1_BETA = 0.1
 """Scaled error above which the loss of a place or displacement is linear."""
-MOVING = 0.012
-"""An object moves if its velocity, as a share of the image in 10 frames, is above this. Measures of
-displacements leave out objects that are displaced by less."""
+MOVING_SPEED = 0.012
+"""An object moves if its velocity, as a share of the image in 10 frames, is above this.
+Displacements ahead are measured for objects that move, `since` and `future` for objects that are
+displaced by more than this."""
 
 
 class OracleHeads(nn.Module):
@@ -91,7 +93,9 @@ class OracleHeads(nn.Module):
             losses[kind] = cross_entropy(logits, targets.truth[kind])
         truth = targets.truth | {"inside": targets.inside}
         for name in ("inside", "shift", "place"):
-            losses[f"seen {name}"] = distance(self.seen[name](seen), truth[name], SCALES[name])
+            losses[f"seen {name}"] = regression_loss(
+                self.seen[name](seen), truth[name], SCALES[name]
+            )
         return losses
 
     def word_logits(self, seen: Tensor) -> dict[str, Tensor]:
@@ -104,12 +108,12 @@ class OracleHeads(nn.Module):
         known = self.norms["known"](hidden[targets.objects[:, 0], targets.objects[:, 1]])
         truth = targets.truth
         losses = {
-            name: distance(self.known[name](known), truth[name], SCALES[name])
+            name: regression_loss(self.known[name](known), truth[name], SCALES[name])
             for name in ("place", "apart", *DISPLACEMENTS)
         }
         observed = ~truth["velocity"][:, 0].isnan()
         if observed.any():
-            moves = (truth["velocity"][observed].norm(dim=1) > MOVING).float()
+            moves = (truth["velocity"][observed].norm(dim=1) > MOVING_SPEED).float()
             moving = self.known["moving"](known[observed])[:, 0]
             losses["moving"] = binary_cross_entropy_with_logits(moving, moves)
         return losses
@@ -117,7 +121,7 @@ class OracleHeads(nn.Module):
     def measures(
         self, tokens: Tensor, hidden: Tensor | None, targets: OracleTargets
     ) -> dict[str, Tensor]:
-        """Return what the heads read correctly, as in `seen_losses` and `known_losses`.
+        """Return the accuracies and errors of the heads of `seen_losses` and `known_losses`.
 
         Args:
             hidden: None leaves out what is read in the middle layers.
@@ -134,10 +138,10 @@ class OracleHeads(nn.Module):
         seen = self.norms["seen"](tokens)[row, token]
         words = self.word_logits(seen)
         found = {kind: logits.argmax(dim=-1) == truth[kind] for kind, logits in words.items()}
-        moves = truth["velocity"].norm(dim=1) > MOVING
+        moves = truth["velocity"].norm(dim=1) > MOVING_SPEED
         if hidden is None:
             shift = self.seen["shift"](seen)
-            found["heading"] = (octant(shift) == octant(truth["velocity"]))[moves]
+            found["heading"] = (heading_octant(shift) == heading_octant(truth["velocity"]))[moves]
             return found
         known = self.norms["known"](hidden[row, token])
         read = {
@@ -147,12 +151,15 @@ class OracleHeads(nn.Module):
         }
         observed = ~truth["velocity"][:, 0].isnan()
         found["moving"] = ((self.known["moving"](known)[:, 0] > 0) == moves)[observed]
-        found["heading"] = (octant(read["velocity"]) == octant(truth["velocity"]))[moves]
+        headings = [heading_octant(values["velocity"]) for values in (read, truth)]
+        found["heading"] = (headings[0] == headings[1])[moves]
         found["place_error"] = (read["place"] - truth["place"]).norm(dim=1)
         for name in (*AHEADS, "since"):
             distances = truth[name].norm(dim=1)
             # Objects in images have no velocity, so `since` is filtered by its own length.
-            displaced = moves & ~distances.isnan() if name != "since" else distances > MOVING
+            displaced = distances > MOVING_SPEED
+            if name != "since":
+                displaced = moves & ~distances.isnan()
             found[f"{name}_error"] = (read[name] - truth[name]).norm(dim=1)[displaced]
             found[f"{name}_still"] = distances[displaced]
         apart = truth["apart"][:, 0]
@@ -175,34 +182,38 @@ class OracleHeads(nn.Module):
         row, at = targets.names.T
         named = self.norms["named"](hidden[row, at])
         pictures = targets.has_picture[row]
-        visible = (targets.found >= 0).float()[pictures]
-        spread = measure_spread(targets.places)[:, None]
+        visible = (targets.name_tokens >= 0).float()[pictures]
+        spread = measure_spread(targets.name_places)[:, None]
         return {
             "visible": binary_cross_entropy_with_logits(
                 self.named["visible"](named)[pictures], visible
             ),
-            "places": distance(self.named["places"](named), targets.places, SCALES["place"]),
-            "future": distance(self.named["future"](named), targets.future, SCALES["since"]),
-            "spread": distance(self.spread(named), spread, SCALES["since"]),
+            "places": regression_loss(
+                self.named["places"](named), targets.name_places, SCALES["place"]
+            ),
+            "future": regression_loss(
+                self.named["future"](named), targets.name_displacements, SCALES["since"]
+            ),
+            "spread": regression_loss(self.spread(named), spread, SCALES["since"]),
         }
 
     def spoken_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the losses at the tokens that describe a named object, from the output of the
         layer `SPEAKING`, (B, L, H)."""
-        row, at = targets.spoken.T
+        row, at = targets.description_tokens.T
         spoken = self.norms["spoken"](hidden[row, at])
-        truth = dict(zip(self.spoken, targets.spoken_state.split(2, dim=1), strict=True))
+        truth = dict(zip(self.spoken, targets.description_states.split(2, dim=1), strict=True))
         return {
-            name: distance(head(spoken), truth[name], SCALES[name])
+            name: regression_loss(head(spoken), truth[name], SCALES[name])
             for name, head in self.spoken.items()
         }
 
     def spoken_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return `spoken_place_error`, the error of the place that the heads read at the tokens
         that describe a named object, as a share of the image."""
-        row, at = targets.spoken.T
+        row, at = targets.description_tokens.T
         read = self.spoken["place"](self.norms["spoken"](hidden[row, at])).float()
-        errors = (read / SCALES["place"] - targets.spoken_state[:, :2]).norm(dim=1)
+        errors = (read / SCALES["place"] - targets.description_states[:, :2]).norm(dim=1)
         return {"spoken_place_error": errors[~errors.isnan()]}
 
     def named_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
@@ -213,13 +224,13 @@ class OracleHeads(nn.Module):
         row, at = targets.names.T
         named = self.norms["named"](hidden[row, at])
         read = {name: self.named[name](named).float() for name in ("places", "future")}
-        places = (read["places"] / SCALES["place"] - targets.places).unflatten(1, (-1, 2))
+        places = (read["places"] / SCALES["place"] - targets.name_places).unflatten(1, (-1, 2))
         errors = places.norm(dim=-1)
-        still = targets.future.norm(dim=1)
-        displaced = still > MOVING
-        future = (read["future"] / SCALES["since"] - targets.future).norm(dim=1)
+        still = targets.name_displacements.norm(dim=1)
+        displaced = still > MOVING_SPEED
+        future = (read["future"] / SCALES["since"] - targets.name_displacements).norm(dim=1)
         pictures = targets.has_picture[row]
-        visible = (self.named["visible"](named) > 0) == (targets.found >= 0)
+        visible = (self.named["visible"](named) > 0) == (targets.name_tokens >= 0)
         return {
             "named_visible": visible[pictures].float(),
             "named_place_error": errors[~errors.isnan()],
@@ -228,12 +239,13 @@ class OracleHeads(nn.Module):
         }
 
 
-def distance(predicted: Tensor, true: Tensor, scale: float) -> Tensor:
-    """Return the mean smooth absolute error of the elements of `true` that are not NaN."""
+def regression_loss(predicted: Tensor, true: Tensor, scale: float) -> Tensor:
+    """Return twice the mean smooth L1 loss between `predicted` and `true * scale`, without the
+    elements that are NaN in `true`."""
     known = ~true.isnan()
     if not known.any():
         return predicted.sum() * 0
-    return 2 * smooth_l1_loss(predicted[known], true[known] * scale, beta=BEND)
+    return 2 * smooth_l1_loss(predicted[known], true[known] * scale, beta=SMOOTH_L1_BETA)
 
 
 def measure_spread(places: Tensor) -> Tensor:
@@ -251,6 +263,6 @@ def measure_spread(places: Tensor) -> Tensor:
     return spread.where((~distances.isnan()).any(dim=1), torch.nan)
 
 
-def octant(vectors: Tensor) -> Tensor:
+def heading_octant(vectors: Tensor) -> Tensor:
     """Return which of eight headings vectors (N, 2) have."""
     return torch.round(torch.atan2(vectors[:, 1], vectors[:, 0]) / (math.pi / 4)) % 8

@@ -40,8 +40,8 @@ CLAIMED = re.compile(
     rf"(?P<place>between [^.]+? and the (?:{NAME.pattern})|[^.]+?)"
     r"(?P<comma>,?)(?=(?P<agrees>,? and agrees| and the )| not | but |,? and not |\.)"
 )
-"""Matches what a text says that a candidate shows of an object. The group `agrees` matches if it
-was predicted."""
+"""Matches what a text says that a candidate shows of an object. The group `agrees` matches if the
+text says that the candidate agrees, or goes on with another object."""
 POSSESSES = re.compile(r"\b(?:with|has|have) the $")
 """Matches the words before the sphere in "the cube has the sphere left of it"."""
 PREDICTION = re.compile("Prediction:")
@@ -49,7 +49,8 @@ PREDICTION = re.compile("Prediction:")
 
 @dataclass(frozen=True)
 class Mention:
-    """A name in a text, and the tokens up to the next name or the end of the sentence.
+    """A name in a text, and the tokens up to the next name, candidate or section, or the end of the
+    sentence.
 
     Attributes:
         first, last: Indices of the name's first and last token.

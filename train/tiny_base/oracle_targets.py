@@ -20,7 +20,7 @@ from teacher.predicates.motion import motion_start
 
 WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
 """The words of a noun phrase, in their order."""
-STATE_WORDS = {
+SPATIAL_WORDS = {
     "heading": COMPASS,
     "region": ("top", "left", "right", "center", "bottom"),
     "speed": ("slowly", "steadily", "quickly", "rests", "stationary"),
@@ -86,7 +86,8 @@ class ObjectTarget:
 @dataclass(frozen=True)
 class OracleTargets:
     """Targets of a batch of B samples with T visual tokens each, N objects at visual tokens, K
-    pairs of tokens to track, and M names in texts. Tokens are indices into `visual`.
+    pairs of tokens to track, M names in texts, and S tokens of texts that describe named objects.
+    Visual tokens are indices into `visual`, positions are indices into the sequence.
 
     Attributes:
         visual: (B, T) positions of the visual tokens in the sequence.
@@ -102,17 +103,17 @@ class OracleTargets:
             candidate, and token of the same object there, or -1 where it is not visible.
         names: (M, 2) row and position of a name's last token.
         name_words: (M,) the named object's colour, material and shape, by kind.
-        found: (M, PICTURES) token of the named object in each picture, or -1 where it is not
+        name_tokens: (M, PICTURES) token of the named object in each picture, or -1 where it is not
             visible.
-        shown: (_, 3) row, position of a name, and token of the object in the picture that the text
-            speaks of, or -1 where it is not visible.
-        places: (M, 2 * PICTURES) its places relative to the centre of each picture, NaN where it is
-            not visible.
-        future: (M, 2) its displacement up to the moment that the item asks for, or NaN.
-        spoken: (S, 2) row and position of the tokens that describe a named object, from the end of
-            its name on.
-        spoken_state: (S, 6) place and velocity of the object there, and its displacement from its
-            owner, or NaN.
+        described_tokens: (_, 3) row, position of a name, and token of the object in the picture
+            that the text describes, or -1 where it is not visible.
+        name_places: (M, 2 * PICTURES) its places relative to the centre of each picture, NaN where
+            it is not visible.
+        name_displacements: (M, 2) its displacement up to the moment that the item asks for, or NaN.
+        description_tokens: (S, 2) row and position of the tokens that describe a named object, from
+            the end of its name on.
+        description_states: (S, 6) place and velocity of the object there, and its displacement from
+            its owner, or NaN.
         subjects: (_, 3) row, position after a name, and position of the name.
         owners: (_, 3) row, position of a token that describes the sphere in "the cube has the
             sphere left of it", and position of the cube's name.
@@ -123,8 +124,8 @@ class OracleTargets:
         repeats: (_, 3) row, position before a name that the text has mentioned before, and position
             of the first token of its last mention.
         text_tokens: (_, 2) row and position of the tokens of texts.
-        state_words: (_, 2) row and position of the tokens of words for places, motion and relations
-            in texts.
+        spatial_words: (_, 2) row and position of the tokens of words for places, motion and
+            relations in texts.
         verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
             of the word that says that the candidate agrees.
         comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
@@ -147,19 +148,19 @@ class OracleTargets:
     tracked_to_candidates: Tensor
     names: Tensor
     name_words: dict[str, Tensor]
-    found: Tensor
-    shown: Tensor
-    places: Tensor
-    future: Tensor
-    spoken: Tensor
-    spoken_state: Tensor
+    name_tokens: Tensor
+    described_tokens: Tensor
+    name_places: Tensor
+    name_displacements: Tensor
+    description_tokens: Tensor
+    description_states: Tensor
     subjects: Tensor
     owners: Tensor
     text_letters: Tensor
     prompt_letters: Tensor
     repeats: Tensor
     text_tokens: Tensor
-    state_words: Tensor
+    spatial_words: Tensor
     verdicts: Tensor
     comparisons: Tensor
     next_in_clip: Tensor

@@ -61,7 +61,7 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         named = targets.has_picture[targets.names[:, 0], head]
         row, query = targets.names[named].T
         if len(row):
-            key = locate_objects(row, targets.found[named, head], targets)
+            key = locate_objects(row, targets.name_tokens[named, head], targets)
             losses[f"find {head}"] = -trace.log_attention(NAMING, head, row, query, key).mean()
     row, position = targets.text_tokens.T
     before, second_before = (torch.stack([row, position, position - k], dim=1) for k in (1, 2))
@@ -69,7 +69,7 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     next_in_clip = torch.stack([row, query, targets.visual[row, token]], dim=1)
     row, query, token = targets.next_in_candidates.T
     next_in_candidates = torch.stack([row, query, targets.visual[row, token]], dim=1)
-    row, query, token = targets.shown.T
+    row, query, token = targets.described_tokens.T
     shown = torch.stack([row, query, locate_objects(row, token, targets)], dim=1)
     for name, layer, head, pairs in (
         ("before", PRECEDING, 0, before),

@@ -73,8 +73,8 @@ class Probe:
         return average(found)
 
     def _measure_predicted_words(self) -> dict[str, float]:
-        """Return the share of words of each kind that the model predicts, given the correct words
-        before them, and the errors of what the heads read at names."""
+        """Return the accuracy of the first token of each kind of word, given the correct words
+        before it, and the errors of what the heads read at names and after them."""
         found: dict[str, list[Tensor]] = defaultdict(list)
         for kind, samples in self.worded.items():
             for k in range(0, len(samples), BATCH):

@@ -59,12 +59,12 @@ QUESTIONS = (PARSE, PREDICT, DESCRIBE, COMPARE, EXPLAIN, MATCH, NARRATE)
 FULL = Detail(parsed=6, analysed=4, predicted=6, pairs=2, relations=2)
 SPARSE = Detail(parsed=3, analysed=2, predicted=1, pairs=1)
 PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
-"""Maximum numbers of relations in a prediction and about each candidate, and of statements that are
-compared with all candidates."""
+"""Maximum numbers of relations in an answer to `predict`, of relations about each candidate in one
+to `describe`, and of candidates that `compare` supposes to be the target."""
 SUPPOSED_PATH = 0.2
 """Path of objects to a supposed target, as a share of the image; a typical path to the target."""
 OPTIONS = 12
-"""Number of statements that are sampled about a picture."""
+"""Number of statements that `explain` samples, of which it uses one or two."""
 
 WEIGHTS = {
     "region": 10, "gap": 2, "side": 2, "height": 2, "nearer": 1, "sight": 1, "between": 1,
@@ -91,11 +91,11 @@ class Question:
     predicts_target: bool = True
 
 
-def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+def ask_parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the scene at the end of the clip, and for the motion.
 
-    Statements that are true of the target choose which objects and relations the answer mentions.
-    What it says of relations is true at the end of the clip.
+    The objects and relations that the answer mentions are those of sampled statements that are true
+    of the target. What the answer says of relations is true at the end of the clip.
     """
     statements = sample_statements(leave_out_unseen(p), p.target, rng, FULL.relations)
     writer = make_statement_writer(p, item, rng, statements)
@@ -106,7 +106,7 @@ def parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator
     return Question(PARSE, answer, candidates=False)
 
 
-def predict(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+def ask_predict(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the place of each object at the target, and for relations."""
     writer = make_statement_writer(p, item, rng)
     parts = [writer.expected(o) for o in writer.order(writer.ranked)]
@@ -116,7 +116,9 @@ def predict(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
     return Question(PREDICT, f"Prediction: {join_sentences(parts)}", candidates=False)
 
 
-def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+def ask_describe(
+    p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator
+) -> Question:
     """Ask for the place of each object in each candidate, and for relations. Those of the first
     candidate are chosen at random; the others follow it in the same respects."""
     writer = make_statement_writer(p, item, rng)
@@ -138,7 +140,7 @@ def describe(p: RelationalPredicates, item: SelectionItem, rng: np.random.Genera
     return Question(DESCRIBE, "\n".join(lines), clip=False)
 
 
-def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+def ask_compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the statements that would decide the item if a candidate were the target, and which
     candidates agree with them, for two candidates."""
     blocks = []
@@ -149,7 +151,7 @@ def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
             continue
         writer = make_statement_writer(p, item, rng, statements)
         predicted = [writer.statement(s, "will be") for s in writer.statements]
-        analysed = [f"candidate {view.letter} {judge(writer, view)}" for view in p.views]
+        analysed = [f"candidate {view.letter} {state_verdict(writer, view)}" for view in p.views]
         blocks.append(
             f"Prediction: {join_sentences(predicted)}\n"
             f"Candidate analysis: {join_sentences(analysed)}\n"
@@ -158,19 +160,19 @@ def compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
     return Question(COMPARE, "\n".join(blocks), predicts_target=False)
 
 
-def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+def ask_explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for the steps of a rationale, with statements that are true of the target and of another
     candidate; for the first two steps if there are none."""
     statements = sample_shared_statements(leave_out_unseen(p), rng)
     if not statements:
-        return replace(parse(p, item, rng), text=EXPLAIN, candidates=True)
+        return replace(ask_parse(p, item, rng), text=EXPLAIN, candidates=True)
     writer = make_statement_writer(p, item, rng, statements, SPARSE)
     shortest = min(writer.statements, key=lambda s: len(s.objects))
     sections = {
         "Scene parse": writer.scene_parse(),
         "Motion analysis": writer.motion_analysis(),
         "Prediction": writer.prediction(),
-        "Candidate analysis": [f"candidate {v.letter} {judge(writer, v)}" for v in p.views],
+        "Candidate analysis": [f"candidate {v.letter} {state_verdict(writer, v)}" for v in p.views],
         "Outcome": [writer.statement(shortest, "is"), name_agreeing(p, statements)],
     }
     lines = [f"{title}: {join_sentences(parts)}" for title, parts in sections.items()]
@@ -181,12 +183,12 @@ def explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
     return Question(EXPLAIN, "\n".join(lines))
 
 
-def match(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+def ask_match(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for comparisons as in `compare`. No picture is shown."""
-    return replace(compare(p, item, rng), text=MATCH, clip=False, candidates=False)
+    return replace(ask_compare(p, item, rng), text=MATCH, clip=False, candidates=False)
 
 
-def narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+def ask_narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
     """Ask for a rationale, in one of the vocabularies, and its answer. No picture is shown."""
     predicates = p if rng.random() < 0.5 else p.without_relations()
     rationale = write_rationale(predicates, item, int(rng.integers(2**31)))
@@ -197,8 +199,8 @@ def narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generat
 
 MakeQuestion = Callable[[RelationalPredicates, SelectionItem, np.random.Generator], Question]
 KINDS: dict[str, MakeQuestion] = {
-    "parse": parse, "predict": predict, "describe": describe, "compare": compare,
-    "explain": explain, "match": match, "narrate": narrate,
+    "parse": ask_parse, "predict": ask_predict, "describe": ask_describe,
+    "compare": ask_compare, "explain": ask_explain, "match": ask_match, "narrate": ask_narrate,
 }  # fmt: skip
 
 
@@ -227,14 +229,15 @@ def suppose_target(p: RelationalPredicates, letter: str) -> RelationalPredicates
     return replace(p, candidates=candidates, views=views, paths=paths)
 
 
-def judge(writer: RelationalWriter, view: View) -> str:
-    """State which of the writer's statements is false of a candidate, or that all are true."""
+def state_verdict(writer: RelationalWriter, view: View) -> str:
+    """Return a clause that says which of the writer's statements is false of a candidate, or that
+    all are true."""
     if (wrong := writer.find_false(view)) is not None:
         return writer.contrast(wrong, view)
     return f"shows {writer.all_shown()}, and agrees"
 
 
-def agreeing(p: RelationalPredicates, statements: Sequence[Relation]) -> list[str]:
+def find_agreeing(p: RelationalPredicates, statements: Sequence[Relation]) -> list[str]:
     """Return the letters of the candidates of which all statements are true."""
     wanted = {normalize_relation(s) for s in statements}
     return [view.letter for view in p.views if wanted <= view.statements]
@@ -242,7 +245,7 @@ def agreeing(p: RelationalPredicates, statements: Sequence[Relation]) -> list[st
 
 def name_agreeing(p: RelationalPredicates, statements: Sequence[Relation]) -> str:
     """Return the clause that names the candidates of which all statements are true."""
-    *letters, last = agreeing(p, statements)
+    *letters, last = find_agreeing(p, statements)
     if not letters:
         return f"candidate {last} agrees"
     return f"candidates {', '.join(letters)} and {last} agree"
@@ -279,23 +282,23 @@ def sample_shared_statements(p: RelationalPredicates, rng: np.random.Generator) 
     """Sample one or two statements that are true of the target and of another candidate, the first
     chosen by `choose_rarest`. The list is empty if there are none."""
     options = sample_statements(p, p.target, rng, OPTIONS)
-    shared = [s for s in options if len(agreeing(p, [s])) > 1]
+    shared = [s for s in options if len(find_agreeing(p, [s])) > 1]
     if not shared:
         return []
     first = [choose_rarest(p, shared)]
     if rng.random() < 0.6:
         return first
-    second = [s for s in shared if s not in first and len(agreeing(p, [*first, s])) > 1]
+    second = [s for s in shared if s not in first and len(find_agreeing(p, [*first, s])) > 1]
     return first + second[:1]
 
 
 def choose_rarest(p: RelationalPredicates, statements: Sequence[Relation]) -> Relation:
-    """Return the statement that fewest candidates agree with; of several, the one that a reader
-    with errors of places most likely finds true and false of the right candidates."""
+    """Return the statement that the fewest candidates agree with. Of several, this is the one that
+    a reader whose places are inexact most likely judges correctly for all candidates."""
 
     def rank(statement: Relation) -> tuple[int, float]:
         normalized = normalize_relation(statement)
         seen = [probability_of_sight(normalized, view, p.bounds) for view in p.views]
-        return len(agreeing(p, [statement])), -math.prod(seen)
+        return len(find_agreeing(p, [statement])), -math.prod(seen)
 
     return min(statements, key=rank)

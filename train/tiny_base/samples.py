@@ -1,7 +1,7 @@
 """Samples of the tiny base: prompts as students read them, with what the oracle knows of them.
 
-A sample shows a clip and four candidates, as a selection prompt does, and asks one of the questions
-of `train.tiny_base.questions`.
+A sample shows the clip, the candidates, both or neither, as a selection prompt shows them, and asks
+a question of `train.tiny_base.questions`, or none.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from teacher.predicates.motion import find_cut
 from train.tiny_base.mentions import Mention, TokenizedText
 from train.tiny_base.oracle_targets import (
     PICTURES,
-    STATE_WORDS,
+    SPATIAL_WORDS,
     UNKNOWN,
     ObjectTarget,
     OracleTargets,
@@ -98,7 +98,7 @@ class OracleCollator:
     def __init__(self, processor: ProcessorMixin, max_length: int) -> None:
         self._processor = processor
         self._collate = Collator(processor, max_length)
-        self._state_ids = state_tokens(processor.tokenizer)
+        self._spatial_ids = spatial_token_ids(processor.tokenizer)
 
     def __call__(self, samples: Sequence[OracleSample]) -> tuple[dict[str, Any], OracleTargets]:
         batch = self._collate([s.sample for s in samples])
@@ -110,7 +110,7 @@ class OracleCollator:
         mentions: list[LocatedMention] = []
         pairs: dict[str, list[tuple[int, ...]]] = {
             "prompt_letters": [*self._find_letters(ids, visual, samples, grid)],
-            "text_tokens": [], "state_words": [], "verdicts": [], "comparisons": [],
+            "text_tokens": [], "spatial_words": [], "verdicts": [], "comparisons": [],
         }  # fmt: skip
         for row, (sample, text) in enumerate(zip(samples, texts, strict=True)):
             # The token that ends the turn follows the response.
@@ -118,8 +118,8 @@ class OracleCollator:
             mentions += locate_mentions(sample, text, row, start, grid)
             tokens = range(start, start + len(text))
             pairs["text_tokens"] += [(row, k) for k in tokens]
-            pairs["state_words"] += [
-                (row, k) for k in tokens if int(ids[row, k]) in self._state_ids
+            pairs["spatial_words"] += [
+                (row, k) for k in tokens if int(ids[row, k]) in self._spatial_ids
             ]
             pairs["verdicts"] += [
                 (row, start + letter - 1, start + agrees) for letter, agrees in text.verdicts()
@@ -144,9 +144,9 @@ class OracleCollator:
                 yield from ((row, int(token), int(before[-1])) for token in picture)
 
 
-def state_tokens(tokenizer: PreTrainedTokenizerBase) -> set[int]:
+def spatial_token_ids(tokenizer: PreTrainedTokenizerBase) -> set[int]:
     """Return the tokens of the words for places, motion and relations."""
-    words = [word for words in STATE_WORDS.values() for word in words]
+    words = [word for words in SPATIAL_WORDS.values() for word in words]
     words += [f"{row}-{column}" for row in ("top", "bottom") for column in ("left", "right")]
     return {i for word in words for i in tokenizer.encode(f" {word}", add_special_tokens=False)}
 
@@ -264,8 +264,8 @@ def stack_samples(
         tracked_to_candidates=integers([*track_to_candidates(samples, objects, grid)], 4),
         names=integers([(m.row, m.position) for m in mentions], 2),
         name_words=name_words([m.name for m in mentions]),
-        found=integers([m.found for m in mentions], PICTURES),
-        shown=integers(
+        name_tokens=integers([m.found for m in mentions], PICTURES),
+        described_tokens=integers(
             [
                 (m.row, m.position, m.found[m.picture])
                 for m in mentions
@@ -273,10 +273,10 @@ def stack_samples(
             ],
             3,
         ),
-        places=torch.tensor([m.places for m in mentions]).reshape(-1, 2 * PICTURES) - 0.5,
-        future=torch.tensor([m.future for m in mentions]).reshape(-1, 2),
-        spoken=integers([(m.row, k) for m in mentions for k in m.spoken], 2),
-        spoken_state=torch.tensor(
+        name_places=torch.tensor([m.places for m in mentions]).reshape(-1, 2 * PICTURES) - 0.5,
+        name_displacements=torch.tensor([m.future for m in mentions]).reshape(-1, 2),
+        description_tokens=integers([(m.row, k) for m in mentions for k in m.spoken], 2),
+        description_states=torch.tensor(
             [(*m.state, *m.offset) for m in mentions for _ in m.spoken]
         ).reshape(-1, 6),
         subjects=integers([(m.row, k, m.position) for m in mentions for k in m.spoken[1:]], 3),
@@ -289,7 +289,7 @@ def stack_samples(
         prompt_letters=integers(pairs["prompt_letters"], 3),
         repeats=integers([*find_repeats(mentions)], 3),
         text_tokens=integers(pairs["text_tokens"], 2),
-        state_words=integers(pairs["state_words"], 2),
+        spatial_words=integers(pairs["spatial_words"], 2),
         verdicts=integers(pairs["verdicts"], 3),
         comparisons=integers(pairs["comparisons"], 3),
         next_in_clip=integers([*find_next_in_clip(mentions)], 3),

@@ -1,4 +1,4 @@
-"""The states of the model that the targets of the tiny base refer to."""
+"""Record the hidden states, queries and keys that the losses of the tiny base are computed from."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import apply_rotary_pos_emb
 from models.student.collator import MEDIA
 
 PRECEDING, TRACKING, MIDDLE, NAMING, RECALLING, SPEAKING = 0, 1, 2, 3, 4, 5
-"""Indices of the language layers that the targets refer to (see `train.tiny_base.heads`)."""
+"""Indices of the language layers that the heads (`train.tiny_base.heads`) and the attention losses
+(`train.tiny_base.pointing`) refer to."""
 
 
 @dataclass

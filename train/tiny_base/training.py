@@ -39,7 +39,7 @@ from train.common.curves import plot_curves
 from train.common.journal import CURVES, JOURNAL, read_journal
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import OracleHeads
-from train.tiny_base.oracle_targets import STATE_WORDS, WORDS, OracleTargets
+from train.tiny_base.oracle_targets import SPATIAL_WORDS, WORDS, OracleTargets
 from train.tiny_base.pointing import pointing_losses
 from train.tiny_base.probe import Probe
 from train.tiny_base.questions import KINDS
@@ -58,11 +58,17 @@ from train.tiny_base.trace import (
 log = logging.getLogger(__name__)
 
 STAGES = ("eyes", "motion", "words")
-STATE = "state.pt"
-DENSE, POINTING, NAMED, DESCRIBED = 0.5, 1.0, 3.0, 1.0
-"""Weights of losses in the stage of words, relative to the loss of all words: those of what visual
-tokens and names show, those of attention, those of places and motion in texts, and that of the
-words for places, motion and relations, which are a tenth of all words."""
+CHECKPOINT = "state.pt"
+WARMUP_STEPS, LEAST_RATE = 40, 0.05
+DENSE = 0.5
+"""Weight, in the stage of words, of the losses at visual tokens and of the colours, materials and
+shapes at names, relative to the loss of all words."""
+POINTING = 1.0
+"""Weight of the losses of attention heads."""
+NAMED = 3.0
+"""Weight of the losses of places and motion in texts."""
+SPATIAL = 1.0
+"""Weight of the words for places, motion and relations, which are a tenth of all words."""
 
 
 def eyes_losses(
@@ -101,12 +107,12 @@ def words_losses(
         losses |= {f"spelled {kind}": DENSE * loss for kind, loss in spelled.items()}
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()
     losses["words"] = cross_entropy(predicted, following, ignore_index=IGNORED)
-    row, at = targets.state_words.T
+    row, at = targets.spatial_words.T
     if len(row):
         # The logits and labels are those of the last tokens.
         at = at - (batch["input_ids"].shape[1] - labels.shape[1])
-        state = cross_entropy(logits[row, at - 1].float(), labels[row, at])
-        losses["state words"] = DESCRIBED * state
+        spatial = cross_entropy(logits[row, at - 1].float(), labels[row, at])
+        losses["spatial words"] = SPATIAL * spatial
     return losses
 
 
@@ -195,10 +201,10 @@ class BaseTrainer:
     def _train_step(self, name: str, stage: StageConfig) -> dict[str, float]:
         """Take one optimizer step, and return the losses."""
         self.model.train()
-        samples = self.sampler.batch(name, self.step, stage.batch)
+        samples = self.sampler.make_batch(name, self.step, stage.batch)
         batch, targets = self.collate(samples)
         for group in self.optimizer.param_groups:
-            group["lr"] = stage.lr * schedule(self.step, stage.steps)
+            group["lr"] = stage.lr * learning_rate_factor(self.step, stage.steps)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.cfg.precision == "bf16"):
             losses = LOSSES[name](self.model, self.heads, batch, targets)
         loss = sum(losses.values())
@@ -232,13 +238,13 @@ class BaseTrainer:
             "optimizer": self.optimizer.state_dict(),
             "journal": (self.folder / JOURNAL).stat().st_size,
         }
-        part = self.folder / f"{STATE}.tmp"
+        part = self.folder / f"{CHECKPOINT}.tmp"
         torch.save(state, part)
-        os.replace(part, self.folder / STATE)
+        os.replace(part, self.folder / CHECKPOINT)
         plot_curves(read_journal(self.folder), self.folder / CURVES)
 
     def _load(self) -> None:
-        path = self.folder / STATE
+        path = self.folder / CHECKPOINT
         journal = self.folder / JOURNAL
         if not path.exists():
             if rank() == 0:
@@ -260,12 +266,11 @@ class BaseTrainer:
         log.info("resuming at step %d of stage %s", self.step, [*STAGES, "end"][self.stage])
 
 
-def schedule(step: int, steps: int, warmup: int = 40, least: float = 0.05) -> float:
+def learning_rate_factor(step: int, steps: int) -> float:
     """Return the learning rate at a step as a share of the peak: a linear warm-up, then a cosine
-    down to `least`."""
-    return min(1, (step + 1) / warmup) * (
-        least + (1 - least) * (1 + math.cos(math.pi * step / steps)) / 2
-    )
+    down to `LEAST_RATE`."""
+    cosine = (1 + math.cos(math.pi * step / steps)) / 2
+    return min(1, (step + 1) / WARMUP_STEPS) * (LEAST_RATE + (1 - LEAST_RATE) * cosine)
 
 
 def build_trainer(
@@ -282,22 +287,24 @@ def build_trainer(
         cfg: Settings whose train.precision is bf16 or fp32, not auto.
         held_out: Items on which the base is measured.
     """
-    words = first_tokens(processor)
+    words = first_token_ids(processor)
     objects = {kind: words[kind] for kind in WORDS}
     heads = OracleHeads(model.get_input_embeddings(), objects)
     collate = OracleCollator(processor, cfg.student.max_length)
-    samples = [sampler.sample(item, None, "held out") for item in held_out]
-    worded = {kind: [sampler.sample(i, kind, "held out") for i in held_out[::2]] for kind in KINDS}
+    samples = [sampler.make_sample(item, None, "held out") for item in held_out]
+    worded = {
+        kind: [sampler.make_sample(i, kind, "held out") for i in held_out[::2]] for kind in KINDS
+    }
     probe = Probe(model, heads, collate, samples, worded, words, cfg.train.precision == "bf16")
     tokenizer = processor.tokenizer.backend_tokenizer.to_str()
     digest = hashlib.sha256(tokenizer.encode()).hexdigest()[:16]
     return BaseTrainer(cfg.train, model, heads, collate, sampler, probe, run.folder, digest)
 
 
-def first_tokens(processor: ProcessorMixin) -> dict[str, list[int]]:
+def first_token_ids(processor: ProcessorMixin) -> dict[str, list[int]]:
     """Return the first tokens of the words for objects, places, motion and relations, by kind."""
     encode = processor.tokenizer.encode
     return {
         kind: [encode(f" {word}", add_special_tokens=False)[0] for word in words]
-        for kind, words in (WORDS | STATE_WORDS).items()
+        for kind, words in (WORDS | SPATIAL_WORDS).items()
     }

@@ -15,7 +15,7 @@ from train.tiny_base.heads import OracleHeads
 from train.tiny_base.oracle_targets import PICTURES
 from train.tiny_base.samples import OracleCollator, OracleSample
 from train.tiny_base.trace import SPEAKING
-from train.tiny_base.training import first_tokens
+from train.tiny_base.training import first_token_ids
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def sampler(items: list[SelectionItem], frames: FrameReader) -> ItemSampler:
 
 @pytest.fixture(scope="module")
 def samples(sampler: ItemSampler) -> list[OracleSample]:
-    return [sampler.sample(item, "compare", "test") for item in sampler.items[:3]]
+    return [sampler.make_sample(item, "compare", "test") for item in sampler.items[:3]]
 
 
 @pytest.fixture
@@ -57,6 +57,6 @@ def deep_model(model, request: pytest.FixtureRequest):
 
 @pytest.fixture
 def heads(deep_model, processor) -> OracleHeads:
-    words = first_tokens(processor)
+    words = first_token_ids(processor)
     kinds = {kind: words[kind] for kind in ("color", "material", "shape")}
     return OracleHeads(deep_model.get_input_embeddings(), kinds)

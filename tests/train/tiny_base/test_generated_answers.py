@@ -22,7 +22,7 @@ def measure(micro_store: Store, model, processor, student_cfg, monkeypatch: pyte
 
     def measure_answers(change) -> dict[str, float]:
         true = [
-            sampler.ask(item, kind, "held out")[1].answer
+            sampler.ask_question(item, kind, "held out")[1].answer
             for kind in generated_answers.SECTIONS
             for item in items[: generated_answers.BATCH]
         ]

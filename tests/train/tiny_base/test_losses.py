@@ -7,7 +7,13 @@ import torch
 from torch.nn.functional import one_hot
 
 from data.records import LETTERS
-from train.tiny_base.heads import SCALES, OracleHeads, distance, measure_spread, octant
+from train.tiny_base.heads import (
+    SCALES,
+    OracleHeads,
+    heading_octant,
+    measure_spread,
+    regression_loss,
+)
 from train.tiny_base.oracle_targets import AHEAD, PICTURES, UNSEEN_DISTANCE
 from train.tiny_base.pointing import pointing_losses
 from train.tiny_base.trace import (
@@ -24,7 +30,7 @@ from train.tiny_base.training import motion_losses, words_losses
 
 
 def test_texts_without_pictures_have_losses(sampler, collate, deep_model, heads) -> None:
-    batch, targets = collate([sampler.sample(i, "narrate", "test") for i in sampler.items[:3]])
+    batch, targets = collate([sampler.make_sample(i, "narrate", "test") for i in sampler.items[:3]])
     losses = words_losses(deep_model, heads, batch, targets)
     assert {"words", "spelled color", "verdict", "repeat"} <= losses.keys()
     assert not {"color", "place", "named places", "find 0", "label", "find shown"} & losses.keys()
@@ -137,7 +143,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(sampler, collate
         def log_attention(self, layer, head, row, query, key):
             return torch.zeros(len(row))
 
-    _, targets = collate([sampler.sample(i, "compare", "test") for i in sampler.items[:8]])
+    _, targets = collate([sampler.make_sample(i, "compare", "test") for i in sampler.items[:8]])
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
         "before", "second before", "track clip", *(f"find {k}" for k in range(PICTURES)), "subject",
@@ -151,16 +157,16 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(sampler, collate
 def test_unknown_values_do_not_count() -> None:
     true = torch.tensor([[0.2, 0.1], [float("nan")] * 2])
     predicted = torch.tensor([[0.6, 0.3], [9.0, 9.0]])
-    assert distance(predicted, true, 3.0).item() == pytest.approx(0, abs=1e-12)
-    assert distance(predicted, true * float("nan"), 3.0).item() == 0
-    assert distance(predicted + 0.2, true, 3.0).item() == pytest.approx(2 * (0.2 - 0.05))
+    assert regression_loss(predicted, true, 3.0).item() == pytest.approx(0, abs=1e-12)
+    assert regression_loss(predicted, true * float("nan"), 3.0).item() == 0
+    assert regression_loss(predicted + 0.2, true, 3.0).item() == pytest.approx(2 * (0.2 - 0.05))
 
 
 def test_headings_are_eighths_of_the_circle() -> None:
     angles = torch.arange(0, 360, 45) * torch.pi / 180
     vectors = torch.stack([angles.cos(), angles.sin()], dim=1)
-    assert len(octant(vectors).unique()) == 8
-    assert octant(vectors * 3 + 0.01).equal(octant(vectors))
+    assert len(heading_octant(vectors).unique()) == 8
+    assert heading_octant(vectors * 3 + 0.01).equal(heading_octant(vectors))
 
 
 def test_spread_is_the_mean_distance_from_the_mean_place() -> None:

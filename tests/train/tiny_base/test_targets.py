@@ -114,7 +114,7 @@ def test_names_end_where_the_text_names_objects(samples, collate, processor) -> 
         text = processor.decode(batch["input_ids"][row, : position + 1])
         assert text.endswith(("cube", "sphere", "cylinder"))
     for (row, position), found, places in zip(
-        targets.names.tolist(), targets.found.tolist(), targets.places, strict=True
+        targets.names.tolist(), targets.name_tokens.tolist(), targets.name_places, strict=True
     ):
         text = processor.decode(batch["input_ids"][row, : position + 1])
         for k, token in enumerate(found):
@@ -144,7 +144,7 @@ def test_candidates_are_compared_with_the_earlier_ones() -> None:
 
 
 def test_objects_are_recognised_in_the_earlier_candidates(sampler, collate) -> None:
-    samples = [sampler.sample(item, "compare", "test") for item in sampler.items[:6]]
+    samples = [sampler.make_sample(item, "compare", "test") for item in sampler.items[:6]]
     _, targets = collate(samples)
     assert len(targets.tracked_to_candidates) > 20
     for row, token, earlier, other in targets.tracked_to_candidates.tolist():
@@ -163,13 +163,13 @@ def next_names(targets: OracleTargets, pairs: torch.Tensor) -> Iterator[tuple[in
     positions = {(row, at): m for m, (row, at) in enumerate(targets.names.tolist())}
     for row, before, token in pairs.tolist():
         name = min(at for r, at in positions if r == row and at > before)
-        yield token, targets.found[positions[row, name]].tolist()
+        yield token, targets.name_tokens[positions[row, name]].tolist()
 
 
 def test_new_names_refer_to_the_object_in_the_last_candidate_that_shows_it(
     sampler, collate
 ) -> None:
-    samples = [sampler.sample(item, "explain", "test") for item in sampler.items[:6]]
+    samples = [sampler.make_sample(item, "explain", "test") for item in sampler.items[:6]]
     _, targets = collate(samples)
     assert len(targets.next_in_candidates) > 10
     for token, found in next_names(targets, targets.next_in_candidates):
@@ -177,7 +177,7 @@ def test_new_names_refer_to_the_object_in_the_last_candidate_that_shows_it(
 
 
 def test_scene_parses_refer_to_the_object_that_they_name_next(sampler, collate) -> None:
-    samples = [sampler.sample(item, "parse", "test") for item in sampler.items[:6]]
+    samples = [sampler.make_sample(item, "parse", "test") for item in sampler.items[:6]]
     _, targets = collate(samples)
     assert len(targets.next_in_clip) > 10
     for token, found in next_names(targets, targets.next_in_clip):
@@ -185,8 +185,8 @@ def test_scene_parses_refer_to_the_object_that_they_name_next(sampler, collate) 
 
 
 def test_pictures_refer_to_the_letters_of_their_candidates(sampler, collate, processor) -> None:
-    samples = [sampler.sample(item, "describe", "test") for item in sampler.items[:3]]
-    samples += [sampler.sample(sampler.items[3], "explain", "test")]
+    samples = [sampler.make_sample(item, "describe", "test") for item in sampler.items[:3]]
+    samples += [sampler.make_sample(sampler.items[3], "explain", "test")]
     for some in (samples[:3], samples[3:]):
         batch, targets = collate(some)
         assert len(targets.prompt_letters) == len(some) * 4 * GRID**2
@@ -197,26 +197,26 @@ def test_pictures_refer_to_the_letters_of_their_candidates(sampler, collate, pro
 
 
 def test_names_refer_to_the_picture_that_the_text_speaks_of(sampler, collate, processor) -> None:
-    samples = [sampler.sample(item, "explain", "test") for item in sampler.items[:8]]
+    samples = [sampler.make_sample(item, "explain", "test") for item in sampler.items[:8]]
     batch, targets = collate(samples)
     letters = {(row, at): letter for row, at, letter in targets.text_letters.tolist()}
     names = {(row, at): m for m, (row, at) in enumerate(targets.names.tolist())}
     assert len(letters) > 20
-    assert len(targets.shown) > 40
-    for row, at, token in targets.shown.tolist():
+    assert len(targets.described_tokens) > 40
+    for row, at, token in targets.described_tokens.tolist():
         picture = 0
         if letter := letters.get((row, at)):
             word = processor.tokenizer.decode(batch["input_ids"][row, letter]).strip()
             picture = 1 + LETTERS.index(word)
-        assert token == targets.found[names[row, at], picture]
+        assert token == targets.name_tokens[names[row, at], picture]
 
 
 def test_names_of_unseen_objects_refer_to_the_first_token(sampler, collate) -> None:
     crossed = [item for item in sampler.items if "cross" in item.item_id]
-    samples = [sampler.sample(item, "describe", "test") for item in crossed[:6]]
+    samples = [sampler.make_sample(item, "describe", "test") for item in crossed[:6]]
     batch, targets = collate(samples)
     assert targets.has_picture.tolist() == [[False, True, True, True, True]] * len(samples)
-    row, _, token = targets.shown.T
+    row, _, token = targets.described_tokens.T
     assert (token < 0).sum() > 5
     positions = locate_objects(row, token, targets)
     seen = token >= 0
@@ -237,10 +237,10 @@ def test_repeated_names_refer_to_their_last_mention(samples, collate, processor)
 
 
 def test_spoken_states_are_those_of_the_oracle(sampler, collate, processor) -> None:
-    samples = (sampler.sample(item, "explain", "test") for item in sampler.items)
+    samples = (sampler.make_sample(item, "explain", "test") for item in sampler.items)
     explained = next(s for s in samples if "Outcome:" in s.sample.response)
     _, targets = collate([explained])
-    assert len(targets.spoken_state) == len(targets.spoken) > 20
+    assert len(targets.description_states) == len(targets.description_tokens) > 20
     text = TokenizedText(explained.sample.response, processor.tokenizer)
     shown = {(t.picture, t.name): t.place for t in explained.targets}
     compared = set()
@@ -259,10 +259,10 @@ def test_spoken_states_are_those_of_the_oracle(sampler, collate, processor) -> N
 
 
 def test_offsets_lead_from_the_owner_to_the_object(sampler, collate) -> None:
-    samples = [sampler.sample(item, "describe", "test") for item in sampler.items[:12]]
+    samples = [sampler.make_sample(item, "describe", "test") for item in sampler.items[:12]]
     _, targets = collate(samples)
-    at = [tuple(position) for position in targets.spoken.tolist()]
-    states = dict(zip(at, targets.spoken_state, strict=True))
+    at = [tuple(position) for position in targets.description_tokens.tolist()]
+    states = dict(zip(at, targets.description_states, strict=True))
     owners = {(row, k): (row, owner) for row, k, owner in targets.owners.tolist()}
     assert len(owners) > 20
     compared = 0
@@ -293,21 +293,23 @@ def test_observed_states_are_those_of_the_cut(micro_store: Store, items) -> None
 
 
 def test_samples_depend_on_seed_and_step_only(sampler: ItemSampler) -> None:
-    first, again, later = (sampler.batch("words", step, 4) for step in (1, 1, 1 + len(KINDS)))
+    first, again, later = (sampler.make_batch("words", step, 4) for step in (1, 1, 1 + len(KINDS)))
     assert [s.sample.response for s in first] == [s.sample.response for s in again]
     assert [s.sample.response for s in first] != [s.sample.response for s in later]
     epoch = [
-        s.sample.sample_id for k in range(len(sampler.items)) for s in sampler.batch("motion", k, 1)
+        s.sample.sample_id
+        for k in range(len(sampler.items))
+        for s in sampler.make_batch("motion", k, 1)
     ]
     assert sorted(epoch) == sorted(item.item_id for item in sampler.items)
 
 
 def test_ranks_share_the_samples_of_a_step(sampler: ItemSampler, monkeypatch) -> None:
-    whole = [s.sample.response for s in sampler.batch("words", 3, 4)]
+    whole = [s.sample.response for s in sampler.make_batch("words", 3, 4)]
     monkeypatch.setenv("LOCAL_RANK", "0")
     monkeypatch.setenv("WORLD_SIZE", "2")
     parts = []
     for rank in ("0", "1"):
         monkeypatch.setenv("RANK", rank)
-        parts.append([s.sample.response for s in sampler.batch("words", 3, 4)])
+        parts.append([s.sample.response for s in sampler.make_batch("words", 3, 4)])
     assert parts == [whole[::2], whole[1::2]]

@@ -23,7 +23,7 @@ from tests.user_errors import raises_user_error
 from train.base import main
 from train.common.held_out import held_out_scenes
 from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
-from train.tiny_base.training import STATE, BaseTrainer, build_trainer, schedule
+from train.tiny_base.training import CHECKPOINT, BaseTrainer, build_trainer, learning_rate_factor
 
 pytestmark = pytest.mark.slow
 
@@ -122,7 +122,7 @@ def test_command_saves_a_base_that_can_be_loaded(cfg, tmp_path: Path) -> None:
     model, processor = loading.load_base(student, "bf16", list)
     assert {p.dtype for p in model.parameters()} <= {torch.float32, torch.bfloat16}
     assert processor.image_processor.patch_size == cfg.student.architecture.patch
-    assert (run.folder / STATE).exists()
+    assert (run.folder / CHECKPOINT).exists()
 
 
 def test_no_held_out_scene_is_trained_on(micro_store: Store, frames: FrameReader) -> None:
@@ -146,7 +146,7 @@ def test_unsuitable_models_are_refused(override: str, message: str) -> None:
 
 
 def test_schedule_warms_up_and_decays() -> None:
-    rates = [schedule(step, 1000) for step in range(1000)]
+    rates = [learning_rate_factor(step, 1000) for step in range(1000)]
     assert rates[0] < 0.05
     assert max(rates) == pytest.approx(1, abs=0.01)
     assert rates[-1] == pytest.approx(0.05, abs=0.001)
