@@ -124,6 +124,8 @@ class OracleTargets:
         repeats: (_, 3) row, position before a name that the text has mentioned before, and position
             of the first token of its last mention.
         text_tokens: (_, 2) row and position of the tokens of texts.
+        object_words: (_, 2) row and position of the tokens of colours, materials and shapes in
+            texts.
         spatial_words: (_, 2) row and position of the tokens of words for places, motion and
             relations in texts.
         verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
@@ -160,6 +162,7 @@ class OracleTargets:
     prompt_letters: Tensor
     repeats: Tensor
     text_tokens: Tensor
+    object_words: Tensor
     spatial_words: Tensor
     verdicts: Tensor
     comparisons: Tensor

@@ -30,6 +30,7 @@ from train.tiny_base.oracle_targets import (
     PICTURES,
     SPATIAL_WORDS,
     UNKNOWN,
+    WORDS,
     ObjectTarget,
     OracleTargets,
     clip_targets,
@@ -98,7 +99,10 @@ class OracleCollator:
     def __init__(self, processor: ProcessorMixin, max_length: int) -> None:
         self._processor = processor
         self._collate = Collator(processor, max_length)
-        self._spatial_ids = spatial_token_ids(processor.tokenizer)
+        self._word_ids = {
+            "object_words": object_token_ids(processor.tokenizer),
+            "spatial_words": spatial_token_ids(processor.tokenizer),
+        }
 
     def __call__(self, samples: Sequence[OracleSample]) -> tuple[dict[str, Any], OracleTargets]:
         batch = self._collate([s.sample for s in samples])
@@ -110,7 +114,8 @@ class OracleCollator:
         mentions: list[LocatedMention] = []
         pairs: dict[str, list[tuple[int, ...]]] = {
             "prompt_letters": [*self._find_letters(ids, visual, samples, grid)],
-            "text_tokens": [], "spatial_words": [], "verdicts": [], "comparisons": [],
+            "text_tokens": [], "object_words": [], "spatial_words": [], "verdicts": [],
+            "comparisons": [],
         }  # fmt: skip
         for row, (sample, text) in enumerate(zip(samples, texts, strict=True)):
             # The token that ends the turn follows the response.
@@ -118,9 +123,8 @@ class OracleCollator:
             mentions += locate_mentions(sample, text, row, start, grid)
             tokens = range(start, start + len(text))
             pairs["text_tokens"] += [(row, k) for k in tokens]
-            pairs["spatial_words"] += [
-                (row, k) for k in tokens if int(ids[row, k]) in self._spatial_ids
-            ]
+            for group, word_ids in self._word_ids.items():
+                pairs[group] += [(row, k) for k in tokens if int(ids[row, k]) in word_ids]
             pairs["verdicts"] += [
                 (row, start + letter - 1, start + agrees) for letter, agrees in text.verdicts()
             ]
@@ -142,6 +146,12 @@ class OracleCollator:
             for letter, picture in zip(letters, tokens[sample.last + 1 :], strict=False):
                 before = (ids[row, : picture[0]] == letter).nonzero()
                 yield from ((row, int(token), int(before[-1])) for token in picture)
+
+
+def object_token_ids(tokenizer: PreTrainedTokenizerBase) -> set[int]:
+    """Return the tokens of the words for colours, materials and shapes."""
+    words = [word for words in WORDS.values() for word in words]
+    return {i for word in words for i in tokenizer.encode(f" {word}", add_special_tokens=False)}
 
 
 def spatial_token_ids(tokenizer: PreTrainedTokenizerBase) -> set[int]:
@@ -289,6 +299,7 @@ def stack_samples(
         prompt_letters=integers(pairs["prompt_letters"], 3),
         repeats=integers([*find_repeats(mentions)], 3),
         text_tokens=integers(pairs["text_tokens"], 2),
+        object_words=integers(pairs["object_words"], 2),
         spatial_words=integers(pairs["spatial_words"], 2),
         verdicts=integers(pairs["verdicts"], 3),
         comparisons=integers(pairs["comparisons"], 3),

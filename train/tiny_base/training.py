@@ -67,8 +67,9 @@ POINTING = 1.0
 """Weight of the losses of attention heads."""
 NAMED = 3.0
 """Weight of the losses of places and motion in texts."""
-SPATIAL = 1.0
-"""Weight of the words for places, motion and relations, which are a tenth of all words."""
+WORD_GROUPS = {"object words": 1.0, "spatial words": 1.0}
+"""Weights of the words for colours, materials and shapes, and of those for places, motion and
+relations. They are a third and a tenth of all words, and harder to predict than the others."""
 
 
 def eyes_losses(
@@ -107,12 +108,14 @@ def words_losses(
         losses |= {f"spelled {kind}": DENSE * loss for kind, loss in spelled.items()}
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()
     losses["words"] = cross_entropy(predicted, following, ignore_index=IGNORED)
-    row, at = targets.spatial_words.T
-    if len(row):
-        # The logits and labels are those of the last tokens.
-        at = at - (batch["input_ids"].shape[1] - labels.shape[1])
-        spatial = cross_entropy(logits[row, at - 1].float(), labels[row, at])
-        losses["spatial words"] = SPATIAL * spatial
+    # The logits and labels are those of the last tokens.
+    start = batch["input_ids"].shape[1] - labels.shape[1]
+    groups = {"object words": targets.object_words, "spatial words": targets.spatial_words}
+    for name, tokens in groups.items():
+        row, at = tokens.T
+        if len(row):
+            predicted = logits[row, at - start - 1].float()
+            losses[name] = WORD_GROUPS[name] * cross_entropy(predicted, labels[row, at - start])
     return losses
 
 
