@@ -177,6 +177,26 @@ def lora_config(group: str, lora: LoraConfig, task_type: str | None = None) -> I
         ) from error
 
 
+def load_to_continue(
+    cfg: StudentConfig, precision: str, folder: Path
+) -> tuple[nn.Module, ProcessorMixin]:
+    """Load a trained student to train it further: adapters and their base, or a whole model.
+
+    Raises:
+        UserError: As `load_trained`.
+    """
+    import peft
+
+    if not cfg.lora.rank:
+        return load_student(replace(cfg, model=str(folder), architecture=None), precision, list)
+    base, processor = load_base(cfg, precision, list)
+    base.config.use_cache = base.config.get_text_config().use_cache = False
+    keep_differentiable(base)
+    with explain_damage(folder):
+        check_adapters(folder, base, cfg.lora.rank, cfg.model)
+        return peft.PeftModel.from_pretrained(base, folder, is_trainable=True), processor
+
+
 def load_trained(
     cfg: StudentConfig, precision: str, folder: Path
 ) -> tuple[nn.Module, ProcessorMixin]:

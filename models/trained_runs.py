@@ -84,7 +84,8 @@ def trained_settings(
                 f"{key}={folder} contains an export: give {key}={folder / product}",
                 code="missing-run",
             )
-        if not OmegaConf.is_dict(saved) or product not in saved:
+        source = saved.get("model") if OmegaConf.is_dict(saved) else None
+        if source is None and (not OmegaConf.is_dict(saved) or product not in saved):
             raise UserError(
                 f"{key}={folder} is not a run that trained a {product}", code="missing-run"
             )
@@ -94,6 +95,9 @@ def trained_settings(
                 f"{key}={folder} is not finished: run its command again to resume it",
                 code="unfinished-run",
             )
+        if source is not None:
+            # train.distill trains the student of another run further.
+            return trained_settings(Path(source), schema, product, f"the model of {folder}, {key}")
         settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), saved))
     except FileNotFoundError as error:
         raise UserError(
@@ -139,6 +143,8 @@ def resolve_model(
         return None, cfg
     folder = Path(cfg.model)
     settings = trained_settings(folder, schema, product, key)
+    if product == "student":
+        check_sees_frames(folder, settings.train.facts, key)
     check_unseen(f"{key}={folder}", settings.benchmark, benchmark)
     _check_base_unseen(getattr(settings, product).model, benchmark)
     _apply_overrides(settings, cfg, product, overrides, key)
@@ -212,6 +218,16 @@ def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) 
             "was trained on: set both as in training, or simulate other scenes with another "
             "benchmark.seed",
             code="training-scenes-tested",
+        )
+
+
+def check_sees_frames(folder: Path, facts: bool, key: str = "model") -> None:
+    """Raise UserError if a student was trained on facts (`train.facts`) instead of frames."""
+    if facts:
+        raise UserError(
+            f"{key}={folder} was trained with train.facts=true, on facts instead of frames: it can "
+            "only be the teacher of train.distill, as teacher_model",
+            code="facts-instead-of-frames",
         )
 
 

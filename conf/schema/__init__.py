@@ -12,6 +12,7 @@ from conf.schema.commands import (
     BuildCommand,
     CommandConfig,
     ContrastiveCommand,
+    DistillCommand,
     ExportCommand,
     ExportModelCommand,
     GalleryCommand,
@@ -41,8 +42,10 @@ from conf.schema.servers import ServerConfig, ServersConfig, TeacherConfig
 from conf.schema.training import (
     BaseTrainConfig,
     ContrastiveTrainConfig,
+    DistillTrainConfig,
     SftTrainConfig,
     StageConfig,
+    StudentTrainConfig,
     TrainConfig,
 )
 from conf.schema.world import CameraConfig, PartConfig, PhysicsConfig, WorldConfig

@@ -12,7 +12,12 @@ from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import TeacherConfig
 from conf.schema.settings import Settings, check_run, setting
-from conf.schema.training import BaseTrainConfig, ContrastiveTrainConfig, SftTrainConfig
+from conf.schema.training import (
+    BaseTrainConfig,
+    ContrastiveTrainConfig,
+    DistillTrainConfig,
+    SftTrainConfig,
+)
 
 PARALLEL_BACKENDS = ("loky", "ray")
 BASE_LAYERS, BASE_HEADS = 6, 6
@@ -131,6 +136,26 @@ class SftCommand(CommandConfig):
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
     seed: int = setting(0, least=0)
     """Seed of the order of the samples and of the initial adapter weights."""
+
+
+@dataclass
+class DistillCommand(CommandConfig):
+    model: str | None = None
+    """Folder of the run of train.sft whose student is trained further."""
+    teacher_model: str | None = None
+    """Folder of the run that trained the teacher, for example with train.sft train.facts=true; null
+    uses the student itself, as it is at the start. The teacher reads the facts of an item as text
+    instead of its frames, and needs the student's tokenizer."""
+    train: DistillTrainConfig = field(default_factory=DistillTrainConfig)
+    seed: int = setting(0, least=0)
+    """Seed of the order of the items and of the sampled responses."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        if self.model is None:
+            yield (
+                f"{group}model is missing: give the folder of a run of train.sft, such as "
+                "model=checkpoints/sft/exp-cot"
+            )
 
 
 @dataclass

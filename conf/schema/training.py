@@ -61,12 +61,9 @@ class TrainConfig(Settings):
 
 
 @dataclass
-class SftTrainConfig(TrainConfig):
-    regime: str = setting("cot", REGIMES)
-    """Content of the responses that the student is trained on: cot (the rationale; one line per
-    candidate that says whether it matches; the answer), cot_no_candidate_analysis (cot, but the
-    rationale has no candidate analysis), cot_no_match_layout (cot without the lines per candidate),
-    or answer_only (the answer)."""
+class StudentTrainConfig(TrainConfig):
+    """Training settings that `train.sft` and `train.distill` share."""
+
     batch: int = setting(16, least=1)
     """Number of samples per optimizer step, over all micro-batches and ranks."""
     micro_batch: int = setting(1, least=1)
@@ -86,6 +83,30 @@ class SftTrainConfig(TrainConfig):
         yield from super().find_problems(group)
         if self.micro_batch > 0 and self.batch % self.micro_batch:
             yield f"{group}micro_batch={self.micro_batch} must divide {group}batch={self.batch}"
+
+
+@dataclass
+class SftTrainConfig(StudentTrainConfig):
+    regime: str = setting("cot", REGIMES)
+    """Content of the responses that the student is trained on: cot (the rationale; one line per
+    candidate that says whether it matches; the answer), cot_no_candidate_analysis (cot, but the
+    rationale has no candidate analysis), cot_no_match_layout (cot without the lines per candidate),
+    or answer_only (the answer)."""
+    facts: bool = False
+    """Give the facts of an item as text instead of its frames. A model that is trained so scores
+    the texts of students in train.distill; it cannot be evaluated."""
+
+
+@dataclass
+class DistillTrainConfig(StudentTrainConfig):
+    epochs: float = 1.0
+    """Number of responses that are sampled for each training item."""
+    temperature: float = setting(1.0, above=0)
+    """Temperature at which responses are sampled."""
+    weight: float = setting(1.0, least=0, most=1)
+    """Weight of the teacher in the divergence: 1 is the reverse Kullback-Leibler divergence of the
+    student from the teacher, 0 the forward one; between, the generalised Jensen-Shannon divergence
+    (Agarwal et al. 2024)."""
 
 
 @dataclass

@@ -17,7 +17,7 @@ from evaluation.metrics.results import RetrievalReport, SelectionReport, StudyRe
 from evaluation.reporting.run_responses import Responses, read_responses, reading
 
 SELECTION_KINDS, RETRIEVAL_KINDS = ("select", "similarity"), ("retrieve", "two_stage")
-STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "contrastive")
+STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "distill", "contrastive")
 REPORT_TYPES = {
     **dict.fromkeys(SELECTION_KINDS, SelectionReport),
     **dict.fromkeys(RETRIEVAL_KINDS, RetrievalReport),

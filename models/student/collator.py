@@ -73,7 +73,9 @@ def encode(
     types = prompt.pop("mm_token_type_ids")[0].tolist()
     prompt.pop("attention_mask")
     response = []
-    if sample.response is not None:
+    if sample.response_ids is not None:
+        response = list(sample.response_ids)
+    elif sample.response is not None:
         response = processor.tokenizer.encode(sample.response, add_special_tokens=False)
         response.append(processor.tokenizer.eos_token_id)
     if len(ids) + len(response) > max_length:
