@@ -100,8 +100,12 @@ def is_inside(path: str, folder: str) -> bool:
     return bool(path) and not os.path.relpath(path, folder).startswith("..")
 
 
-def runs_folder(checkpoints: str, product: str) -> str:
-    """Folder of the runs that train a product (student or retriever), below `checkpoints`."""
+def runs_folder(checkpoints: str, product: str, run: str = "") -> str:
+    """Folder to which the names of the runs that train a product (student or retriever) are
+    relative. If `run` is the folder of a run of train.distill, this is `checkpoints`, so that the
+    run's name begins with "distill/"."""
+    if product == "student" and is_inside(run, f"{checkpoints}/distill"):
+        return checkpoints
     return f"{checkpoints}/{TRAINER_FOLDERS.get(product, product)}"
 
 

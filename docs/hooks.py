@@ -19,6 +19,7 @@ GROUPS = {
     "student": schema.StudentConfig,
     "retriever": schema.RetrieverConfig,
     "train, of a student": schema.SftTrainConfig,
+    "train, of a student in distillation": schema.DistillTrainConfig,
     "train, of a retriever": schema.ContrastiveTrainConfig,
     "server": schema.ServerConfig,
 }

@@ -19,7 +19,8 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
   `get_batch_sampler`, `collect_features` and `add_model_card_callback`.
 - `train.retriever.inputs` adds an input in a forward pre-hook of sentence-transformers'
   `Transformer`, which passes it on to its model.
-- `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer.
+- `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer, and
+  `train.student.distillation` overrides `get_batch_samples` and calls `_get_num_items_in_batch`.
 """
 
 from __future__ import annotations

@@ -19,6 +19,10 @@ from models.resolved import read_resolved, with_resolved_commit
 EXPORT = "export.json"
 """A file that only the folders that `train.export` writes contain."""
 
+STUDENT_SETTINGS = "student.yaml"
+"""A file in runs of train.distill: the settings of the trained student, in the form of those of
+train.sft."""
+
 EVALUATION_SETTINGS = {
     "student": ("temperature", "top_p", "top_k", "max_new_tokens", "max_length"),
     "retriever": ("widths", "max_length"),
@@ -61,6 +65,13 @@ def product_folder(folder: Path, product: str) -> Path:
     return folder if (folder / EXPORT).exists() else folder / product
 
 
+def settings_file(folder: Path) -> Path:
+    """Return the file with the settings of a trained model: student.yaml of a run of train.distill,
+    which takes most settings from another run, or else config.yaml."""
+    path = folder / STUDENT_SETTINGS
+    return path if path.exists() else folder / "config.yaml"
+
+
 def trained_settings(
     folder: Path, schema: type[Command], product: str, key: str = "model"
 ) -> Command:
@@ -76,7 +87,7 @@ def trained_settings(
         UserError: `folder` is not the folder of a run or an export of this product, the run is not
             finished, or its settings are damaged.
     """
-    config = folder / "config.yaml"
+    config = settings_file(folder)
     try:
         saved = OmegaConf.load(config)
         if (folder / product / EXPORT).exists():
@@ -84,8 +95,7 @@ def trained_settings(
                 f"{key}={folder} contains an export: give {key}={folder / product}",
                 code="missing-run",
             )
-        source = saved.get("model") if OmegaConf.is_dict(saved) else None
-        if source is None and (not OmegaConf.is_dict(saved) or product not in saved):
+        if not OmegaConf.is_dict(saved) or product not in saved:
             raise UserError(
                 f"{key}={folder} is not a run that trained a {product}", code="missing-run"
             )
@@ -95,9 +105,6 @@ def trained_settings(
                 f"{key}={folder} is not finished: run its command again to resume it",
                 code="unfinished-run",
             )
-        if source is not None:
-            # train.distill trains the student of another run further.
-            return trained_settings(Path(source), schema, product, f"the model of {folder}, {key}")
         settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), saved))
     except FileNotFoundError as error:
         raise UserError(

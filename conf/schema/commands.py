@@ -141,7 +141,8 @@ class SftCommand(CommandConfig):
 @dataclass
 class DistillCommand(CommandConfig):
     model: str | None = None
-    """Folder of the run of train.sft whose student is trained further."""
+    """Folder of the run of train.sft whose student is trained further. It determines the benchmark,
+    the narrator's settings and the student."""
     teacher_model: str | None = None
     """Folder of the run that trained the teacher, for example with train.sft train.facts=true; null
     uses the student itself, as it is at the start. The teacher reads the facts of an item as text
@@ -149,13 +150,6 @@ class DistillCommand(CommandConfig):
     train: DistillTrainConfig = field(default_factory=DistillTrainConfig)
     seed: int = setting(0, least=0)
     """Seed of the order of the items and of the sampled responses."""
-
-    def find_problems(self, group: str) -> Iterator[str]:
-        if self.model is None:
-            yield (
-                f"{group}model is missing: give the folder of a run of train.sft, such as "
-                "model=checkpoints/sft/exp-cot"
-            )
 
 
 @dataclass
@@ -223,9 +217,10 @@ class ContrastiveCommand(CommandConfig):
 @dataclass
 class ExportModelCommand(CommandConfig):
     product: str = setting("student", tuple(TRAINER_FOLDERS))
-    """Model to export: student (trained by train.sft) or retriever (by train.contrastive)."""
+    """Model to export: student (trained by train.sft or train.distill) or retriever (by
+    train.contrastive)."""
     run: str = "default"
-    """Training run to export: its name or its folder."""
+    """Training run to export: its name or its folder. A run of train.distill needs its folder."""
     format: str = setting("bf16", ("bf16", "fp32", "adapter"))
     """bf16 and fp32 merge the adapters into the dequantised base and write the weights in that
     precision; adapter writes only the adapters."""
@@ -237,4 +232,4 @@ class ExportModelCommand(CommandConfig):
         for other in TRAINER_FOLDERS:
             if other != self.product and is_inside(self.run, runs_folder(self.checkpoints, other)):
                 return [f"run={self.run} trained a {other}: give product={other}"]
-        return check_run(self.run, runs_folder(self.checkpoints, self.product))
+        return check_run(self.run, runs_folder(self.checkpoints, self.product, self.run))

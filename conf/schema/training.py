@@ -68,9 +68,6 @@ class StudentTrainConfig(TrainConfig):
     """Number of samples per optimizer step, over all micro-batches and ranks."""
     micro_batch: int = setting(1, least=1)
     """Number of samples per forward pass on each rank; changes memory and speed, not the result."""
-    reuse_features: bool = False
-    """Cache the frozen vision tower's features of each frame in up to half of the free memory. With
-    an 8B model, the features of a frame take about 3 MB."""
     permute_candidates: bool = False
     """Shuffle the order of each item's candidates in every epoch."""
     validation_items: int = setting(64, least=1)
@@ -93,20 +90,33 @@ class SftTrainConfig(StudentTrainConfig):
     rationale has no candidate analysis), cot_no_match_layout (cot without the lines per candidate),
     or answer_only (the answer)."""
     facts: bool = False
-    """Give the facts of an item as text instead of its frames. A model that is trained so scores
-    the texts of students in train.distill; it cannot be evaluated."""
+    """Show the facts of an item as text instead of its frames. Such a model can be the teacher of
+    train.distill; it cannot be evaluated."""
+    reuse_features: bool = False
+    """Cache the frozen vision tower's features of each frame in up to half of the free memory. With
+    an 8B model, the features of a frame take about 3 MB."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        yield from super().find_problems(group)
+        if self.facts and self.regime == "answer_only":
+            yield (
+                f"{group}facts=true with {group}regime=answer_only: facts need a regime with "
+                f"rationales, such as {group}regime=cot"
+            )
 
 
 @dataclass
 class DistillTrainConfig(StudentTrainConfig):
+    lr: float = setting(1e-5, above=0)
+    """Peak learning rate."""
     epochs: float = 1.0
-    """Number of responses that are sampled for each training item."""
+    """Number of passes over the training items. Each pass samples one response to each item."""
     temperature: float = setting(1.0, above=0)
     """Temperature at which responses are sampled."""
-    weight: float = setting(1.0, least=0, most=1)
-    """Weight of the teacher in the divergence: 1 is the reverse Kullback-Leibler divergence of the
-    student from the teacher, 0 the forward one; between, the generalised Jensen-Shannon divergence
-    (Agarwal et al. 2024)."""
+    beta: float = setting(1.0, least=0, most=1)
+    """Divergence of the student from the teacher: 1 is the reverse Kullback-Leibler divergence, 0
+    the forward one, and between them the generalised Jensen-Shannon divergence with this weight of
+    the teacher."""
 
 
 @dataclass

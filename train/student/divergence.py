@@ -8,28 +8,27 @@ import torch
 from torch import Tensor
 
 
-def measure_divergence(student: Tensor, teacher: Tensor, weight: float) -> Tensor:
+def measure_divergence(student: Tensor, teacher: Tensor, beta: float) -> Tensor:
     """Return the generalised Jensen-Shannon divergence (N,) of distributions over V tokens.
 
-    With the mixture M = w T + (1 - w) S, it is w KL(T || M) + (1 - w) KL(S || M) (Agarwal et al.
-    2024, "On-Policy Distillation of Language Models"). This vanishes as w approaches 0 or 1, where
-    the limit of its ratio to w or 1 - w is taken: KL(T || S) for w = 0, and KL(S || T) for w = 1.
+    With the mixture M = beta T + (1 - beta) S, it is beta KL(T || M) + (1 - beta) KL(S || M)
+    (Agarwal et al. 2024, "On-Policy Distillation of Language Models"). It vanishes as beta
+    approaches 0 or 1; there the limits of its ratios to beta and to 1 - beta are returned, KL(T ||
+    S) and KL(S || T).
 
     Args:
         student: (N, V) logarithms of the student's probabilities S.
         teacher: (N, V) logarithms of the teacher's probabilities T.
-        weight: The weight w of the teacher, from 0 to 1.
     """
-    if weight == 0:
-        return measure_kl(teacher, student)
-    if weight == 1:
-        return measure_kl(student, teacher)
-    mixture = torch.logaddexp(teacher + math.log(weight), student + math.log(1 - weight))
-    return weight * measure_kl(teacher, mixture) + (1 - weight) * measure_kl(student, mixture)
+    if beta == 0:
+        return kl_divergence(teacher, student)
+    if beta == 1:
+        return kl_divergence(student, teacher)
+    mixture = torch.logaddexp(teacher + math.log(beta), student + math.log(1 - beta))
+    return beta * kl_divergence(teacher, mixture) + (1 - beta) * kl_divergence(student, mixture)
 
 
-def measure_kl(one: Tensor, other: Tensor) -> Tensor:
-    """Return the Kullback-Leibler divergence (N,) of `one` from `other`, both (N, V) logarithms of
-    probabilities. A token without probability in `one` adds nothing."""
-    terms = one.exp() * (one - other)
-    return torch.where(one == -torch.inf, 0.0, terms).sum(dim=-1)
+def kl_divergence(log_p: Tensor, log_q: Tensor) -> Tensor:
+    """Return the Kullback-Leibler divergence KL(p || q) (N,) of distributions (N, V), given as
+    logarithms."""
+    return (log_p.exp() * (log_p - log_q)).sum(dim=-1)

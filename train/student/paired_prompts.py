@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from conf.schema import DistillCommand, SftCommand
-from data.records import Rationale, SelectionItem
+from data.records import Rationale
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.prompts import Sample
@@ -17,7 +17,7 @@ from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
 
 @dataclass(frozen=True)
 class PairedPrompts:
-    """The prompts of student and teacher about one item.
+    """The prompts of student and teacher about one item, without responses.
 
     Attributes:
         letter: The letter of the target.
@@ -33,33 +33,37 @@ class PairedPrompts:
 
 
 def pair_prompts(
-    seen: LazySample, facts: SupervisedItem, teacher: LazySample, seed: int, permute: bool
+    item: SupervisedItem, frames: FrameReader, frame_count: int, seed: int, permute: bool
 ) -> LazySample:
-    """Return the prompts about an item with its frames (`seen`) and with its facts (`teacher`).
+    """Return the prompts about an item: with its frames for the student, and with its facts for the
+    teacher.
 
     Args:
-        facts: The item with its facts.
+        item: The item with its facts.
         seed: Seed of the responses and, if `permute` is true, of the order of the candidates.
     """
+    order = seed if permute else None
+    student = replace(item, facts="").lazy_sample(frames, frame_count, order)
+    teacher = item.lazy_sample(frames, frame_count, order)
 
     def render(epoch: int) -> PairedPrompts:
-        shown = facts.permuted(seed, epoch) if permute else facts
-        rng = seeded_rng("response", seed, epoch, facts.item.item_id)
+        shown = item.permuted(seed, epoch) if permute else item
+        rng = seeded_rng("response", seed, epoch, item.item.item_id)
         return PairedPrompts(
-            replace(seen.render(epoch), response=None),
+            replace(student.render(epoch), response=None),
             replace(teacher.render(epoch), response=None),
             shown.item.letter,
             int(rng.integers(2**31)),
         )
 
-    return replace(seen, render=render)
+    return replace(student, render=render)
 
 
 def load_datasets(
     cfg: DistillCommand, trained: SftCommand, store: Store, rationales: Sequence[Rationale]
 ) -> tuple[StudentDataset, dict[str, StudentDataset]]:
-    """Return the training dataset, whose samples are `PairedPrompts`s, and the validation
-    dataset in reasoning mode, which has the narrator's rationales.
+    """Return the training dataset, whose samples are `PairedPrompts`, and the validation datasets
+    by mode, with the narrator's rationales as responses.
 
     Args:
         trained: Settings of the student.
@@ -67,25 +71,19 @@ def load_datasets(
     Raises:
         UserError: a dataset is empty.
     """
-    frames = FrameReader(store, trained.student.image_size)
+    frames, frame_count = FrameReader(store, trained.student.image_size), trained.student.frames
     by_item = {r.item_id: r for r in rationales}
-    permute = cfg.train.permute_candidates
     training, validation = split_items(store, cfg.train.validation_items, cfg.seed)
-
-    def supervise(items: list[SelectionItem], with_facts: bool) -> list[SupervisedItem]:
-        regime = trained.train.regime
-        by_mode = supervised_items(store, items, by_item, regime, trained.teacher, with_facts)
-        return by_mode["reasoning"]
-
-    def lazy(supervised: SupervisedItem, permute: bool) -> LazySample:
-        seed = cfg.seed if permute else None
-        return supervised.lazy_sample(frames, trained.student.frames, seed)
-
+    shared = (by_item, trained.train.regime, trained.teacher)
+    permute = cfg.train.permute_candidates
     samples = [
-        pair_prompts(lazy(seen, permute), facts, lazy(facts, permute), cfg.seed, permute)
-        for seen, facts in zip(supervise(training, False), supervise(training, True), strict=True)
+        pair_prompts(item, frames, frame_count, cfg.seed, permute)
+        for item in supervised_items(store, training, *shared, True)["reasoning"]
     ]
-    held_out = [lazy(seen, False) for seen in supervise(validation, False)]
+    held_out = {
+        mode: StudentDataset([item.lazy_sample(frames, frame_count, None) for item in items])
+        for mode, items in supervised_items(store, validation, *shared).items()
+    }
     check_not_empty(len(samples), "training items with accepted rationales")
-    check_not_empty(len(held_out), "items of held-out training scenes with accepted rationales")
-    return StudentDataset(samples), {"reasoning": StudentDataset(held_out)}
+    check_not_empty(len(held_out["reasoning"]), "held-out items with accepted rationales")
+    return StudentDataset(samples), held_out

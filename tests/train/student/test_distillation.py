@@ -18,6 +18,7 @@ from models.trained_runs import trained_settings
 from tests.user_errors import raises_user_error
 from train import distill, sft
 from train.common.journal import read_journal
+from train.export import find_run
 from train.student import distillation, paired_prompts
 from train.student.distillation import check_tokenizer
 from train.student.paired_prompts import PairedPrompts
@@ -88,7 +89,7 @@ def test_a_killed_run_samples_the_same_responses(settings, tmp_path, monkeypatch
         assert first == pytest.approx(second, rel=1e-4)
     losses = [r for r in read_journal(whole) if "loss" in r]
     assert len(losses) == 4
-    assert all(r["loss"] > 0 and 0 <= r["sampled_parsed"] <= 1 for r in losses)
+    assert all(r["loss"] > 0 and 0 <= r["sampled_parse_rate"] <= 1 for r in losses)
 
 
 def test_a_teacher_equal_to_the_student_gives_no_loss(settings, tmp_path, monkeypatch) -> None:
@@ -123,13 +124,19 @@ def test_micro_batches_change_neither_loss_nor_gradient(settings, tmp_path) -> N
     assert records[0]["grad_norm"] == pytest.approx(records[1]["grad_norm"], rel=1e-3)
 
 
-def test_the_student_can_be_evaluated_as_its_source(settings, student, tmp_path) -> None:
-    run = Run("run", tmp_path)
+def test_the_student_can_be_evaluated_and_exported(settings, student, tmp_path) -> None:
+    run = Run("run", tmp_path / "distill" / "run")
     open_run(run, asdict(settings), "train.distill")
     metrics = distill.main.__wrapped__(settings, run)
     (run.folder / "metrics.json").write_text(json.dumps(metrics))
-    found = trained_settings(run.folder, SftCommand, "student")
-    assert found == trained_settings(student, SftCommand, "student")
+    # Its settings no longer depend on the run that it continues.
+    source = trained_settings(student, SftCommand, "student")
+    student.rename(tmp_path / "moved")
+    name, folder, found = find_run(str(run.folder), "student", str(tmp_path))
+    (tmp_path / "moved").rename(student)
+    assert (name, folder) == ("distill/run", run.folder)
+    assert (found.student, found.benchmark) == (source.student, source.benchmark)
+    assert (found.train.regime, found.train.lr) == (source.train.regime, settings.train.lr)
     loading.load_trained(found.student, "fp32", run.folder / "student")
 
 
@@ -139,3 +146,15 @@ def test_a_teacher_with_another_tokenizer_is_refused(processor, student, tmp_pat
     other.tokenizer.add_tokens(["zebra"])
     with raises_user_error("other-tokenizer", contains="'zebra' (id None in the student"):
         check_tokenizer(tmp_path, loading.AutoProcessor.from_pretrained(folder), other)
+
+
+def test_unsuitable_runs_are_refused(settings, student, teacher, few_steps, tmp_path) -> None:
+    with raises_user_error("missing-run", contains="model is missing"):
+        run_distill(replace(settings, model=None), tmp_path / "a")
+    with raises_user_error("facts-instead-of-frames", contains=str(teacher)):
+        run_distill(replace(settings, model=str(teacher)), tmp_path / "b")
+    answers = finish_run(few_steps(max_steps=1, regime="answer_only"), tmp_path / "answers")
+    with raises_user_error("untrained-mode", contains="train.regime=answer_only"):
+        run_distill(replace(settings, model=str(answers)), tmp_path / "c")
+    with raises_user_error("other-settings", contains="train.regime=answer_only"):
+        run_distill(replace(settings, teacher_model=str(answers)), tmp_path / "d")
