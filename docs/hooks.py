@@ -20,6 +20,7 @@ GROUPS = {
     "retriever": schema.RetrieverConfig,
     "train, of a student": schema.SftTrainConfig,
     "train, of a student in distillation": schema.DistillTrainConfig,
+    "train, of a student with rewards": schema.ReinforceTrainConfig,
     "train, of a retriever": schema.ContrastiveTrainConfig,
     "server": schema.ServerConfig,
 }

@@ -36,6 +36,7 @@ STUDY_FILE = "study.json"
 METRICS = {
     "train.sft": "answer_letter_accuracy",
     "train.distill": "answer_letter_accuracy",
+    "train.reinforce": "reward",
     "train.contrastive": "mrr",
 }
 """Default of hydra.sweeper.metric for each command."""

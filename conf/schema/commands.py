@@ -16,6 +16,7 @@ from conf.schema.training import (
     BaseTrainConfig,
     ContrastiveTrainConfig,
     DistillTrainConfig,
+    ReinforceTrainConfig,
     SftTrainConfig,
 )
 
@@ -148,6 +149,16 @@ class DistillCommand(CommandConfig):
     uses the student itself, as it is at the start. The teacher reads the facts of an item as text
     instead of its frames, and needs the student's tokenizer."""
     train: DistillTrainConfig = field(default_factory=DistillTrainConfig)
+    seed: int = setting(0, least=0)
+    """Seed of the order of the items and of the sampled responses."""
+
+
+@dataclass
+class ReinforceCommand(CommandConfig):
+    model: str | None = None
+    """Folder of the run of train.sft whose student is trained further. It determines the benchmark,
+    the narrator's settings and the student."""
+    train: ReinforceTrainConfig = field(default_factory=ReinforceTrainConfig)
     seed: int = setting(0, least=0)
     """Seed of the order of the items and of the sampled responses."""
 

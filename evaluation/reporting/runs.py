@@ -18,7 +18,7 @@ from evaluation.reporting.run_responses import Responses, read_responses, readin
 from models.trained_runs import settings_file
 
 SELECTION_KINDS, RETRIEVAL_KINDS = ("select", "similarity"), ("retrieve", "two_stage")
-STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "distill", "contrastive")
+STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "distill", "reinforce", "contrastive")
 REPORT_TYPES = {
     **dict.fromkeys(SELECTION_KINDS, SelectionReport),
     **dict.fromkeys(RETRIEVAL_KINDS, RetrievalReport),

@@ -26,6 +26,7 @@ SCHEMAS = {
     "train.base": schema.BaseCommand,
     "train.sft": schema.SftCommand,
     "train.distill": schema.DistillCommand,
+    "train.reinforce": schema.ReinforceCommand,
     "train.contrastive": schema.ContrastiveCommand,
     "train.export": schema.ExportModelCommand,
     "evaluation.select": schema.SelectCommand,
