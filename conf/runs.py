@@ -42,7 +42,7 @@ CONTINUATIONS = ("distill", "reinforce")
 
 PACKAGES = (
     "torch", "transformers", "peft", "bitsandbytes", "accelerate", "sentence-transformers",
-    "hydra-core", "omegaconf", "numpy", "pybullet",
+    "trl", "hydra-core", "omegaconf", "numpy", "pybullet",
 )  # fmt: skip
 """Packages whose versions run.json records."""
 

@@ -46,11 +46,9 @@ def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
 
     The name is gradient_checkpointing up to transformers 5.22, activation_checkpointing from 5.23.
     """
-    if not enabled:
-        return {}
     renamed = "activation_checkpointing" in {field.name for field in fields(TrainingArguments)}
     name = "activation_checkpointing" if renamed else "gradient_checkpointing"
-    return {name: True, f"{name}_kwargs": {"use_reentrant": False}}
+    return {name: enabled, f"{name}_kwargs": {"use_reentrant": False} if enabled else None}
 
 
 def encode_images(

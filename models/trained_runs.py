@@ -20,8 +20,8 @@ EXPORT = "export.json"
 """A file that only the folders that `train.export` writes contain."""
 
 STUDENT_SETTINGS = "student.yaml"
-"""A file in runs of train.distill: the settings of the trained student, in the form of those of
-train.sft."""
+"""A file in runs of train.distill and train.reinforce: the settings of the trained student, in the
+form of those of train.sft."""
 
 EVALUATION_SETTINGS = {
     "student": ("temperature", "top_p", "top_k", "max_new_tokens", "max_length"),
@@ -66,8 +66,8 @@ def product_folder(folder: Path, product: str) -> Path:
 
 
 def settings_file(folder: Path) -> Path:
-    """Return the file with the settings of a trained model: student.yaml of a run of train.distill,
-    which takes most settings from another run, or else config.yaml."""
+    """Return the file with the settings of a trained model: student.yaml of a run of train.distill
+    or train.reinforce, which takes most settings from another run, or else config.yaml."""
     path = folder / STUDENT_SETTINGS
     return path if path.exists() else folder / "config.yaml"
 

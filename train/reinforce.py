@@ -37,6 +37,9 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     from train.student.reinforcement import build_trainer, load_items
 
     compat.keep_freed_memory()
+    train = cfg.train
+    responses = "train.batch x train.responses"
+    distributed.split_batch(train.batch * train.responses, train.micro_batch, key=responses)
     if distributed.is_sharded():
         raise UserError(
             "train.reinforce does not work with FSDP, since the student generates texts between "

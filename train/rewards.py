@@ -14,16 +14,18 @@ from dataclasses import dataclass
 from data.records import SelectionItem
 from models.student.answer_parser import parse_choice
 from teacher.numbers.detection import find_numbers
-from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.facts import Relation, RelationalPredicates
+from teacher.predicates.relations import VALUES, normalize_relation
 from teacher.reading.grounding import Claim
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.reasons import CONTRADICTED, SUPPORTED, ResponseReasons, read_response
 
 ENOUGH_CLAIMS = 6
 """Number of different claims from which on their share counts. Fewer claims earn less."""
-MAX_MENTIONS = 3
+MAX_MENTIONS = 10
 """A claim that a response states more often than this counts as contradicted each further time. In
-the narrator's responses, the prediction, the analysis and the match layout repeat some claims."""
+the narrator's responses, the analysis and the match layout repeat what is predicted for each false
+candidate ("not near the top")."""
 
 
 @dataclass(frozen=True)
@@ -63,30 +65,46 @@ def reward_answer(response: JudgedResponse) -> float:
 
 def reward_truth(response: JudgedResponse) -> float:
     """Return the share of the claims that the oracle supports less that of those it contradicts,
-    from -1 to 1. Each claim counts once; further mentions above `MAX_MENTIONS` count as
-    contradicted."""
+    from -1 to 1.
+
+    Each claim counts once, whatever its moment and the order of its objects; further mentions above
+    `MAX_MENTIONS` count as contradicted. Only certain claims can count as supported, and negated
+    ones count only if they are contradicted: otherwise, a list of what may be, or of what is not
+    the case, would be supported without any knowledge.
+    """
     mentions: Counter[tuple] = Counter()
-    verdicts: dict[tuple, str] = {}
+    affirmed, supported, contradicted = set(), set(), set()
     for claims in response.reasons.claims.values():
         for claim in claims:
             key = _identify(claim)
             mentions[key] += 1
-            verdicts[key] = claim.verdict
-    supported = sum(verdict == SUPPORTED for verdict in verdicts.values())
-    contradicted = sum(verdict == CONTRADICTED for verdict in verdicts.values())
+            if claim.affirmed:
+                affirmed.add(key)
+            if claim.verdict == CONTRADICTED:
+                contradicted.add(key)
+            elif _is_earned(claim):
+                supported.add(key)
     repeated = sum(max(0, count - MAX_MENTIONS) for count in mentions.values())
-    total = max(len(verdicts) + repeated, ENOUGH_CLAIMS)
-    return (supported - contradicted - repeated) / total
+    total = max(len(affirmed | contradicted) + repeated, ENOUGH_CLAIMS)
+    return (len(supported - contradicted) - len(contradicted) - repeated) / total
 
 
 def _identify(claim: Claim) -> tuple:
-    return claim.kind, claim.subjects, claim.value, claim.affirmed, claim.candidate, claim.when
+    subjects, value = claim.subjects, claim.value
+    if claim.kind in VALUES and len(subjects) > 1:
+        _, subjects, value = normalize_relation(Relation(claim.kind, subjects, value))
+    return claim.kind, subjects, value, claim.affirmed, claim.candidate
+
+
+def _is_earned(claim: Claim) -> bool:
+    return claim.verdict == SUPPORTED and claim.certain and claim.affirmed
 
 
 def reward_following(response: JudgedResponse) -> float:
-    """Return 1 if the answer follows from the text and the text is rather true than false (see
-    `reward_truth`), otherwise 0."""
-    return float(response.reasons.follows and reward_truth(response) > 0)
+    """Return 1 if the answer follows from the text, the text is rather true than false (see
+    `reward_truth`), and the oracle supports a claim of its prediction; otherwise 0."""
+    predicted = any(map(_is_earned, response.reasons.claims["prediction"]))
+    return float(response.reasons.follows and predicted and reward_truth(response) > 0)
 
 
 def reward_no_numbers(response: JudgedResponse) -> float:
@@ -95,10 +113,10 @@ def reward_no_numbers(response: JudgedResponse) -> float:
 
 
 def reward_form(response: JudgedResponse) -> float:
-    """Return -1 for a response that was cut off, or whose sections are out of order or occur twice,
-    otherwise 0. A response without sections has no form that it could miss."""
-    headings = [name for name, _, _ in split_sections(response.text) if name in SECTIONS]
-    in_order = headings == [name for name in SECTIONS if name in headings]
+    """Return -1 for a response that was cut off, or whose sections and answer are out of order or
+    occur twice, otherwise 0. A response without sections has no form that it could miss."""
+    headings = [name for name, _, _ in split_sections(response.text)]
+    in_order = headings == [name for name in (*SECTIONS, "Answer") if name in headings]
     return -float(response.cut or not in_order)
 
 

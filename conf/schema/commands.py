@@ -228,10 +228,11 @@ class ContrastiveCommand(CommandConfig):
 @dataclass
 class ExportModelCommand(CommandConfig):
     product: str = setting("student", tuple(TRAINER_FOLDERS))
-    """Model to export: student (trained by train.sft or train.distill) or retriever (by
+    """Model to export: student (of train.sft, train.distill or train.reinforce) or retriever (of
     train.contrastive)."""
     run: str = "default"
-    """Training run to export: its name or its folder. A run of train.distill needs its folder."""
+    """Training run to export: its name or its folder. Runs of train.distill and
+    train.reinforce need their folder."""
     format: str = setting("bf16", ("bf16", "fp32", "adapter"))
     """bf16 and fp32 merge the adapters into the dequantised base and write the weights in that
     precision; adapter writes only the adapters."""

@@ -50,10 +50,15 @@ def read_response(
         target: The letter of the target.
     """
     claims = extract_claims(text, predicates)
-    spans = {name: (start, stop) for name, start, stop in split_sections(text)}
+    sections = split_sections(text)
+    spans = {name: (start, stop) for name, start, stop in sections}
     by_part = _divide(claims, spans.get("Scene parse", NOWHERE))
-    first, last = spans.get("Answer", NOWHERE)
-    agreeing = [c for c in claims if c.kind == "agrees" and not first <= c.span[0] < last]
+    answers = [(start, stop) for name, start, stop in sections if name == "Answer"]
+    agreeing = [
+        c
+        for c in claims
+        if c.kind == "agrees" and not any(start <= c.span[0] < stop for start, stop in answers)
+    ]
     affirmed = {c.candidate for c in agreeing if c.affirmed}
     denied = {c.candidate for c in agreeing if not c.affirmed}
     follows = letter is not None and affirmed == {letter} and letter not in denied

@@ -9,7 +9,7 @@ from data.records import LETTERS, SelectionItem
 from data.store import Store
 from models.student.prompts import answer_line, response
 from teacher.narrator import write_match_lines, write_rationale
-from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.facts import REGIONS, RelationalPredicates
 from teacher.vocabulary import describe_item
 from train.rewards import REWARDS, judge_response, reward_form, reward_truth
 
@@ -47,6 +47,11 @@ def test_the_narrator_earns_every_reward(described) -> None:
 HACKS = {
     "empty": "",
     "the question": "{question}\n",
+    "the question in a section": "Scene parse: {question}\n",
+    "the answer twice": "Answer: {letter}\n",
+    "only the outcome": "Outcome: Only candidate {letter} agrees.\n",
+    "negations": "Prediction: {negations}\nOutcome: Only candidate {letter} agrees.\n",
+    "a list of what may be": "Prediction: {options}\nOutcome: Only candidate {letter} agrees.\n",
     "nothing to check": "Scene parse: Things are there.\nMotion analysis: They move.\nPrediction: "
     "The future comes.\nCandidate analysis: Candidate {letter} agrees.\nOutcome: Only candidate "
     "{letter} agrees.\n",
@@ -57,12 +62,15 @@ HACKS = {
 
 @pytest.mark.parametrize("hack", HACKS)
 def test_empty_text_earns_no_more_than_the_answer_alone(described, hack: str) -> None:
+    regions = [region for row in REGIONS for region in row]
     for item, p in described:
         name = p.objects[0].object
         for letter in LETTERS:
             text = HACKS[hack].format(
                 question=item.question, letter=letter, other=name,
-                sentences=f"The {name} is in view. " * 50,
+                sentences=f"The {name} is near the top. " * 50,
+                negations=" ".join(f"The {name} is not {region}." for region in regions),
+                options=" ".join(f"The {name} frobs {region}." for region in regions),
             )  # fmt: skip
             alone = answer_line(letter)
             assert total(text + alone, item, p) <= total(alone, item, p)

@@ -20,7 +20,13 @@ from transformers import ProcessorMixin, SuppressTokensLogitsProcessor
 
 from conf.errors import UserError
 from conf.runs import Run, world_size
-from conf.schema import DistillCommand, DistillTrainConfig, SftCommand, StudentConfig
+from conf.schema import (
+    DistillCommand,
+    DistillTrainConfig,
+    ReinforceTrainConfig,
+    SftCommand,
+    StudentConfig,
+)
 from models import loading
 from models.distributed import rank_device
 from models.memory import explain_out_of_memory
@@ -71,7 +77,10 @@ class ResponseSampler:
     """
 
     def __init__(
-        self, processor: ProcessorMixin, student: StudentConfig, train: DistillTrainConfig
+        self,
+        processor: ProcessorMixin,
+        student: StudentConfig,
+        train: DistillTrainConfig | ReinforceTrainConfig,
     ) -> None:
         self._processor, self._precision = processor, train.precision
         self._sampling = replace(student, temperature=train.temperature, top_p=1.0, top_k=0)

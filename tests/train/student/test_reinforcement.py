@@ -120,6 +120,36 @@ def test_probabilities_are_those_of_the_student_trainer(
     assert sum(checked) >= 8
 
 
+def test_a_run_resumes_in_its_second_epoch(settings, tmp_path, monkeypatch, short_rewards) -> None:
+    """Each epoch has its own order of the items."""
+    seen: dict[str, list[list[str]]] = {"whole": [], "resumed": []}
+    respond = reinforcement.MediaGRPOTrainer._respond
+    load = reinforcement.load_items
+
+    def recorded(self, prompts, trainer):
+        if self.model.training:
+            seen[current].append([judged.item.item_id for judged in self._judged[::4]])
+        return respond(self, prompts, trainer)
+
+    def four_items(*arguments):
+        training, validation = load(*arguments)
+        return training[:4], validation
+
+    monkeypatch.setattr(reinforcement.MediaGRPOTrainer, "_respond", recorded)
+    monkeypatch.setattr(reinforcement, "load_items", four_items)
+    train = replace(settings.train, max_steps=6, evaluations=2)
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    current = "whole"
+    run_reinforce(replace(settings, train=train), whole)
+    shutil.copytree(whole / "checkpoint-3", resumed / "checkpoint-3")
+    current = "resumed"
+    run_reinforce(replace(settings, train=train), resumed)
+    assert seen["resumed"] == seen["whole"][3:]
+    epochs = [seen["whole"][k] + seen["whole"][k + 1] for k in (0, 2, 4)]
+    assert all(sorted(epoch) == sorted(epochs[0]) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) > 1
+
+
 def test_equal_rewards_leave_the_student_unchanged(settings, tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(reinforcement.REWARDS, "answer", lambda _: 1.0)
     for name in ("truth", "following", "no_numbers"):
