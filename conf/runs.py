@@ -37,9 +37,12 @@ BOOKKEEPING_FILES = {"config.yaml", "run.json", "run.log", "output.log", "job.js
 TRAINER_FOLDERS = {"student": "sft", "retriever": "contrastive"}
 """Folder below checkpoints/ of the training runs that have each product (trained model)."""
 
+CONTINUATIONS = ("distill", "reinforce")
+"""Folders below checkpoints/ of the runs that train the student of another run further."""
+
 PACKAGES = (
     "torch", "transformers", "peft", "bitsandbytes", "accelerate", "sentence-transformers",
-    "hydra-core", "omegaconf", "numpy", "pybullet",
+    "trl", "hydra-core", "omegaconf", "numpy", "pybullet",
 )  # fmt: skip
 """Packages whose versions run.json records."""
 
@@ -100,8 +103,12 @@ def is_inside(path: str, folder: str) -> bool:
     return bool(path) and not os.path.relpath(path, folder).startswith("..")
 
 
-def runs_folder(checkpoints: str, product: str) -> str:
-    """Folder of the runs that train a product (student or retriever), below `checkpoints`."""
+def runs_folder(checkpoints: str, product: str, run: str = "") -> str:
+    """Folder to which the names of the runs that train a product (student or retriever) are
+    relative. If `run` is the folder of a run of train.distill or train.reinforce, this is
+    `checkpoints`, so that the run's name begins with "distill/" or "reinforce/"."""
+    if product == "student" and any(is_inside(run, f"{checkpoints}/{f}") for f in CONTINUATIONS):
+        return checkpoints
     return f"{checkpoints}/{TRAINER_FOLDERS.get(product, product)}"
 
 

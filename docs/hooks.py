@@ -19,6 +19,8 @@ GROUPS = {
     "student": schema.StudentConfig,
     "retriever": schema.RetrieverConfig,
     "train, of a student": schema.SftTrainConfig,
+    "train, of a student in distillation": schema.DistillTrainConfig,
+    "train, of a student with rewards": schema.ReinforceTrainConfig,
     "train, of a retriever": schema.ContrastiveTrainConfig,
     "server": schema.ServerConfig,
 }

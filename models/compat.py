@@ -19,7 +19,10 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
   `get_batch_sampler`, `collect_features` and `add_model_card_callback`.
 - `train.retriever.inputs` adds an input in a forward pre-hook of sentence-transformers'
   `Transformer`, which passes it on to its model.
-- `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer.
+- `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer, and
+  `train.student.distillation` overrides `get_batch_samples` and calls `_get_num_items_in_batch`.
+- `train.student.reinforcement` overrides `_generate_and_score_completions`, `_compute_loss` and
+  `_get_per_token_logps_and_entropies` of TRL's GRPOTrainer, and uses its `rollout_func`.
 """
 
 from __future__ import annotations
@@ -43,11 +46,9 @@ def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
 
     The name is gradient_checkpointing up to transformers 5.22, activation_checkpointing from 5.23.
     """
-    if not enabled:
-        return {}
     renamed = "activation_checkpointing" in {field.name for field in fields(TrainingArguments)}
     name = "activation_checkpointing" if renamed else "gradient_checkpointing"
-    return {name: True, f"{name}_kwargs": {"use_reentrant": False}}
+    return {name: enabled, f"{name}_kwargs": {"use_reentrant": False} if enabled else None}
 
 
 def encode_images(

@@ -177,6 +177,39 @@ def lora_config(group: str, lora: LoraConfig, task_type: str | None = None) -> I
         ) from error
 
 
+def load_trainable(
+    cfg: StudentConfig, precision: str, folder: Path
+) -> tuple[nn.Module, ProcessorMixin]:
+    """Load a trained student to train it further: adapters and their base, or a whole model.
+
+    Raises:
+        UserError: As `load_trained`; or `folder` contains a merged export, which has no adapters.
+    """
+    import peft
+
+    if (folder / EXPORT).exists() and not (folder / "adapter_config.json").exists():
+        raise UserError(
+            f"{folder} is a merged export, which has no adapters to train: give the run that was "
+            "exported",
+            code="merged-export",
+        )
+    if not cfg.lora.rank:
+        return load_student(replace(cfg, model=str(folder), architecture=None), precision, list)
+    check_safetensors(folder)
+    base, processor = load_base(cfg, precision, list)
+    base.config.use_cache = base.config.get_text_config().use_cache = False
+    keep_differentiable(base)
+    with explain_damage(folder):
+        check_adapters(folder, base, cfg.lora.rank, cfg.model)
+        return peft.PeftModel.from_pretrained(base, folder, is_trainable=True), processor
+
+
+def check_safetensors(folder: Path) -> None:
+    """Raise UserError if the adapters in a folder have no safetensors; peft would read a pickle."""
+    if not (weights := folder / "adapter_model.safetensors").exists():
+        raise UserError(f"{folder} has no student: {weights} is missing", code="missing-run")
+
+
 def load_trained(
     cfg: StudentConfig, precision: str, folder: Path
 ) -> tuple[nn.Module, ProcessorMixin]:
@@ -191,9 +224,7 @@ def load_trained(
     import peft
 
     if (folder / "adapter_config.json").exists():
-        # Without safetensors, peft would read a pickle.
-        if not (weights := folder / "adapter_model.safetensors").exists():
-            raise UserError(f"{folder} has no student: {weights} is missing", code="missing-run")
+        check_safetensors(folder)
         base, processor = load_base(cfg, precision, list)
         with explain_damage(folder):
             check_adapters(folder, base, cfg.lora.rank, cfg.model)

@@ -19,6 +19,10 @@ from models.resolved import read_resolved, with_resolved_commit
 EXPORT = "export.json"
 """A file that only the folders that `train.export` writes contain."""
 
+STUDENT_SETTINGS = "student.yaml"
+"""A file in runs of train.distill and train.reinforce: the settings of the trained student, in the
+form of those of train.sft."""
+
 EVALUATION_SETTINGS = {
     "student": ("temperature", "top_p", "top_k", "max_new_tokens", "max_length"),
     "retriever": ("widths", "max_length"),
@@ -61,6 +65,13 @@ def product_folder(folder: Path, product: str) -> Path:
     return folder if (folder / EXPORT).exists() else folder / product
 
 
+def settings_file(folder: Path) -> Path:
+    """Return the file with the settings of a trained model: student.yaml of a run of train.distill
+    or train.reinforce, which takes most settings from another run, or else config.yaml."""
+    path = folder / STUDENT_SETTINGS
+    return path if path.exists() else folder / "config.yaml"
+
+
 def trained_settings(
     folder: Path, schema: type[Command], product: str, key: str = "model"
 ) -> Command:
@@ -76,7 +87,7 @@ def trained_settings(
         UserError: `folder` is not the folder of a run or an export of this product, the run is not
             finished, or its settings are damaged.
     """
-    config = folder / "config.yaml"
+    config = settings_file(folder)
     try:
         saved = OmegaConf.load(config)
         if (folder / product / EXPORT).exists():
@@ -139,6 +150,8 @@ def resolve_model(
         return None, cfg
     folder = Path(cfg.model)
     settings = trained_settings(folder, schema, product, key)
+    if product == "student":
+        check_sees_frames(folder, settings.train.facts, key)
     check_unseen(f"{key}={folder}", settings.benchmark, benchmark)
     _check_base_unseen(getattr(settings, product).model, benchmark)
     _apply_overrides(settings, cfg, product, overrides, key)
@@ -212,6 +225,16 @@ def check_unseen(model: str, trained: BenchmarkConfig, tested: BenchmarkConfig) 
             "was trained on: set both as in training, or simulate other scenes with another "
             "benchmark.seed",
             code="training-scenes-tested",
+        )
+
+
+def check_sees_frames(folder: Path, facts: bool, key: str = "model") -> None:
+    """Raise UserError if a student was trained on facts (`train.facts`) instead of frames."""
+    if facts:
+        raise UserError(
+            f"{key}={folder} was trained with train.facts=true, on facts instead of frames: it can "
+            "only be the teacher of train.distill, as teacher_model",
+            code="facts-instead-of-frames",
         )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from data.records import SelectionItem
 from teacher.deciding import Decision, choose_statements
 from teacher.predicates.facts import Predicates, RelationalPredicates
-from teacher.writers.paper import Detail, Writer
+from teacher.writers.paper import Detail, Writer, join_sentences
 from teacher.writers.relational import RelationalWriter
 
 NARRATOR_VERSION = "10"
@@ -45,6 +45,12 @@ def list_clauses(predicates: Predicates, item: SelectionItem) -> dict[str, list[
     """Return the clauses from which a rationale can be made, by section, in full detail."""
     writer = _make_writer(predicates, _decide(predicates), FULL, item.item_id, "clauses")
     return writer.sections()
+
+
+def write_facts(predicates: Predicates, item: SelectionItem) -> str:
+    """Return all clauses of `list_clauses` as sentences, in the form of a rationale."""
+    sections = list_clauses(predicates, item)
+    return "\n".join(f"{name}: {join_sentences(parts)}" for name, parts in sections.items())
 
 
 def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RECORDS = ("config.yaml", "run.json", "metrics.json")
-"""Files that are copied from the training run to its export."""
+RECORDS = ("run.json", "metrics.json")
+"""Files that are copied from the training run to its export, beside its settings."""
 COMMANDS = {"student": SftCommand, "retriever": ContrastiveCommand}
 
 
@@ -42,7 +42,7 @@ COMMANDS = {"student": SftCommand, "retriever": ContrastiveCommand}
 def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
     from data.store import hash_file
     from models.resolved import RESOLVED
-    from models.trained_runs import EXPORT, export_record
+    from models.trained_runs import EXPORT, export_record, settings_file
     from train.common.model_card import model_card
 
     name, run_folder, settings = find_run(cfg.run, cfg.product, cfg.checkpoints)
@@ -74,6 +74,7 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
             measured = write_merged(RetrieverMerge(settings, saved), partial, cfg)
         for file_name in RECORDS:
             shutil.copy(run_folder / file_name, partial)
+        shutil.copy(settings_file(run_folder), partial / "config.yaml")
         card = model_card(name, settings, run_folder, cfg.format, measured)
         card.save(partial / "README.md")
         record = {"run": name, "format": cfg.format, "weights": weights, "measured": measured}
@@ -96,7 +97,7 @@ def find_run(
     from models.resolved import check_base
     from models.trained_runs import trained_settings
 
-    runs = runs_folder(checkpoints, product)
+    runs = runs_folder(checkpoints, product, run)
     name = resolve_run_name(run, runs)
     folder = Path(runs) / name
     settings = trained_settings(folder, COMMANDS[product], product, "run")

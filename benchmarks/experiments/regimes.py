@@ -39,10 +39,11 @@ from data.records import FAMILIES, SelectionItem
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.selection.distractors import BUILDERS_VERSIONS
-from evaluation.metrics.reasons import PARTS, SUPPORTED, read_reasons
+from evaluation.metrics.reasons import read_reasons
 from evaluation.reporting.run_responses import ItemResponse
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
+from teacher.validation.reasons import PARTS, SUPPORTED
 from teacher.vocabulary import VERSIONS
 
 RECORD = Path(__file__).with_name("letters.parquet")

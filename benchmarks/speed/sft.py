@@ -1,4 +1,4 @@
-"""Compares the student trainer with TRL's SFTTrainer (extra `bench`) in speed and memory.
+"""Compares the student trainer with TRL's SFTTrainer (extra `rl`) in speed and memory.
 
     python -m benchmarks.speed.sft                # the tiny student, on any machine
     python -m benchmarks.speed.sft qwen3_vl_8b    # a released size, on a GPU
@@ -102,7 +102,7 @@ def main() -> None:
     args = parser.parse_args()
     has_trl = importlib.util.find_spec("trl") is not None
     if args.losses and not has_trl:
-        parser.error("--losses needs TRL: pip install -e '.[bench]'")
+        parser.error("--losses needs TRL: pip install -e '.[rl]'")
     if args.losses:
         args.precision, args.quantization = "fp32", "none"
     overrides = [

@@ -33,7 +33,12 @@ log = logging.getLogger(__name__)
 RunJobs = Callable[[list[list[str]], int], list[dict[str, Any]]]
 """`Sweep.run_jobs`: runs jobs, given their overrides and the first one's number."""
 STUDY_FILE = "study.json"
-METRICS = {"train.sft": "answer_letter_accuracy", "train.contrastive": "mrr"}
+METRICS = {
+    "train.sft": "answer_letter_accuracy",
+    "train.distill": "answer_letter_accuracy",
+    "train.reinforce": "reward",
+    "train.contrastive": "mrr",
+}
 """Default of hydra.sweeper.metric for each command."""
 
 

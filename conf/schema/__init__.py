@@ -12,10 +12,12 @@ from conf.schema.commands import (
     BuildCommand,
     CommandConfig,
     ContrastiveCommand,
+    DistillCommand,
     ExportCommand,
     ExportModelCommand,
     GalleryCommand,
     NarrateCommand,
+    ReinforceCommand,
     ServeCommand,
     SftCommand,
     StatisticsCommand,
@@ -41,8 +43,12 @@ from conf.schema.servers import ServerConfig, ServersConfig, TeacherConfig
 from conf.schema.training import (
     BaseTrainConfig,
     ContrastiveTrainConfig,
+    DistillTrainConfig,
+    ReinforceTrainConfig,
+    RewardWeights,
     SftTrainConfig,
     StageConfig,
+    StudentTrainConfig,
     TrainConfig,
 )
 from conf.schema.world import CameraConfig, PartConfig, PhysicsConfig, WorldConfig

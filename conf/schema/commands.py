@@ -12,7 +12,13 @@ from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import TeacherConfig
 from conf.schema.settings import Settings, check_run, setting
-from conf.schema.training import BaseTrainConfig, ContrastiveTrainConfig, SftTrainConfig
+from conf.schema.training import (
+    BaseTrainConfig,
+    ContrastiveTrainConfig,
+    DistillTrainConfig,
+    ReinforceTrainConfig,
+    SftTrainConfig,
+)
 
 PARALLEL_BACKENDS = ("loky", "ray")
 BASE_LAYERS, BASE_HEADS = 6, 6
@@ -134,6 +140,30 @@ class SftCommand(CommandConfig):
 
 
 @dataclass
+class DistillCommand(CommandConfig):
+    model: str | None = None
+    """Folder of the run of train.sft whose student is trained further. It determines the benchmark,
+    the narrator's settings and the student."""
+    teacher_model: str | None = None
+    """Folder of the run that trained the teacher, for example with train.sft train.facts=true; null
+    uses the student itself, as it is at the start. The teacher reads the facts of an item as text
+    instead of its frames, and needs the student's tokenizer."""
+    train: DistillTrainConfig = field(default_factory=DistillTrainConfig)
+    seed: int = setting(0, least=0)
+    """Seed of the order of the items and of the sampled responses."""
+
+
+@dataclass
+class ReinforceCommand(CommandConfig):
+    model: str | None = None
+    """Folder of the run of train.sft whose student is trained further. It determines the benchmark,
+    the narrator's settings and the student."""
+    train: ReinforceTrainConfig = field(default_factory=ReinforceTrainConfig)
+    seed: int = setting(0, least=0)
+    """Seed of the order of the items and of the sampled responses."""
+
+
+@dataclass
 class BaseCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     student: StudentConfig = MISSING
@@ -198,9 +228,11 @@ class ContrastiveCommand(CommandConfig):
 @dataclass
 class ExportModelCommand(CommandConfig):
     product: str = setting("student", tuple(TRAINER_FOLDERS))
-    """Model to export: student (trained by train.sft) or retriever (by train.contrastive)."""
+    """Model to export: student (of train.sft, train.distill or train.reinforce) or retriever (of
+    train.contrastive)."""
     run: str = "default"
-    """Training run to export: its name or its folder."""
+    """Training run to export: its name or its folder. Runs of train.distill and
+    train.reinforce need their folder."""
     format: str = setting("bf16", ("bf16", "fp32", "adapter"))
     """bf16 and fp32 merge the adapters into the dequantised base and write the weights in that
     precision; adapter writes only the adapters."""
@@ -212,4 +244,4 @@ class ExportModelCommand(CommandConfig):
         for other in TRAINER_FOLDERS:
             if other != self.product and is_inside(self.run, runs_folder(self.checkpoints, other)):
                 return [f"run={self.run} trained a {other}: give product={other}"]
-        return check_run(self.run, runs_folder(self.checkpoints, self.product))
+        return check_run(self.run, runs_folder(self.checkpoints, self.product, self.run))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from conf.schema.settings import Settings, setting
 
@@ -61,19 +61,13 @@ class TrainConfig(Settings):
 
 
 @dataclass
-class SftTrainConfig(TrainConfig):
-    regime: str = setting("cot", REGIMES)
-    """Content of the responses that the student is trained on: cot (the rationale; one line per
-    candidate that says whether it matches; the answer), cot_no_candidate_analysis (cot, but the
-    rationale has no candidate analysis), cot_no_match_layout (cot without the lines per candidate),
-    or answer_only (the answer)."""
+class StudentTrainConfig(TrainConfig):
+    """Training settings that `train.sft` and `train.distill` share."""
+
     batch: int = setting(16, least=1)
     """Number of samples per optimizer step, over all micro-batches and ranks."""
     micro_batch: int = setting(1, least=1)
     """Number of samples per forward pass on each rank; changes memory and speed, not the result."""
-    reuse_features: bool = False
-    """Cache the frozen vision tower's features of each frame in up to half of the free memory. With
-    an 8B model, the features of a frame take about 3 MB."""
     permute_candidates: bool = False
     """Shuffle the order of each item's candidates in every epoch."""
     validation_items: int = setting(64, least=1)
@@ -86,6 +80,92 @@ class SftTrainConfig(TrainConfig):
         yield from super().find_problems(group)
         if self.micro_batch > 0 and self.batch % self.micro_batch:
             yield f"{group}micro_batch={self.micro_batch} must divide {group}batch={self.batch}"
+
+
+@dataclass
+class SftTrainConfig(StudentTrainConfig):
+    regime: str = setting("cot", REGIMES)
+    """Content of the responses that the student is trained on: cot (the rationale; one line per
+    candidate that says whether it matches; the answer), cot_no_candidate_analysis (cot, but the
+    rationale has no candidate analysis), cot_no_match_layout (cot without the lines per candidate),
+    or answer_only (the answer)."""
+    facts: bool = False
+    """Show the facts of an item as text instead of its frames. Such a model can be the teacher of
+    train.distill; it cannot be evaluated."""
+    reuse_features: bool = False
+    """Cache the frozen vision tower's features of each frame in up to half of the free memory. With
+    an 8B model, the features of a frame take about 3 MB."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        yield from super().find_problems(group)
+        if self.facts and self.regime == "answer_only":
+            yield (
+                f"{group}facts=true with {group}regime=answer_only: facts need a regime with "
+                f"rationales, such as {group}regime=cot"
+            )
+
+
+@dataclass
+class DistillTrainConfig(StudentTrainConfig):
+    lr: float = setting(1e-5, above=0)
+    """Peak learning rate."""
+    epochs: float = 1.0
+    """Number of passes over the training items. Each pass samples one response to each item."""
+    temperature: float = setting(1.0, above=0)
+    """Temperature at which responses are sampled."""
+    beta: float = setting(1.0, least=0, most=1)
+    """Divergence of the student from the teacher: 1 is the reverse Kullback-Leibler divergence, 0
+    the forward one, and between them the generalised Jensen-Shannon divergence with this weight of
+    the teacher."""
+
+
+@dataclass
+class RewardWeights(Settings):
+    """Weights of the rewards of `train.rewards`. A reward with weight 0 is not computed."""
+
+    answer: float = setting(1.0, least=0)
+    """Weight of 1 for the right letter."""
+    truth: float = setting(0.5, least=0)
+    """Weight of the share of claims that the oracle supports less that of those it contradicts."""
+    following: float = setting(0.25, least=0)
+    """Weight of 1 for an answer that follows from a text that is rather true than false."""
+    no_numbers: float = setting(0.5, least=0)
+    """Weight of -1 for a text with numbers."""
+    form: float = setting(0.5, least=0)
+    """Weight of -1 for a text that is cut off, or whose sections are out of order or repeated."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        if not any(getattr(self, f.name) for f in fields(self)):
+            yield f"{group.rstrip('.')}: all weights are 0; give one of them a weight above 0"
+
+
+@dataclass
+class ReinforceTrainConfig(TrainConfig):
+    lr: float = setting(1e-5, above=0)
+    """Peak learning rate."""
+    epochs: float = 1.0
+    """Number of passes over the training items."""
+    batch: int = setting(8, least=1)
+    """Number of items per optimizer step, over all ranks."""
+    responses: int = setting(8, least=2)
+    """Number of responses that are sampled to each item of a step. The advantage of a response is
+    its reward relative to those of the others."""
+    micro_batch: int = setting(8, least=1)
+    """Number of responses per forward pass on each rank; changes memory and speed, not the
+    result."""
+    temperature: float = setting(1.0, above=0)
+    """Temperature at which responses are sampled."""
+    validation_items: int = setting(16, least=1)
+    """Number of items of held-out training scenes on which the rewards are measured."""
+    rewards: RewardWeights = field(default_factory=RewardWeights)
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        yield from super().find_problems(group)
+        if self.micro_batch > 0 and (self.batch * self.responses) % self.micro_batch:
+            yield (
+                f"{group}micro_batch={self.micro_batch} must divide the {self.batch} x "
+                f"{self.responses} responses of a step ({group}batch x {group}responses)"
+            )
 
 
 @dataclass

@@ -15,9 +15,10 @@ import yaml
 from conf.errors import UserError
 from evaluation.metrics.results import RetrievalReport, SelectionReport, StudyReport, from_json
 from evaluation.reporting.run_responses import Responses, read_responses, reading
+from models.trained_runs import settings_file
 
 SELECTION_KINDS, RETRIEVAL_KINDS = ("select", "similarity"), ("retrieve", "two_stage")
-STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "contrastive")
+STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "distill", "reinforce", "contrastive")
 REPORT_TYPES = {
     **dict.fromkeys(SELECTION_KINDS, SelectionReport),
     **dict.fromkeys(RETRIEVAL_KINDS, RetrievalReport),
@@ -132,8 +133,8 @@ def _read_run(folder: Path, title: str, root: Path) -> FinishedRun:
     return FinishedRun(folder, title, kind, name, settings, training, report, started, responses)
 
 
-def _read_settings(folder: Path) -> dict[str, Any]:
-    with reading(folder, "config.yaml"), open(folder / "config.yaml", "rb") as file:
+def _read_settings(folder: Path, file_name: str = "config.yaml") -> dict[str, Any]:
+    with reading(folder, file_name), open(folder / file_name, "rb") as file:
         try:
             return dict(yaml.load(file, Loader=YamlLoader))
         except yaml.YAMLError as error:
@@ -149,4 +150,4 @@ def _training_settings(settings: Mapping[str, Any], root: Path) -> dict[str, Any
     # If the runs were moved, or the working directory is another, the model is below `root`.
     folders = [path, root / Path(*path.parts[1:])]
     found = [folder for folder in folders if (folder / "config.yaml").is_file()]
-    return _read_settings(found[0]) if found else {}
+    return _read_settings(found[0], settings_file(found[0]).name) if found else {}

@@ -42,11 +42,12 @@ class Encoded:
 
 
 def encode(
-    sample: Sample, processor: ProcessorMixin, max_length: int, thinking: bool = False
+    sample: Sample, processor: ProcessorMixin, max_length: int | None, thinking: bool = False
 ) -> Encoded:
     """Encode a conversation; without a response, only its prompt.
 
     Args:
+        max_length: Maximum number of tokens; None sets no limit.
         thinking: Value of the variable `enable_thinking` of chat templates that have it.
 
     Raises:
@@ -73,10 +74,12 @@ def encode(
     types = prompt.pop("mm_token_type_ids")[0].tolist()
     prompt.pop("attention_mask")
     response = []
-    if sample.response is not None:
+    if sample.response_ids is not None:
+        response = list(sample.response_ids)
+    elif sample.response is not None:
         response = processor.tokenizer.encode(sample.response, add_special_tokens=False)
         response.append(processor.tokenizer.eos_token_id)
-    if len(ids) + len(response) > max_length:
+    if max_length is not None and len(ids) + len(response) > max_length:
         raise UserError(
             f"sample {sample.sample_id} has {len(ids) + len(response)} tokens, more than "
             f"student.max_length={max_length}: raise student.max_length, or lower "
@@ -95,7 +98,9 @@ class Collator:
     `logits_to_keep` (K,) of these positions. The logits at position j predict label j + 1.
     """
 
-    def __init__(self, processor: ProcessorMixin, max_length: int, thinking: bool = False) -> None:
+    def __init__(
+        self, processor: ProcessorMixin, max_length: int | None, thinking: bool = False
+    ) -> None:
         self._processor = processor
         self._max_length = max_length
         self._thinking = thinking

@@ -66,10 +66,15 @@ def generate(
     start = THOUGHT_TAG if prompt_end.endswith(THOUGHT_TAG) else ""
     texts = tokenizer.batch_decode(new, skip_special_tokens=True)
     ends = torch.tensor([tokenizer.eos_token_id, tokenizer.pad_token_id], device=new.device)
-    ended = torch.isin(new, ends).any(dim=1) | (new.shape[1] < limit)
+    is_end = torch.isin(new, ends)
+    ended = is_end.any(dim=1) | (new.shape[1] < limit)
+    # The tokens after the first end are padding.
+    lengths = torch.where(is_end.any(dim=1), is_end.int().argmax(dim=1) + 1, new.shape[1])
     return [
-        GeneratedText(start + text, not end)
-        for text, end in zip(texts, ended.tolist(), strict=True)
+        GeneratedText(start + text, not end, tuple(row[:length]))
+        for text, end, row, length in zip(
+            texts, ended.tolist(), new.tolist(), lengths.tolist(), strict=True
+        )
     ]
 
 

@@ -77,6 +77,8 @@ class Sample:
         clip: The prefix, or None for a prompt without video.
         images: (S, S, 3) uint8 pixels of the images, such as the candidates, in order.
         response: The assistant's text, or None if it is to be generated.
+        response_ids: Token ids of the response if a model has generated them; the tokenizer may
+            divide the same text into other tokens.
         supervised: Whether the response is trained on; if not, the sample only fills a batch.
     """
 
@@ -85,6 +87,7 @@ class Sample:
     clip: Clip | None
     images: list[np.ndarray]
     response: str | None = None
+    response_ids: tuple[int, ...] | None = None
     supervised: bool = True
 
     @property
@@ -164,6 +167,15 @@ def selection_sample(
     parts.append(f"\n{text or instruction(mode, regime)}")
     clip = load_clip(item.scene_id, visible, frames) if visible else None
     return conversation(f"{item.item_id} ({mode})", parts, response, clip)
+
+
+def facts_sample(
+    item: SelectionItem, mode: str, regime: str, facts: str, response: str | None = None
+) -> Sample:
+    """Return the conversation about a selection item whose facts are given as text instead of its
+    frames."""
+    parts = [f"{item.question}\nFacts:\n{facts}\n{instruction(mode, regime)}"]
+    return conversation(f"{item.item_id} ({mode}, facts)", parts, response)
 
 
 def text_sample(

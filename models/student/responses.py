@@ -18,7 +18,13 @@ def response_token_limit(mode: str, max_new_tokens: int, thinking: bool = False)
 
 @dataclass(frozen=True)
 class GeneratedText:
-    """A generated text, and whether it was cut off at the token limit."""
+    """A generated text.
+
+    Attributes:
+        cut: Whether it was cut off at the token limit.
+        ids: Its token ids, with the one that ends it; empty if a server generated it.
+    """
 
     text: str
     cut: bool = False
+    ids: tuple[int, ...] = ()

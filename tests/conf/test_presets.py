@@ -25,6 +25,8 @@ SCHEMAS = {
     "teacher.serve": schema.ServeCommand,
     "train.base": schema.BaseCommand,
     "train.sft": schema.SftCommand,
+    "train.distill": schema.DistillCommand,
+    "train.reinforce": schema.ReinforceCommand,
     "train.contrastive": schema.ContrastiveCommand,
     "train.export": schema.ExportModelCommand,
     "evaluation.select": schema.SelectCommand,

@@ -25,15 +25,13 @@ CHANGED = "a library changed this hook; correct models/compat.py or the version 
 
 
 def test_checkpointing_arguments_recompute_activations(tmp_path) -> None:
-    assert compat.checkpointing_arguments(False) == {}
-    arguments = TrainingArguments(
-        output_dir=str(tmp_path), use_cpu=True, **compat.checkpointing_arguments(True)
-    )
-    enabled = [
-        getattr(arguments, name, None)
-        for name in ("activation_checkpointing", "gradient_checkpointing")
-    ]
-    assert any(enabled), f"{CHANGED} TrainingArguments takes no argument to recompute activations"
+    for enabled in (True, False):
+        arguments = TrainingArguments(
+            output_dir=str(tmp_path), use_cpu=True, **compat.checkpointing_arguments(enabled)
+        )
+        names = ("activation_checkpointing", "gradient_checkpointing")
+        found = any(getattr(arguments, name, None) for name in names)
+        assert found == enabled, f"{CHANGED} TrainingArguments recomputes activations otherwise"
 
 
 def test_4_bit_weights_are_not_repacked() -> None:

@@ -15,10 +15,13 @@ from conf.files import write_json_lines
 from train.common.curves import plot_curves
 from train.common.journal import ANSWERS, CURVES, JOURNAL, read_journal, read_lines
 
-NOT_REPRODUCIBLE = ("_runtime", "_per_second", "total_flos", "train_loss")
+NOT_REPRODUCIBLE = ("_runtime", "_per_second", "step_time", "total_flos", "train_loss")
 """Suffixes of logged names that the journal leaves out: timings, numbers of operations, and the
 trainer's mean loss, which in a resumed run counts only the steps since it resumed."""
-BAR_MEASURES = ("loss", "letter_accuracy", "token_accuracy", "recall@10")
+BAR_MEASURES = (
+    "loss", "letter_accuracy", "token_accuracy", "recall@10", "sampled_accuracy", "reward",
+    "answer/mean", "truth/mean", "following/mean", "no_numbers/mean", "form/mean",
+)  # fmt: skip
 """Suffixes of the measures that the progress bar shows."""
 
 PLOT_INTERVAL = 30

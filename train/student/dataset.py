@@ -14,13 +14,14 @@ from models.student.prompts import (
     MODES,
     Sample,
     answer_line,
+    facts_sample,
     has_matches,
     instruction,
     response,
     selection_sample,
 )
 from teacher.candidate_letters import relabel_text, reorder_candidates
-from teacher.narrator import write_match_lines
+from teacher.narrator import write_facts, write_match_lines
 from teacher.vocabulary import choose_vocabulary, describe_item
 from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
@@ -31,7 +32,8 @@ class SupervisedItem:
     """A selection item, and what a student's response to it in one mode is made of.
 
     `rationale` is the teacher's full text, and each of `matches` says whether a candidate matches.
-    Both are empty in answer mode, and `matches` also in regimes without the match layout.
+    Both are empty in answer mode, and `matches` also in regimes without the match layout. `facts`
+    are the facts of the item as text if they replace its frames, otherwise empty.
     """
 
     item: SelectionItem
@@ -39,6 +41,7 @@ class SupervisedItem:
     regime: str
     rationale: str = ""
     matches: tuple[str, ...] = ()
+    facts: str = ""
 
     @property
     def response(self) -> str:
@@ -46,17 +49,21 @@ class SupervisedItem:
 
     @property
     def text(self) -> str:
-        return f"{self.item.question} {instruction(self.mode, self.regime)} {self.response}"
+        parts = (self.item.question, self.facts, instruction(self.mode, self.regime), self.response)
+        return " ".join(filter(None, parts))
 
     def lazy_sample(self, frames: FrameReader, frame_count: int, seed: int | None) -> LazySample:
         """Return a sample that shows `frame_count` frames of the prefix. If `seed` is not None, its
         candidates are permuted in each epoch."""
         render = partial(self.render, frames, frame_count, seed)
         pairs = -(-frame_count // 2)
-        return LazySample(self.text, pairs + len(LETTERS), render, self.item.family)
+        pictures = 0 if self.facts else pairs + len(LETTERS)
+        return LazySample(self.text, pictures, render, self.item.family)
 
     def render(self, frames: FrameReader, frame_count: int, seed: int | None, epoch: int) -> Sample:
         s = self if seed is None else self.permuted(seed, epoch)
+        if s.facts:
+            return facts_sample(s.item, s.mode, s.regime, s.facts, s.response)
         return selection_sample(s.item, s.mode, s.regime, frames, frame_count, s.response)
 
     def permuted(self, seed: int, epoch: int) -> SupervisedItem:
@@ -66,6 +73,7 @@ class SupervisedItem:
             self,
             item=reorder_candidates(self.item, order),
             rationale=relabel_text(self.rationale, order),
+            facts=relabel_text(self.facts, order),
             # One line per candidate, in the order of the letters.
             matches=tuple(sorted(relabel_text(line, order) for line in self.matches)),
         )
@@ -77,27 +85,47 @@ def supervised_items(
     rationales: dict[str, Rationale],
     regime: str,
     teacher: TeacherConfig,
+    with_facts: bool = False,
 ) -> dict[str, list[SupervisedItem]]:
     """Return, by mode, every item in answer mode, and in reasoning mode if `rationales` has its id.
 
     A student that is trained on rationales learns both modes, so that it can be prompted in either.
 
     Args:
-        teacher: Settings of the rationales; the lines about matches have their vocabulary.
+        teacher: Settings of the rationales; the lines about matches and the facts have their
+            vocabulary.
+        with_facts: Whether the facts of an item replace its frames. Items without a rationale are
+            then left out.
     """
     by_mode: dict[str, list[SupervisedItem]] = {mode: [] for mode in MODES}
     for item in items:
-        if rationale := rationales.get(item.item_id):
-            lines: tuple[str, ...] = ()
-            if has_matches(regime):
-                # An item that has a rationale has predicates.
-                predicates = describe_item(item, store, teacher)
-                lines = write_match_lines(choose_vocabulary(predicates, teacher), item)
+        rationale, facts, lines = rationales.get(item.item_id), "", ()
+        if rationale and (with_facts or has_matches(regime)):
+            # An item that has a rationale has predicates.
+            predicates = choose_vocabulary(describe_item(item, store, teacher), teacher)
+            facts = write_facts(predicates, item) if with_facts else ""
+            lines = write_match_lines(predicates, item) if has_matches(regime) else ()
+        if rationale:
             by_mode["reasoning"].append(
-                SupervisedItem(item, "reasoning", regime, rationale.text, lines)
+                SupervisedItem(item, "reasoning", regime, rationale.text, lines, facts)
             )
-        by_mode["answer"].append(SupervisedItem(item, "answer", regime))
+        if facts or not with_facts:
+            by_mode["answer"].append(SupervisedItem(item, "answer", regime, facts=facts))
     return by_mode
+
+
+def split_items(
+    store: Store, validation_items: int, seed: int
+) -> tuple[list[SelectionItem], list[SelectionItem]]:
+    """Return the training items, and a sample of the items of held-out training scenes. No frame of
+    a held-out scene is visible in training, not even as a distractor."""
+    held_out = held_out_scenes(store)
+    training_scenes = set(store.scene_ids("train")) - held_out
+    items = store.selection("train")
+    training = [item for item in items if uses_only(item, training_scenes)]
+    # The items are sorted by family; a part of them has all families only if they are shuffled.
+    validation = shuffled([i for i in items if i.scene_id in held_out], seed)
+    return training, validation[:validation_items]
 
 
 def load_datasets(
@@ -112,24 +140,18 @@ def load_datasets(
     frames = FrameReader(store, cfg.student.image_size)
     if train.regime != "answer_only":
         check_not_empty(len(rationales), "accepted rationales")
-    held_out = held_out_scenes(store)
-    training_scenes = set(store.scene_ids("train")) - held_out
-    items = store.selection("train")
-    # No frame of a held-out scene is visible in training, not even as a distractor.
-    training_items = [item for item in items if uses_only(item, training_scenes)]
+    training_items, validation_items = split_items(store, train.validation_items, seed)
     by_item = {r.item_id: r for r in rationales}
-    # The items are sorted by family; a part of them has all families only if they are shuffled.
-    validation_items = shuffled([i for i in items if i.scene_id in held_out], seed)
 
     def samples_of(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
-        by_mode = supervised_items(store, items, by_item, train.regime, cfg.teacher)
+        by_mode = supervised_items(store, items, by_item, train.regime, cfg.teacher, train.facts)
         return {
             mode: [s.lazy_sample(frames, frame_count, seed) for s in supervised]
             for mode, supervised in by_mode.items()
         }
 
     training = samples_of(training_items, seed if train.permute_candidates else None)
-    validation = samples_of(validation_items[: train.validation_items], None)
+    validation = samples_of(validation_items, None)
     samples = [sample for part in training.values() for sample in part]
     check_not_empty(len(samples), f"samples for train.regime={train.regime}")
     check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")

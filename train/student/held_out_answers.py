@@ -13,7 +13,7 @@ from torch import nn
 from transformers import ProcessorMixin
 
 from conf.runs import rank
-from conf.schema import SftCommand
+from conf.schema import StudentConfig, StudentTrainConfig
 from models.memory import explain_out_of_memory
 from models.student.answer_parser import parse_choice
 from models.student.collator import Collator
@@ -30,14 +30,20 @@ class HeldOutAnswers:
     appends them to the run's samples.jsonl. Decoding is greedy and uses no random numbers.
 
     Args:
-        cfg: Settings whose train.precision is bf16 or fp32, not auto.
+        train: Settings whose precision is bf16 or fp32, not auto.
         folder: The run's folder.
     """
 
-    def __init__(self, cfg: SftCommand, processor: ProcessorMixin, folder: Path) -> None:
-        self._cfg, self._processor = cfg, processor
+    def __init__(
+        self,
+        train: StudentTrainConfig,
+        student: StudentConfig,
+        processor: ProcessorMixin,
+        folder: Path,
+    ) -> None:
+        self._train, self._student, self._processor = train, student, processor
         self._path = folder / ANSWERS
-        self._collator = Collator(processor, cfg.student.max_length)
+        self._collator = Collator(processor, student.max_length)
 
     def measure(
         self, model: nn.Module, mode: str, samples: StudentDataset, step: int
@@ -48,7 +54,7 @@ class HeldOutAnswers:
         Raises:
             UserError: memory runs out.
         """
-        train, student = self._cfg.train, self._cfg.student
+        train, student = self._train, self._student
         first = [samples[k] for k in range(min(train.generated_items, len(samples)))]
         inputs = self._collator([replace(sample, response=None) for sample in first])
         limit = response_token_limit(mode, student.max_new_tokens)

@@ -10,7 +10,7 @@ from torch import nn
 from transformers import ProcessorMixin, TrainingArguments
 
 from conf.runs import Run, local_world_size, world_size
-from conf.schema import SftCommand
+from conf.schema import SftCommand, StudentTrainConfig
 from models.distributed import split_batch
 from models.memory import available_cpu_bytes
 from models.student.collator import Collator, letter_ids
@@ -34,6 +34,30 @@ def prefetch_factor(workers: int, accumulation: int) -> int | None:
     prepare at least as many in advance, so that they are ready when the previous step ends.
     """
     return max(2, math.ceil(accumulation / workers)) if workers else None
+
+
+def student_arguments(
+    train: StudentTrainConfig, run: Run, seed: int, checkpoint: Path | None, all_weights: bool
+) -> TrainingArguments:
+    """Return the arguments of a student's trainer.
+
+    Args:
+        train: The settings; `precision` is bf16 or fp32, not auto.
+        checkpoint: The checkpoint that the run resumes from, or None.
+        all_weights: Whether all weights are trained, not only adapters.
+    """
+    accumulation = split_batch(train.batch, train.micro_batch)
+    return TrainingArguments(
+        **common_arguments(train, run, seed, checkpoint),
+        per_device_train_batch_size=train.micro_batch,
+        gradient_accumulation_steps=accumulation,
+        per_device_eval_batch_size=train.micro_batch,
+        dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
+        label_names=["labels"],
+        # Every pass uses all adapters. If all weights are trained, prompts without images leave
+        # those of the vision tower unused.
+        ddp_find_unused_parameters=all_weights,
+    )
 
 
 def build_trainer(
@@ -67,22 +91,10 @@ def build_trainer(
         limit = available_cpu_bytes() // 2 // local_world_size()
         cache = VisionCache(model, train.precision, limit)
     if train.generated_items:
-        answers = HeldOutAnswers(cfg, processor, run.folder)
-    accumulation = split_batch(train.batch, train.micro_batch)
-    arguments = TrainingArguments(
-        **common_arguments(train, run, cfg.seed, checkpoint),
-        per_device_train_batch_size=train.micro_batch,
-        gradient_accumulation_steps=accumulation,
-        per_device_eval_batch_size=train.micro_batch,
-        dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
-        label_names=["labels"],
-        # Every pass uses all adapters. If all weights are trained, prompts without images leave
-        # those of the vision tower unused.
-        ddp_find_unused_parameters=not student.lora.rank,
-    )
+        answers = HeldOutAnswers(train, student, processor, run.folder)
     return StudentTrainer(
         model=model,
-        args=arguments,
+        args=student_arguments(train, run, cfg.seed, checkpoint, not student.lora.rank),
         data_collator=TrainerCollator(collator, digests=cache is not None),
         train_dataset=training,
         eval_dataset=validation,

@@ -11,12 +11,13 @@ import pytest
 from data.records import LETTERS, SelectionItem
 from data.store import Store
 from evaluation.metrics.intervals import SceneBootstrap
-from evaluation.metrics.reasons import PARTS, ReasonSummary, measure_reasons, read_reasons
+from evaluation.metrics.reasons import ReasonSummary, measure_reasons, read_reasons
 from evaluation.reporting.item_browser import mark_claims
 from evaluation.reporting.run_responses import parse_response
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.relations import Bounds
+from teacher.validation.reasons import PARTS
 
 
 @pytest.fixture(scope="module")

@@ -169,7 +169,8 @@ def held_out(responses: list[str]) -> StudentDataset:
 def test_shares_of_parsed_and_correct_answers(few_steps, processor, tmp_path) -> None:
     samples = held_out(["Answer: A", "It falls.\nAnswer: B", "Answer: C", "Answer: D", "Answer: A"])
     texts = ["Answer: A", "It falls.\nAnswer: C", "It falls", "Answer: D"]
-    answers = HeldOutAnswers(few_steps(generated_items=4), processor, tmp_path)
+    settings = few_steps(generated_items=4)
+    answers = HeldOutAnswers(settings.train, settings.student, processor, tmp_path)
     measures = answers.measure(Writer(processor, texts), "answer", samples, step=7)
     assert measures == {"generated_parse_rate": 3 / 4, "generated_accuracy": 2 / 4}
     rows = [json.loads(line) for line in (tmp_path / "samples.jsonl").read_text().splitlines()]

@@ -1,0 +1,160 @@
+"""On-policy distillation: the loss is the divergence on the student's own tokens."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+
+from conf.entry import Run
+from conf.runs import open_run
+from conf.schema import DistillCommand, DistillTrainConfig, SftCommand
+from data.store import Store
+from models import loading
+from models.trained_runs import trained_settings
+from tests.user_errors import raises_user_error
+from train import distill, sft
+from train.common.journal import read_journal
+from train.export import find_run
+from train.student import distillation, paired_prompts
+from train.student.distillation import check_tokenizer
+from train.student.paired_prompts import PairedPrompts
+
+pytestmark = pytest.mark.slow
+
+
+def finish_run(settings: SftCommand, folder: Path) -> Path:
+    """Train a student, as the command does."""
+    # The tokenizer was not trained on rationales.
+    settings = replace(settings, student=replace(settings.student, max_length=4000))
+    run = Run(folder.name, folder)
+    open_run(run, asdict(settings), "train.sft")
+    metrics = sft.main.__wrapped__(settings, run)
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def student(few_steps, tmp_path_factory) -> Path:
+    return finish_run(few_steps(max_steps=1), tmp_path_factory.mktemp("student"))
+
+
+@pytest.fixture(scope="module")
+def teacher(few_steps, tmp_path_factory) -> Path:
+    return finish_run(few_steps(max_steps=2, facts=True), tmp_path_factory.mktemp("teacher"))
+
+
+@pytest.fixture
+def settings(student: Path, teacher: Path, micro_store: Store) -> DistillCommand:
+    train = DistillTrainConfig(
+        lr=1e-2, max_steps=4, batch=4, micro_batch=2, precision="fp32", evaluations=2,
+        validation_items=2, generated_items=0, permute_candidates=True,
+    )  # fmt: skip
+    return DistillCommand(
+        model=str(student), teacher_model=str(teacher), store=str(micro_store.folder.parent),
+        workers=1, train=train,
+    )  # fmt: skip
+
+
+def run_distill(settings: DistillCommand, folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    distill.main.__wrapped__(settings, Run(folder.name, folder))
+    return folder
+
+
+def test_a_killed_run_samples_the_same_responses(settings, tmp_path, monkeypatch) -> None:
+    sampled: dict[str, list[tuple[int, ...]]] = {"whole": [], "resumed": []}
+    sample = distillation.ResponseSampler.sample
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+
+    def recorded(self, model, samples):
+        texts = sample(self, model, samples)
+        sampled[current].extend(text.ids for text in texts)
+        return texts
+
+    monkeypatch.setattr(distillation.ResponseSampler, "sample", recorded)
+    current = "whole"
+    run_distill(settings, whole)
+    shutil.copytree(whole / "checkpoint-2", resumed / "checkpoint-2")
+    shutil.copy(whole / "metrics.jsonl", resumed)
+    current = "resumed"
+    run_distill(settings, resumed)
+    assert len(sampled["whole"]) == 16
+    assert len(set(sampled["whole"])) > 8
+    assert sampled["resumed"] == sampled["whole"][8:]
+    for first, second in zip(read_journal(whole), read_journal(resumed), strict=True):
+        assert first == pytest.approx(second, rel=1e-4)
+    losses = [r for r in read_journal(whole) if "loss" in r]
+    assert len(losses) == 4
+    assert all(r["loss"] > 0 and 0 <= r["sampled_parse_rate"] <= 1 for r in losses)
+
+
+def test_a_teacher_equal_to_the_student_gives_no_loss(settings, tmp_path, monkeypatch) -> None:
+    """If the teacher has the student's weights and its prompt, loss and gradient are zero."""
+    pair = paired_prompts.pair_prompts
+
+    def same_prompts(*arguments):
+        lazy = pair(*arguments)
+
+        def render(epoch: int) -> PairedPrompts:
+            sample = lazy.render(epoch)
+            return replace(sample, teacher=sample.student)
+
+        return replace(lazy, render=render)
+
+    monkeypatch.setattr(paired_prompts, "pair_prompts", same_prompts)
+    train = replace(settings.train, max_steps=1, evaluations=1)
+    folder = run_distill(replace(settings, teacher_model=None, train=train), tmp_path / "run")
+    (record,) = (r for r in read_journal(folder) if "loss" in r)
+    assert record["loss"] == pytest.approx(0, abs=1e-6)
+    # The student's layers use other kernels than the teacher's.
+    assert record["grad_norm"] == pytest.approx(0, abs=1e-3)
+
+
+def test_micro_batches_change_neither_loss_nor_gradient(settings, tmp_path) -> None:
+    records = []
+    for micro_batch in (4, 1):
+        train = replace(settings.train, max_steps=1, evaluations=1, micro_batch=micro_batch)
+        folder = run_distill(replace(settings, train=train), tmp_path / str(micro_batch))
+        records += [r for r in read_journal(folder) if "loss" in r]
+    assert records[0]["loss"] == pytest.approx(records[1]["loss"], rel=1e-4)
+    assert records[0]["grad_norm"] == pytest.approx(records[1]["grad_norm"], rel=1e-3)
+
+
+def test_the_student_can_be_evaluated_and_exported(settings, student, tmp_path) -> None:
+    run = Run("run", tmp_path / "distill" / "run")
+    open_run(run, asdict(settings), "train.distill")
+    metrics = distill.main.__wrapped__(settings, run)
+    (run.folder / "metrics.json").write_text(json.dumps(metrics))
+    # Its settings no longer depend on the run that it continues.
+    source = trained_settings(student, SftCommand, "student")
+    student.rename(tmp_path / "moved")
+    name, folder, found = find_run(str(run.folder), "student", str(tmp_path))
+    (tmp_path / "moved").rename(student)
+    assert (name, folder) == ("distill/run", run.folder)
+    assert (found.student, found.benchmark) == (source.student, source.benchmark)
+    assert (found.train.regime, found.train.lr) == (source.train.regime, settings.train.lr)
+    loading.load_trained(found.student, "fp32", run.folder / "student")
+
+
+def test_a_teacher_with_another_tokenizer_is_refused(processor, student, tmp_path) -> None:
+    folder = shutil.copytree(student / "student", tmp_path / "other")
+    other = loading.AutoProcessor.from_pretrained(folder)
+    other.tokenizer.add_tokens(["zebra"])
+    with raises_user_error("other-tokenizer", contains="'zebra' (id None in the student"):
+        check_tokenizer(tmp_path, loading.AutoProcessor.from_pretrained(folder), other)
+
+
+def test_unsuitable_runs_are_refused(settings, student, teacher, few_steps, tmp_path) -> None:
+    with raises_user_error("missing-run", contains="model is missing"):
+        run_distill(replace(settings, model=None), tmp_path / "a")
+    with raises_user_error("facts-instead-of-frames", contains=str(teacher)):
+        run_distill(replace(settings, model=str(teacher)), tmp_path / "b")
+    answers = finish_run(few_steps(max_steps=1, regime="answer_only"), tmp_path / "answers")
+    with raises_user_error("untrained-mode", contains="train.regime=answer_only"):
+        run_distill(replace(settings, model=str(answers)), tmp_path / "c")
+    with raises_user_error("other-settings", contains="train.regime=answer_only"):
+        run_distill(replace(settings, teacher_model=str(answers)), tmp_path / "d")

@@ -1,0 +1,173 @@
+"""Reinforcement learning: TRL's loss on responses to prompts with clips."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from conf.entry import Run
+from conf.runs import open_run
+from conf.schema import ReinforceCommand, ReinforceTrainConfig, RewardWeights, SftCommand
+from data.store import Store
+from models.trained_runs import trained_settings
+from train import reinforce, sft
+from train.common.journal import read_journal
+from train.student import reinforcement
+from train.student.trainer import token_losses
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def student(few_steps, tmp_path_factory) -> Path:
+    run = Run("student", tmp_path_factory.mktemp("student"))
+    settings = few_steps(max_steps=1)
+    # The tokenizer was not trained on rationales.
+    settings = replace(settings, student=replace(settings.student, max_length=4000))
+    open_run(run, asdict(settings), "train.sft")
+    metrics = sft.main.__wrapped__(settings, run)
+    (run.folder / "metrics.json").write_text(json.dumps(metrics))
+    return run.folder
+
+
+@pytest.fixture
+def settings(student: Path, micro_store: Store) -> ReinforceCommand:
+    train = ReinforceTrainConfig(
+        lr=1e-2, max_steps=4, batch=2, responses=4, micro_batch=4, precision="fp32",
+        evaluations=2, validation_items=1, rewards=RewardWeights(form=0),
+    )  # fmt: skip
+    return ReinforceCommand(
+        model=str(student), store=str(micro_store.folder.parent), workers=1, train=train
+    )
+
+
+def run_reinforce(settings: ReinforceCommand, folder: Path) -> Path:
+    folder.mkdir(exist_ok=True)
+    reinforce.main.__wrapped__(settings, Run(folder.name, folder))
+    return folder
+
+
+@pytest.fixture
+def short_rewards(monkeypatch) -> None:
+    """A reward that differs between random texts: minus the number of their letters."""
+    monkeypatch.setitem(reinforcement.REWARDS, "answer", lambda r: -len(r.text) / 10)
+
+
+def test_a_killed_run_samples_the_same_responses(
+    settings, tmp_path, monkeypatch, short_rewards
+) -> None:
+    sampled: dict[str, list[tuple[int, ...]]] = {"whole": [], "resumed": []}
+    sample = reinforcement.ResponseSampler.sample
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+
+    def recorded(self, model, prompts):
+        texts = sample(self, model, prompts)
+        if len(prompts) == 8:  # those of a training step
+            sampled[current].extend(text.ids for text in texts)
+        return texts
+
+    monkeypatch.setattr(reinforcement.ResponseSampler, "sample", recorded)
+    current = "whole"
+    run_reinforce(settings, whole)
+    shutil.copytree(whole / "checkpoint-2", resumed / "checkpoint-2")
+    shutil.copy(whole / "metrics.jsonl", resumed)
+    current = "resumed"
+    run_reinforce(settings, resumed)
+    assert len(sampled["whole"]) == 4 * 8
+    assert sampled["resumed"] == sampled["whole"][16:]
+    steps = [r for r in read_journal(whole) if "reward" in r]
+    assert len(steps) == 4
+    assert all(r["rewards/answer/mean"] < 0 for r in steps)
+    assert all(r["grad_norm"] > 0 for r in steps)
+
+
+def test_probabilities_are_those_of_the_student_trainer(
+    settings, tmp_path, monkeypatch, short_rewards
+) -> None:
+    """The summed logarithms of a response's probabilities are minus its cross entropy."""
+    checked = []
+    compute = reinforcement.MediaGRPOTrainer._get_per_token_logps_and_entropies
+
+    def compared(self, model, input_ids, attention_mask, logits_to_keep, *rest, **settings):
+        logs, entropies, _ = compute(
+            self, model, input_ids, attention_mask, logits_to_keep, *rest, **settings
+        )
+        mask = attention_mask[:, -logits_to_keep:].bool()
+        samples = [
+            replace(sample, response="", response_ids=tuple(ids[kept].tolist()))
+            for sample, ids, kept in zip(
+                self._inputs, input_ids[:, -logits_to_keep:], mask, strict=True
+            )
+        ]
+        batch = self._collator(samples)
+        labels = batch.pop("labels")
+        with torch.no_grad():
+            losses = token_losses(model(**batch, use_cache=False).logits, labels)
+        torch.testing.assert_close((logs * mask).sum(dim=-1), -losses[:, 0], atol=1e-3, rtol=1e-3)
+        checked.append(len(samples))
+        return logs, entropies, None
+
+    monkeypatch.setattr(
+        reinforcement.MediaGRPOTrainer, "_get_per_token_logps_and_entropies", compared
+    )
+    train = replace(settings.train, max_steps=1, evaluations=1)
+    run_reinforce(replace(settings, train=train), tmp_path / "run")
+    assert sum(checked) >= 8
+
+
+def test_a_run_resumes_in_its_second_epoch(settings, tmp_path, monkeypatch, short_rewards) -> None:
+    """Each epoch has its own order of the items."""
+    seen: dict[str, list[list[str]]] = {"whole": [], "resumed": []}
+    respond = reinforcement.MediaGRPOTrainer._respond
+    load = reinforcement.load_items
+
+    def recorded(self, prompts, trainer):
+        if self.model.training:
+            seen[current].append([judged.item.item_id for judged in self._judged[::4]])
+        return respond(self, prompts, trainer)
+
+    def four_items(*arguments):
+        training, validation = load(*arguments)
+        return training[:4], validation
+
+    monkeypatch.setattr(reinforcement.MediaGRPOTrainer, "_respond", recorded)
+    monkeypatch.setattr(reinforcement, "load_items", four_items)
+    train = replace(settings.train, max_steps=6, evaluations=2)
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    current = "whole"
+    run_reinforce(replace(settings, train=train), whole)
+    shutil.copytree(whole / "checkpoint-3", resumed / "checkpoint-3")
+    current = "resumed"
+    run_reinforce(replace(settings, train=train), resumed)
+    assert seen["resumed"] == seen["whole"][3:]
+    epochs = [seen["whole"][k] + seen["whole"][k + 1] for k in (0, 2, 4)]
+    assert all(sorted(epoch) == sorted(epochs[0]) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) > 1
+
+
+def test_equal_rewards_leave_the_student_unchanged(settings, tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(reinforcement.REWARDS, "answer", lambda _: 1.0)
+    for name in ("truth", "following", "no_numbers"):
+        monkeypatch.setitem(reinforcement.REWARDS, name, lambda _: 0.0)
+    train = replace(settings.train, max_steps=1, evaluations=1)
+    folder = run_reinforce(replace(settings, train=train), tmp_path / "run")
+    (step,) = (r for r in read_journal(folder) if "reward" in r)
+    assert step["frac_reward_zero_std"] == 1
+    assert step["grad_norm"] == 0
+
+
+def test_the_student_can_be_evaluated(settings, student, tmp_path) -> None:
+    run = Run("run", tmp_path / "reinforce" / "run")
+    open_run(run, asdict(settings), "train.reinforce")
+    metrics = reinforce.main.__wrapped__(
+        replace(settings, train=replace(settings.train, max_steps=1, evaluations=1)), run
+    )
+    (run.folder / "metrics.json").write_text(json.dumps(metrics))
+    found = trained_settings(run.folder, SftCommand, "student")
+    assert found.student == trained_settings(student, SftCommand, "student").student
+    assert "reward" in metrics

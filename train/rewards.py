@@ -1,0 +1,130 @@
+"""Rewards of a student's responses: what the simulator finds true, and what the form requires.
+
+Each reward is a function of a `JudgedResponse`. A reward cannot be raised by empty text: a response
+that repeats itself, copies the question, states nothing that the simulator can check, or names all
+letters earns no more than the answer line alone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from data.records import SelectionItem
+from models.student.answer_parser import parse_choice
+from teacher.numbers.detection import find_numbers
+from teacher.predicates.facts import Relation, RelationalPredicates
+from teacher.predicates.relations import VALUES, normalize_relation
+from teacher.reading.grounding import Claim
+from teacher.sections import SECTIONS, split_sections
+from teacher.validation.reasons import CONTRADICTED, SUPPORTED, ResponseReasons, read_response
+
+ENOUGH_CLAIMS = 6
+"""Number of different claims from which on their share counts. Fewer claims earn less."""
+MAX_MENTIONS = 10
+"""A claim that a response states more often than this counts as contradicted each further time. In
+the narrator's responses, the analysis and the match layout repeat what is predicted for each false
+candidate ("not near the top")."""
+
+
+@dataclass(frozen=True)
+class JudgedResponse:
+    """A response to an item, as the oracle judges it.
+
+    Attributes:
+        letter: The chosen letter, if any.
+        target: The letter of the target.
+        cut: Whether the response was cut off at the token limit.
+    """
+
+    text: str
+    letter: str | None
+    target: str
+    reasons: ResponseReasons
+    cut: bool
+
+
+def judge_response(
+    text: str, cut: bool, item: SelectionItem, predicates: RelationalPredicates
+) -> JudgedResponse:
+    """Return a response with its answer and its claims.
+
+    Args:
+        predicates: All predicates of the item.
+    """
+    letter = parse_choice(text, cut=cut).letter
+    reasons = read_response(text, letter, item.letter, predicates)
+    return JudgedResponse(text, letter, item.letter, reasons, cut)
+
+
+def reward_answer(response: JudgedResponse) -> float:
+    """Return 1 for the target's letter, otherwise 0."""
+    return float(response.letter == response.target)
+
+
+def reward_truth(response: JudgedResponse) -> float:
+    """Return the share of the claims that the oracle supports less that of those it contradicts,
+    from -1 to 1.
+
+    Each claim counts once, whatever its moment and the order of its objects; further mentions above
+    `MAX_MENTIONS` count as contradicted. Only certain claims can count as supported, and negated
+    ones count only if they are contradicted: otherwise, a list of what may be, or of what is not
+    the case, would be supported without any knowledge.
+    """
+    mentions: Counter[tuple] = Counter()
+    affirmed, supported, contradicted = set(), set(), set()
+    for claims in response.reasons.claims.values():
+        for claim in claims:
+            key = _identify(claim)
+            mentions[key] += 1
+            if claim.affirmed:
+                affirmed.add(key)
+            if claim.verdict == CONTRADICTED:
+                contradicted.add(key)
+            elif _is_earned(claim):
+                supported.add(key)
+    repeated = sum(max(0, count - MAX_MENTIONS) for count in mentions.values())
+    total = max(len(affirmed | contradicted) + repeated, ENOUGH_CLAIMS)
+    return (len(supported - contradicted) - len(contradicted) - repeated) / total
+
+
+def _identify(claim: Claim) -> tuple:
+    subjects, value = claim.subjects, claim.value
+    if claim.kind in VALUES and len(subjects) > 1:
+        _, subjects, value = normalize_relation(Relation(claim.kind, subjects, value))
+    return claim.kind, subjects, value, claim.affirmed, claim.candidate
+
+
+def _is_earned(claim: Claim) -> bool:
+    return claim.verdict == SUPPORTED and claim.certain and claim.affirmed
+
+
+def reward_following(response: JudgedResponse) -> float:
+    """Return 1 if the answer follows from the text, the text is rather true than false (see
+    `reward_truth`), and the oracle supports a claim of its prediction; otherwise 0."""
+    predicted = any(map(_is_earned, response.reasons.claims["prediction"]))
+    return float(response.reasons.follows and predicted and reward_truth(response) > 0)
+
+
+def reward_no_numbers(response: JudgedResponse) -> float:
+    """Return -1 for a text with numbers, otherwise 0."""
+    return -float(bool([*find_numbers(response.text)]))
+
+
+def reward_form(response: JudgedResponse) -> float:
+    """Return -1 for a response that was cut off, or whose sections and answer are out of order or
+    occur twice, otherwise 0. A response without sections has no form that it could miss."""
+    headings = [name for name, _, _ in split_sections(response.text)]
+    in_order = headings == [name for name in (*SECTIONS, "Answer") if name in headings]
+    return -float(response.cut or not in_order)
+
+
+REWARDS: dict[str, Callable[[JudgedResponse], float]] = {
+    "answer": reward_answer,
+    "truth": reward_truth,
+    "following": reward_following,
+    "no_numbers": reward_no_numbers,
+    "form": reward_form,
+}
+"""The rewards by the names of their weights."""

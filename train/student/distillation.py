@@ -1,0 +1,321 @@
+"""On-policy distillation: a student is trained on its own responses towards a teacher.
+
+Each step samples the student's response to each item of the batch. The loss is the divergence of
+the student's distribution from the teacher's at each token of these responses. The student sees the
+frames of the item; the teacher reads its facts as text. No gradient flows through the sampling.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import log_softmax
+from transformers import ProcessorMixin, SuppressTokensLogitsProcessor
+
+from conf.errors import UserError
+from conf.runs import Run, world_size
+from conf.schema import (
+    DistillCommand,
+    DistillTrainConfig,
+    ReinforceTrainConfig,
+    SftCommand,
+    StudentConfig,
+)
+from models import loading
+from models.distributed import rank_device
+from models.memory import explain_out_of_memory
+from models.resolved import check_base
+from models.student.answer_parser import parse_choice
+from models.student.collator import IGNORED, Collator, letter_ids
+from models.student.generation import generate, sampling_processors
+from models.student.prompts import Sample
+from models.student.responses import GeneratedText
+from models.trained_runs import product_folder, trained_settings
+from train.common.audit import audit_student
+from train.common.callbacks import EpochCallback
+from train.student.divergence import measure_divergence
+from train.student.held_out_answers import HeldOutAnswers
+from train.student.lazy_samples import StudentDataset
+from train.student.length_sampler import LengthSampler
+from train.student.metrics import LetterAccuracy
+from train.student.paired_prompts import PairedPrompts
+from train.student.run import student_arguments
+from train.student.trainer import StudentTrainer, TrainerCollator, token_mean
+
+log = logging.getLogger(__name__)
+
+TEACHER = "teacher_inputs"
+"""Key of the teacher's inputs in a batch."""
+MAX_UNPARSED = 64
+"""Number of consecutive responses without an answer after which a run stops."""
+
+
+@dataclass(frozen=True)
+class DistillationCollator:
+    """Passes on the prompts of training batches, which get their responses later; validation
+    samples become tensors."""
+
+    collate: TrainerCollator
+
+    def __call__(self, samples: Sequence[Sample | PairedPrompts]) -> dict[str, Any]:
+        if isinstance(samples[0], PairedPrompts):
+            return {"prompts": list(samples)}
+        return self.collate(samples)
+
+
+class ResponseSampler:
+    """Samples a student's responses, each with its own seed.
+
+    Args:
+        student: Settings of the student; those of sampling are replaced.
+    """
+
+    def __init__(
+        self,
+        processor: ProcessorMixin,
+        student: StudentConfig,
+        train: DistillTrainConfig | ReinforceTrainConfig,
+    ) -> None:
+        self._processor, self._precision = processor, train.precision
+        self._sampling = replace(student, temperature=train.temperature, top_p=1.0, top_k=0)
+        self._collate = Collator(processor, student.max_length)
+        # The model would expect pixels for such a token in a response.
+        self._never = [processor.image_token_id, processor.video_token_id]
+
+    def sample(self, model: nn.Module, prompts: Sequence[PairedPrompts]) -> list[GeneratedText]:
+        """Return a response to each student's prompt.
+
+        Raises:
+            UserError: Memory runs out.
+        """
+        model.eval()
+        inputs = self._collate([p.student for p in prompts])
+        steps = sampling_processors(self._sampling, [p.seed for p in prompts])
+        device = next(model.parameters()).device
+        steps.insert(0, SuppressTokensLogitsProcessor(self._never, device=device))
+        when = f"while sampling {len(prompts)} responses"
+        with explain_out_of_memory(when, "lower train.batch in another run (run=NAME)"):
+            limit = self._sampling.max_new_tokens
+            return generate(model, self._processor, inputs, limit, self._precision, steps)
+
+
+class DistillationTrainer(StudentTrainer):
+    """A student's trainer whose loss is the divergence from a teacher on sampled responses.
+
+    Evaluations are those of `StudentTrainer`, with the narrator's rationales as responses.
+
+    Args:
+        teacher: The teacher's model, which is not trained.
+        responses: Samples the responses.
+        student_collator, teacher_collator: Make the inputs of both models.
+        beta: See `measure_divergence`.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        teacher: nn.Module,
+        responses: ResponseSampler,
+        student_collator: TrainerCollator,
+        teacher_collator: Collator,
+        beta: float,
+        **settings: Any,
+    ) -> None:
+        super().__init__(*args, compute_loss_func=self._mean_divergence, **settings)
+        self._teacher, self._responses = teacher, responses
+        self._student_collator, self._teacher_collator = student_collator, teacher_collator
+        self._beta = beta
+        self._teacher_logits: Tensor | None = None
+        self._sampled: list[tuple[bool, bool, int]] = []
+        self._unparsed = 0
+
+    def get_batch_samples(
+        self, epoch_iterator: Iterator, num_batches: int, device: torch.device
+    ) -> tuple[list, Tensor | int | None]:
+        """Sample the responses of a step, and return its micro-batches with them."""
+        batches, _ = super().get_batch_samples(epoch_iterator, num_batches, device)
+        parts = [batch["prompts"] for batch in batches]
+        texts = iter(self._sample_responses([p for part in parts for p in part]))
+        batches = [self._add_responses(part, [next(texts) for _ in part]) for part in parts]
+        return batches, self._get_num_items_in_batch(batches, device)
+
+    def _sample_responses(self, prompts: Sequence[PairedPrompts]) -> list[GeneratedText]:
+        texts = self._responses.sample(self.model, prompts) if prompts else []
+        for prompt, text in zip(prompts, texts, strict=True):
+            if not prompt.supervised:
+                continue
+            letter = parse_choice(text.text, cut=text.cut).letter
+            self._unparsed = 0 if letter else self._unparsed + 1
+            self._sampled.append((letter == prompt.letter, letter is not None, len(text.ids)))
+        if self._unparsed >= MAX_UNPARSED:
+            raise UserError(
+                f"none of the last {self._unparsed} sampled responses has an answer: lower "
+                "train.temperature or train.lr in another run (run=NAME), or train the student "
+                "longer first",
+                code="nothing-parsed",
+            )
+        return texts
+
+    def _add_responses(
+        self, prompts: Sequence[PairedPrompts], texts: Sequence[GeneratedText]
+    ) -> dict[str, Any]:
+        """Return the inputs of student and teacher. The labels of both are the responses."""
+
+        def respond(samples: Sequence[Sample]) -> list[Sample]:
+            return [
+                replace(s, response=t.text, response_ids=t.ids, supervised=p.supervised)
+                for s, t, p in zip(samples, texts, prompts, strict=True)
+            ]
+
+        teacher = self._teacher_collator(respond([p.teacher for p in prompts]))
+        teacher.pop("labels", None)
+        student = self._student_collator(respond([p.student for p in prompts]))
+        return {**student, TEACHER: teacher}
+
+    def compute_loss(
+        self,
+        model: nn.Module,
+        inputs: dict[str, Any],
+        return_outputs: bool = False,
+        **settings: Any,
+    ) -> Any:
+        teacher = inputs.pop(TEACHER, None)
+        if teacher is not None:
+            device, bf16 = self.args.device.type, self.args.bf16
+            with torch.no_grad(), torch.autocast(device, torch.bfloat16, enabled=bf16):
+                self._teacher_logits = self._teacher(**teacher, use_cache=False).logits
+        return super().compute_loss(model, inputs, return_outputs, **settings)
+
+    def _mean_divergence(
+        self, outputs: Any, labels: Tensor, num_items_in_batch: Tensor | int | None = None
+    ) -> Tensor:
+        """Return a micro-batch's part of the mean divergence over an accumulated batch's tokens;
+        in an evaluation, of the mean cross entropy."""
+        teacher, self._teacher_logits = self._teacher_logits, None
+        if teacher is None:
+            return token_mean(outputs, labels, num_items_in_batch)
+        supervised = labels[:, 1:] != IGNORED
+        # A larger model's table of tokens may be padded to another size.
+        width = min(outputs.logits.shape[-1], teacher.shape[-1])
+        student, teacher = (
+            log_softmax(logits[:, :-1][supervised][:, :width].float(), dim=-1)
+            for logits in (outputs.logits, teacher)
+        )
+        total = measure_divergence(student, teacher, self._beta).sum()
+        return total / (supervised.sum() if num_items_in_batch is None else num_items_in_batch)
+
+    def log(self, logs: dict[str, float], *args: Any, **settings: Any) -> None:
+        """Add the measures of the responses that all ranks have sampled since the last loss."""
+        if "loss" in logs:
+            sums = [sum(values) for values in zip(*self._sampled, strict=True)] or [0, 0, 0]
+            found = torch.tensor([len(self._sampled), *sums], dtype=torch.float64)
+            found = self.accelerator.reduce(found.to(self.args.device, torch.float32))
+            count, right, parsed, tokens = found.tolist()
+            logs |= {
+                "sampled_accuracy": right / max(count, 1),
+                "sampled_parse_rate": parsed / max(count, 1),
+                "sampled_length": tokens / max(count, 1),
+            }
+            self._sampled = []
+        super().log(logs, *args, **settings)
+
+
+def load_teacher(cfg: DistillCommand, trained: SftCommand, processor: ProcessorMixin) -> nn.Module:
+    """Load the teacher, in evaluation mode.
+
+    Args:
+        trained: Settings of the student.
+        processor: The student's processor.
+
+    Raises:
+        UserError: The teacher cannot be loaded; or it has another tokenizer, regime, vocabulary or
+            benchmark than the student.
+    """
+    folder = Path(cfg.teacher_model or cfg.model)
+    settings = trained_settings(folder, SftCommand, "student", "teacher_model")
+    check_base(folder, settings.student)
+    for name, ours, theirs in (
+        ("train.regime", trained.train.regime, settings.train.regime),
+        ("teacher.predicates", trained.teacher.predicates, settings.teacher.predicates),
+        ("benchmark.name", trained.benchmark.name, settings.benchmark.name),
+    ):
+        if ours != theirs:
+            raise UserError(
+                f"teacher_model={folder} was trained with {name}={theirs}, and the student with "
+                f"{ours}: train a teacher with the student's setting",
+                code="other-settings",
+            )
+    weights = product_folder(folder, "student")
+    model, other = loading.load_trained(settings.student, cfg.train.precision, weights)
+    check_tokenizer(folder, processor, other)
+    return model.to(rank_device())
+
+
+def check_tokenizer(folder: Path, student: ProcessorMixin, teacher: ProcessorMixin) -> None:
+    """Raise UserError if a teacher divides texts into other tokens than the student."""
+    ours, theirs = (p.tokenizer.get_vocab() for p in (student, teacher))
+    if ours == theirs:
+        return
+    differing = {token for token, _ in ours.items() ^ theirs.items()}
+    first = min(differing, key=lambda token: ours.get(token, theirs.get(token)))
+    raise UserError(
+        f"teacher_model={folder} has another tokenizer than the student: the first token that "
+        f"differs is {first!r} (id {ours.get(first)} in the student, {theirs.get(first)} in the "
+        "teacher); choose a teacher of the student's family",
+        code="other-tokenizer",
+    )
+
+
+def build_trainer(
+    cfg: DistillCommand,
+    trained: SftCommand,
+    run: Run,
+    model: nn.Module,
+    teacher: nn.Module,
+    processor: ProcessorMixin,
+    training: StudentDataset,
+    validation: dict[str, StudentDataset],
+    checkpoint: Path | None,
+) -> DistillationTrainer:
+    """Audit the model and the longest validation sample, and return a trainer.
+
+    Args:
+        cfg: Settings whose train.precision is bf16 or fp32, not auto.
+        trained: Settings of the student.
+        checkpoint: The checkpoint that the run resumes from, or None.
+
+    Raises:
+        UserError: the model does not fit its preset, or the longest sample is too long.
+    """
+    train, student = cfg.train, trained.student
+    collator = Collator(processor, student.max_length)
+    lengths = validation["reasoning"].lengths(processor, student.image_size)
+    longest = validation["reasoning"][lengths.index(max(lengths))]
+    log.info(audit_student(model, processor, student, longest, collator))
+    lengths = training.lengths(processor, student.image_size)
+    sampler = LengthSampler(lengths, train.batch, cfg.seed, train.micro_batch, world_size())
+    # The sampled responses are limited by student.max_new_tokens already.
+    unlimited = Collator(processor, None)
+    answers = HeldOutAnswers(train, student, processor, run.folder)
+    return DistillationTrainer(
+        model=model,
+        args=student_arguments(train, run, cfg.seed, checkpoint, not student.lora.rank),
+        data_collator=DistillationCollator(TrainerCollator(collator, digests=False)),
+        train_dataset=training,
+        eval_dataset={mode: samples for mode, samples in validation.items() if len(samples)},
+        callbacks=[EpochCallback(training, sampler)],
+        sampler=sampler,
+        accuracy=LetterAccuracy(letter_ids(processor)),
+        answers=answers if train.generated_items else None,
+        teacher=teacher,
+        responses=ResponseSampler(processor, student, train),
+        student_collator=TrainerCollator(unlimited, digests=False),
+        teacher_collator=unlimited,
+        beta=train.beta,
+    )

@@ -1,0 +1,34 @@
+"""Divergences of a student's distributions over tokens from a teacher's."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def measure_divergence(student: Tensor, teacher: Tensor, beta: float) -> Tensor:
+    """Return the generalised Jensen-Shannon divergence (N,) of distributions over V tokens.
+
+    With the mixture M = beta T + (1 - beta) S, it is beta KL(T || M) + (1 - beta) KL(S || M)
+    (Agarwal et al. 2024, "On-Policy Distillation of Language Models"). It vanishes as beta
+    approaches 0 or 1; there the limits of its ratios to beta and to 1 - beta are returned, KL(T ||
+    S) and KL(S || T).
+
+    Args:
+        student: (N, V) logarithms of the student's probabilities S.
+        teacher: (N, V) logarithms of the teacher's probabilities T.
+    """
+    if beta == 0:
+        return kl_divergence(teacher, student)
+    if beta == 1:
+        return kl_divergence(student, teacher)
+    mixture = torch.logaddexp(teacher + math.log(beta), student + math.log(1 - beta))
+    return beta * kl_divergence(teacher, mixture) + (1 - beta) * kl_divergence(student, mixture)
+
+
+def kl_divergence(log_p: Tensor, log_q: Tensor) -> Tensor:
+    """Return the Kullback-Leibler divergence KL(p || q) (N,) of distributions (N, V), given as
+    logarithms."""
+    return (log_p.exp() * (log_p - log_q)).sum(dim=-1)

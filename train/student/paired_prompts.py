@@ -1,0 +1,89 @@
+"""The prompts of student and teacher in on-policy distillation, about the same items."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from conf.schema import DistillCommand, SftCommand
+from data.records import Rationale
+from data.render.frame_cache import FrameReader
+from data.store import Store
+from models.student.prompts import Sample
+from train.common.held_out import check_not_empty
+from train.student.dataset import SupervisedItem, split_items, supervised_items
+from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
+
+
+@dataclass(frozen=True)
+class PairedPrompts:
+    """The prompts of student and teacher about one item, without responses.
+
+    Attributes:
+        letter: The letter of the target.
+        seed: Seed of the student's response.
+        supervised: Whether the item is trained on; if not, it only fills a batch.
+    """
+
+    student: Sample
+    teacher: Sample
+    letter: str
+    seed: int
+    supervised: bool = True
+
+
+def pair_prompts(
+    item: SupervisedItem, frames: FrameReader, frame_count: int, seed: int, permute: bool
+) -> LazySample:
+    """Return the prompts about an item: with its frames for the student, and with its facts for the
+    teacher.
+
+    Args:
+        item: The item with its facts.
+        seed: Seed of the responses and, if `permute` is true, of the order of the candidates.
+    """
+    order = seed if permute else None
+    student = replace(item, facts="").lazy_sample(frames, frame_count, order)
+    teacher = item.lazy_sample(frames, frame_count, order)
+
+    def render(epoch: int) -> PairedPrompts:
+        shown = item.permuted(seed, epoch) if permute else item
+        rng = seeded_rng("response", seed, epoch, item.item.item_id)
+        return PairedPrompts(
+            replace(student.render(epoch), response=None),
+            replace(teacher.render(epoch), response=None),
+            shown.item.letter,
+            int(rng.integers(2**31)),
+        )
+
+    return replace(student, render=render)
+
+
+def load_datasets(
+    cfg: DistillCommand, trained: SftCommand, store: Store, rationales: Sequence[Rationale]
+) -> tuple[StudentDataset, dict[str, StudentDataset]]:
+    """Return the training dataset, whose samples are `PairedPrompts`, and the validation datasets
+    by mode, with the narrator's rationales as responses.
+
+    Args:
+        trained: Settings of the student.
+
+    Raises:
+        UserError: a dataset is empty.
+    """
+    frames, frame_count = FrameReader(store, trained.student.image_size), trained.student.frames
+    by_item = {r.item_id: r for r in rationales}
+    training, validation = split_items(store, cfg.train.validation_items, cfg.seed)
+    shared = (by_item, trained.train.regime, trained.teacher)
+    permute = cfg.train.permute_candidates
+    samples = [
+        pair_prompts(item, frames, frame_count, cfg.seed, permute)
+        for item in supervised_items(store, training, *shared, True)["reasoning"]
+    ]
+    held_out = {
+        mode: StudentDataset([item.lazy_sample(frames, frame_count, None) for item in items])
+        for mode, items in supervised_items(store, validation, *shared).items()
+    }
+    check_not_empty(len(samples), "training items with accepted rationales")
+    check_not_empty(len(held_out["reasoning"]), "held-out items with accepted rationales")
+    return StudentDataset(samples), held_out

@@ -1,0 +1,336 @@
+"""Reinforcement learning with TRL's GRPOTrainer, on responses that the simulator judges.
+
+TRL 1.16 passes images to the model, but no videos with true times (huggingface/trl issues 4144 and
+5373), and it casts the adapters of a 4-bit base to bf16, in which small updates vanish. Both are
+mended here: `MediaGRPOTrainer` computes the probabilities of responses with the project's own
+inputs, and keeps the adapters in fp32. It also keeps the order of the items when a run resumes in a
+later epoch, leaves items whose responses have equal rewards out of the mean, and stops at a
+non-finite loss.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+from datasets import Dataset
+from torch import Tensor, nn
+from transformers import ProcessorMixin
+from trl import GRPOConfig, GRPOTrainer
+from trl.trainer.utils import RepeatSampler
+
+from conf.errors import UserError
+from conf.runs import Run
+from conf.schema import ReinforceCommand, ReinforceTrainConfig, SftCommand, StudentConfig
+from data.records import SelectionItem
+from data.render.frame_cache import FrameReader
+from data.store import Store
+from models.distributed import split_batch
+from models.student.collator import MEDIA_INPUTS, Collator
+from models.student.prompts import Sample, selection_sample
+from teacher.predicates.facts import RelationalPredicates
+from teacher.vocabulary import describe_item
+from train.common.arguments import common_arguments
+from train.common.callbacks import EpochCallback
+from train.common.held_out import check_not_empty
+from train.rewards import REWARDS, JudgedResponse, judge_response
+from train.student.dataset import split_items
+from train.student.distillation import MAX_UNPARSED, ResponseSampler
+from train.student.lazy_samples import seeded_rng
+from train.student.paired_prompts import PairedPrompts
+
+ROW = "row"
+"""Key of the index of a response among those that were sampled together."""
+
+
+@dataclass(frozen=True)
+class JudgedItem:
+    """An item, its prompt without response, and what judges a response to it."""
+
+    item: SelectionItem
+    predicates: RelationalPredicates
+    render: Callable[[], Sample]
+
+
+def load_items(
+    cfg: ReinforceTrainConfig, trained: SftCommand, store: Store, seed: int
+) -> tuple[list[JudgedItem], list[JudgedItem]]:
+    """Return the training items, and held-out items, that have predicates.
+
+    Raises:
+        UserError: there are none.
+    """
+    frames = FrameReader(store, trained.student.image_size)
+
+    def judged(items: Sequence[SelectionItem]) -> list[JudgedItem]:
+        found = []
+        for item in items:
+            predicates = describe_item(item, store, trained.teacher)
+            if predicates is not None:
+                found.append(JudgedItem(item, predicates, lambda item=item: prompt(item)))
+        return found
+
+    def prompt(item: SelectionItem) -> Sample:
+        regime, count = trained.train.regime, trained.student.frames
+        return selection_sample(item, "reasoning", regime, frames, count)
+
+    training, validation = map(judged, split_items(store, cfg.validation_items, seed))
+    check_not_empty(len(training), "training items with predicates")
+    check_not_empty(len(validation), "held-out items with predicates")
+    return training, validation
+
+
+def make_rows(items: Sequence[JudgedItem], split: str) -> Dataset:
+    """Return the rows of TRL's dataset: the index of each item. TRL needs a prompt, but the prompts
+    are rendered later."""
+    ids = [judged.item.item_id for judged in items]
+    return Dataset.from_dict(
+        {"prompt": ids, "index": list(range(len(ids))), "split": [split] * len(ids)}
+    )
+
+
+def make_reward(name: str) -> Callable[..., list[float]]:
+    """Return a reward of `REWARDS` in the form that TRL calls."""
+
+    def reward(judged: Sequence[JudgedResponse], **_: Any) -> list[float]:
+        return [REWARDS[name](response) for response in judged]
+
+    reward.__name__ = name
+    return reward
+
+
+class EpochSampler(RepeatSampler):
+    """TRL's sampler with an order of its own in each epoch. TRL's continues one order of random
+    numbers, which a resumed run would begin again."""
+
+    def set_epoch(self, epoch: int) -> None:
+        self.generator.manual_seed(self.seed + epoch)
+
+
+class MediaGRPOTrainer(GRPOTrainer):
+    """A GRPOTrainer for prompts with clips.
+
+    Args:
+        items: The items by split, train and eval.
+        responses: Samples the responses.
+        collator: Makes the model's inputs.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        *args: Any,
+        items: Mapping[str, Sequence[JudgedItem]],
+        responses: ResponseSampler,
+        collator: Collator,
+        **settings: Any,
+    ) -> None:
+        trained = {p: p.data for p in model.parameters() if p.requires_grad}
+        with warnings.catch_warnings():
+            # It warns that `rollout_func` may change; pyproject.toml excludes later versions.
+            warnings.filterwarnings("ignore", "You are using 'rollout_func'")
+            super().__init__(model, *args, rollout_func=self._respond, **settings)
+        for parameter, data in trained.items():
+            parameter.data = data
+        self._items, self._responses, self._collator = items, responses, collator
+        self._judged: list[JudgedItem] = []
+        self._prompts: list[Sample] = []
+        self._inputs: list[Sample] = []
+        self._unparsed = 0
+
+    def _send_telemetry(self) -> None:
+        """Send nothing."""
+
+    def create_model_card(self, *_: Any, **__: Any) -> None:
+        """Write no model card into the run's folder: `train.export` writes one."""
+
+    def _get_train_sampler(self, dataset: Dataset | None = None) -> EpochSampler:
+        self._sampler = EpochSampler(
+            data_source=self.train_dataset if dataset is None else dataset,
+            mini_repeat_count=self.num_generations,
+            batch_size=self.args.generation_batch_size // self.num_generations,
+            repeat_count=self.num_iterations * self.args.steps_per_generation,
+            seed=self.args.seed,
+        )
+        return self._sampler
+
+    def set_epoch(self, epoch: int) -> None:
+        self._sampler.set_epoch(epoch)
+
+    def _generate_and_score_completions(self, inputs: list[dict[str, Any]]) -> dict[str, Any]:
+        """Sample and judge a response to each row, and keep the prompts for the loss.
+
+        The tokens of responses without advantage do not count in the mean over tokens.
+        """
+        self._judged = [self._items[row["split"]][row["index"]] for row in inputs]
+        self._prompts = [judged.render() for judged in self._judged]
+        output = super()._generate_and_score_completions(inputs)
+        counted = (output["advantages"] != 0).to(output["completion_mask"].dtype)
+        output["completion_mask"] = output["completion_mask"] * counted[:, None]
+        total = self.accelerator.gather(output["completion_mask"].sum()).sum()
+        output["num_items_in_batch"] = total.clamp(min=1)
+        # TRL shuffles and splits the tensors of its output by their rows.
+        return {**output, ROW: torch.arange(len(inputs), device=self.accelerator.device)}
+
+    def _respond(self, prompts: list[str], _: GRPOTrainer) -> dict[str, Any]:
+        """Return token ids of prompts and sampled responses, and the judged responses."""
+        training = self.model.training
+        mode, step = "train" if training else "eval", self.state.global_step
+        seen: Counter[str] = Counter()
+        asked = []
+        for sample, judged in zip(self._prompts, self._judged, strict=True):
+            name = judged.item.item_id
+            # The ranks have consecutive parts of the responses to an item.
+            key = (self.args.seed, mode, step, name, seen[name], self.accelerator.process_index)
+            seed = int(seeded_rng(*key).integers(2**31))
+            asked.append(PairedPrompts(sample, sample, judged.item.letter, seed))
+            seen[name] += 1
+        texts = self._responses.sample(self.model, asked)
+        self.model.train(training)
+        judged = [
+            judge_response(t.text, t.cut, j.item, j.predicates)
+            for t, j in zip(texts, self._judged, strict=True)
+        ]
+        if training:
+            self._check_parsed(judged)
+        batch = self._collator(self._prompts)
+        prompt_ids = [
+            ids[mask.bool()].tolist()
+            for ids, mask in zip(batch["input_ids"], batch["attention_mask"], strict=True)
+        ]
+        ids = [list(t.ids) for t in texts]
+        return {"prompt_ids": prompt_ids, "completion_ids": ids, "logprobs": None, "judged": judged}
+
+    def _check_parsed(self, judged: Sequence[JudgedResponse]) -> None:
+        """Raise UserError on all ranks if no response has had an answer for a while."""
+        counts = torch.tensor([len(judged), sum(j.letter is not None for j in judged)])
+        total, parsed = self.accelerator.reduce(counts.to(self.accelerator.device)).tolist()
+        self._unparsed = 0 if parsed else self._unparsed + total
+        if self._unparsed >= MAX_UNPARSED:
+            raise UserError(
+                f"none of the last {self._unparsed} sampled responses has an answer: lower "
+                "train.temperature or train.lr in another run (run=NAME), or train the student "
+                "longer first",
+                code="nothing-parsed",
+            )
+
+    def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> Tensor:
+        self._inputs = [self._prompts[row] for row in inputs[ROW].tolist()]
+        loss = super()._compute_loss(model, inputs)
+        if not torch.isfinite(loss):
+            self._stop("loss", loss.item())
+        return loss
+
+    def _get_per_token_logps_and_entropies(
+        self,
+        model: nn.Module,
+        input_ids: Tensor,
+        attention_mask: Tensor,
+        logits_to_keep: int,
+        *_: Any,
+        **__: Any,
+    ) -> tuple[Tensor, Tensor, None]:
+        """Return the logarithms of the probabilities of the responses' tokens, and the entropies,
+        (B, `logits_to_keep`). The pixels are those of the prompts."""
+        batch = self._collator(self._inputs)
+        length = input_ids.shape[1] - logits_to_keep
+        # TRL pads prompts on the left, as the collator does, and responses on the right.
+        types = torch.zeros_like(input_ids)
+        prompt_types = batch["mm_token_type_ids"].to(types.device)
+        types[:, length - prompt_types.shape[1] : length] = prompt_types
+        media = {k: batch[k].to(input_ids.device) for k in MEDIA_INPUTS if k in batch}
+        with self.accelerator.autocast():
+            logits = model(
+                input_ids=input_ids,
+                attention_mask=attention_mask,
+                mm_token_type_ids=types,
+                logits_to_keep=logits_to_keep + 1,
+                use_cache=False,
+                **media,
+            ).logits
+        logs = torch.log_softmax(logits[:, :-1].float() / self.temperature, dim=-1)
+        chosen = logs.gather(-1, input_ids[:, -logits_to_keep:, None])[..., 0]
+        with torch.no_grad():
+            entropy = -(logs.exp() * logs).sum(dim=-1)
+        return chosen, entropy, None
+
+    def prediction_step(
+        self, model: nn.Module, inputs: Any, *_: Any, **__: Any
+    ) -> tuple[Tensor, None, None]:
+        """Measure the rewards of an evaluation; its loss would be meaningless."""
+        self._prepare_inputs(inputs)
+        return torch.zeros((), device=self.accelerator.device), None, None
+
+    def log(self, logs: dict[str, float], *args: Any, **settings: Any) -> None:
+        """Raise UserError for a non-finite gradient, before the resulting weights are saved."""
+        super().log(logs, *args, **settings)
+        if not math.isfinite(logs.get("grad_norm", 0.0)):
+            self._stop("gradient", logs["grad_norm"])
+
+    def _stop(self, what: str, value: float) -> NoReturn:
+        raise UserError(
+            f"non-finite {what} ({value}) after step {self.state.global_step}: lower train.lr or "
+            "set train.precision=fp32, in another run (run=NAME); checkpoints up to this step are "
+            "kept",
+            code=f"non-finite-{what}",
+        )
+
+
+def build_trainer(
+    cfg: ReinforceCommand,
+    run: Run,
+    student: StudentConfig,
+    model: nn.Module,
+    processor: ProcessorMixin,
+    training: Sequence[JudgedItem],
+    validation: Sequence[JudgedItem],
+    checkpoint: Path | None,
+) -> MediaGRPOTrainer:
+    """Return a trainer.
+
+    Args:
+        cfg: Settings whose train.precision is bf16 or fp32, not auto.
+        checkpoint: The checkpoint that the run resumes from, or None.
+
+    Raises:
+        UserError: there are fewer training items than train.batch.
+    """
+    train = cfg.train
+    if len(training) < train.batch:
+        raise UserError(
+            f"train.batch={train.batch} is more than the {len(training)} training items: lower it",
+            code="batch-too-large",
+        )
+    names = [name for name in REWARDS if getattr(train.rewards, name)]
+    arguments = GRPOConfig(
+        **common_arguments(train, run, cfg.seed, checkpoint),
+        per_device_train_batch_size=train.micro_batch,
+        per_device_eval_batch_size=train.responses,
+        gradient_accumulation_steps=split_batch(train.batch * train.responses, train.micro_batch),
+        num_generations=train.responses,
+        max_completion_length=student.max_new_tokens,
+        temperature=train.temperature,
+        # No reference model: the few steps and the small adapters keep the student close.
+        beta=0.0,
+        reward_weights=[getattr(train.rewards, name) for name in names],
+        ddp_find_unused_parameters=not student.lora.rank,
+    )
+    trainer = MediaGRPOTrainer(
+        model=model,
+        args=arguments,
+        reward_funcs=[make_reward(name) for name in names],
+        train_dataset=make_rows(training, "train"),
+        eval_dataset=make_rows(validation, "eval"),
+        processing_class=processor,
+        items={"train": training, "eval": validation},
+        responses=ResponseSampler(processor, student, train),
+        collator=Collator(processor, student.max_length),
+    )
+    trainer.add_callback(EpochCallback(trainer))
+    return trainer
