@@ -24,11 +24,12 @@ COMMON = (
     "host", "port", "public", "folder", "format", "product", "verify", "frames", "frames_gb",
     "examples", "gpus", "routes", "benchmark.name", "benchmark.scenes", "benchmark.seed",
     "benchmark.folder", "benchmark.renderer", "teacher.url", "teacher.model", "teacher.attempts",
-    "server.url", "server.model", "student.model", "student.quantization", "student.frames",
-    "student.image_size", "student.temperature", "retriever.model", "retriever.widths",
-    "matcher.model", "train.regime", "train.lr", "train.epochs", "train.max_steps", "train.batch",
-    "train.micro_batch", "train.mini_batch", "train.hard_negatives", "train.precision",
-    "train.report_to", "batch", "workers",
+    "teacher_model", "server.url", "server.model", "student.model", "student.quantization",
+    "student.frames", "student.image_size", "student.temperature", "retriever.model",
+    "retriever.widths", "matcher.model", "train.regime", "train.beta", "train.responses",
+    "train.lr", "train.epochs", "train.max_steps", "train.batch", "train.micro_batch",
+    "train.mini_batch", "train.hard_negatives", "train.precision", "train.report_to", "batch",
+    "workers",
 )  # fmt: skip
 """Keys that users change often; `--help` lists those of the command."""
 
