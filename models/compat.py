@@ -20,8 +20,8 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
 - `train.retriever.inputs` adds an input in a forward pre-hook of sentence-transformers'
   `Transformer`, which passes it on to its model.
 - `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer, and
-  `train.student.distillation` overrides `get_batch_samples` and calls `_get_num_items_in_batch`.
-- `train.student.reinforcement` overrides `_generate_and_score_completions`, `_compute_loss` and
+  `train.on_policy.distillation` overrides `get_batch_samples` and calls `_get_num_items_in_batch`.
+- `train.on_policy.reinforcement` overrides `_generate_and_score_completions`, `_compute_loss` and
   `_get_per_token_logps_and_entropies` of TRL's GRPOTrainer, and uses its `rollout_func`.
 """
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 
 from conf.entry import Run, command
-from conf.errors import UserError
 from conf.gpus import restrict_to_one_gpu
-from conf.runs import finished_metrics, rank
+from conf.runs import finished_metrics
 from conf.schema import ReinforceCommand
 from conf.trackers import check_trackers
 
@@ -25,55 +23,43 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     check_trackers(cfg.train.report_to)
 
     from data.build import ensure_benchmark
-    from models import compat, distributed, loading
+    from models import compat, distributed
     from models.fingerprints import weights_digest
-    from models.lora_kernels import use_fast_layers
-    from models.resolved import data_digest, resolve_run
+    from models.resolved import data_digest
     from models.trained_runs import product_folder
-    from train.common import training_loop
     from train.common.checkpoints import newest_checkpoint
-    from train.common.journal import run_metrics
-    from train.student.continuation import continued_settings, source_settings, write_settings
-    from train.student.reinforcement import build_trainer, load_items
+    from train.on_policy.continuation import (
+        load_source,
+        resolve_continuation,
+        source_settings,
+        train_and_save,
+    )
+    from train.on_policy.reinforcement import build_trainer, load_items
 
     compat.keep_freed_memory()
     train = cfg.train
     responses = "train.batch x train.responses"
     distributed.split_batch(train.batch * train.responses, train.micro_batch, key=responses)
-    if distributed.is_sharded():
-        raise UserError(
-            "train.reinforce does not work with FSDP, since the student generates texts between "
-            "its steps: start without --use_fsdp",
-            code="unsupported-with-fsdp",
-        )
     source, trained = source_settings(cfg.model)
-    weights = product_folder(source, "student")
 
+    # The main rank builds what is missing; then every rank reads it from the disk.
     with distributed.main_first():
         checkpoint = newest_checkpoint(run.folder)
         store = ensure_benchmark(trained.benchmark, Path(cfg.store), cfg.workers)
     training, validation = load_items(cfg.train, trained, store, cfg.seed)
-
     ids = [judged.item.item_id for judged in training]
-    data = data_digest(store.identity, [*ids, weights_digest(weights)])
-    with distributed.main_first():
-        precision, student = resolve_run(run.folder, cfg.train.precision, trained.student, data)
-        cfg = replace(cfg, train=replace(cfg.train, precision=precision))
-        trained = continued_settings(trained, student, cfg)
-        write_settings(run.folder, trained)
+    weights = weights_digest(product_folder(source, "student"))
+    cfg, trained = resolve_continuation(
+        cfg, run, trained, data_digest(store.identity, [*ids, weights])
+    )
 
-    log.info("loading the student of %s, computing in %s", source, precision)
-    model, processor = loading.load_trainable(student, precision, weights)
-    model.to(distributed.rank_device())
-    use_fast_layers(model)
-    trainer = build_trainer(cfg, run, student, model, processor, training, validation, checkpoint)
+    precision = cfg.train.precision
+    model, processor = load_source(source, trained, precision)
+    trainer = build_trainer(
+        cfg, run, trained.student, model, processor, training, validation, checkpoint
+    )
     memory_settings = "train.batch, train.responses or train.micro_batch"
-    best_step = training_loop.run_training(trainer, run, checkpoint, memory_settings)
-
-    if rank() == 0:
-        loading.save_student(model, processor, run.folder / "student", precision)
-    log.info("the student is in %s", run.folder / "student")
-    return run_metrics(run.folder, best_step)
+    return train_and_save(trainer, processor, run, checkpoint, precision, memory_settings)
 
 
 if __name__ == "__main__":

@@ -140,27 +140,28 @@ class SftCommand(CommandConfig):
 
 
 @dataclass
-class DistillCommand(CommandConfig):
+class ContinuationCommand(CommandConfig):
+    """Settings of the commands that train the student of another run further."""
+
     model: str | None = None
     """Folder of the run of train.sft whose student is trained further. It determines the benchmark,
     the narrator's settings and the student."""
-    teacher_model: str | None = None
-    """Folder of the run that trained the teacher, for example with train.sft train.facts=true; null
-    uses the student itself, as it is at the start. The teacher reads the facts of an item as text
-    instead of its frames, and needs the student's tokenizer."""
-    train: DistillTrainConfig = field(default_factory=DistillTrainConfig)
     seed: int = setting(0, least=0)
     """Seed of the order of the items and of the sampled responses."""
 
 
 @dataclass
-class ReinforceCommand(CommandConfig):
-    model: str | None = None
-    """Folder of the run of train.sft whose student is trained further. It determines the benchmark,
-    the narrator's settings and the student."""
+class DistillCommand(ContinuationCommand):
+    teacher_model: str | None = None
+    """Folder of the run that trained the teacher, for example with train.sft train.facts=true; null
+    uses the student itself, as it is at the start. The teacher reads the facts of an item as text
+    instead of its frames, and needs the student's tokenizer."""
+    train: DistillTrainConfig = field(default_factory=DistillTrainConfig)
+
+
+@dataclass
+class ReinforceCommand(ContinuationCommand):
     train: ReinforceTrainConfig = field(default_factory=ReinforceTrainConfig)
-    seed: int = setting(0, least=0)
-    """Seed of the order of the items and of the sampled responses."""
 
 
 @dataclass

@@ -102,11 +102,14 @@ def describe_model(
         if name in inputs:
             time, height, width = inputs[name][0].tolist()
             grids.append(f"{medium} of {time} x {height // merge} x {width // merge} tokens")
-    return [
+    lines = [
         f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'all weights'})",
         towers.map("{:,}".format).rename_axis(None).to_string(),
-        f"frames of {cfg.image_size} x {cfg.image_size} px become {' and '.join(grids)}",
     ]
+    if grids:
+        size = cfg.image_size
+        lines.append(f"frames of {size} x {size} px become {' and '.join(grids)}")
+    return lines
 
 
 def describe_input(

@@ -39,11 +39,10 @@ from teacher.vocabulary import describe_item
 from train.common.arguments import common_arguments
 from train.common.callbacks import EpochCallback
 from train.common.held_out import check_not_empty
+from train.on_policy.sampling import ResponseSampler
 from train.rewards import REWARDS, JudgedResponse, judge_response
 from train.student.dataset import split_items
-from train.student.distillation import MAX_UNPARSED, ResponseSampler
 from train.student.lazy_samples import seeded_rng
-from train.student.paired_prompts import PairedPrompts
 
 ROW = "row"
 """Key of the index of a response among those that were sampled together."""
@@ -142,7 +141,6 @@ class MediaGRPOTrainer(GRPOTrainer):
         self._judged: list[JudgedItem] = []
         self._prompts: list[Sample] = []
         self._inputs: list[Sample] = []
-        self._unparsed = 0
 
     def _send_telemetry(self) -> None:
         """Send nothing."""
@@ -183,22 +181,21 @@ class MediaGRPOTrainer(GRPOTrainer):
         training = self.model.training
         mode, step = "train" if training else "eval", self.state.global_step
         seen: Counter[str] = Counter()
-        asked = []
-        for sample, judged in zip(self._prompts, self._judged, strict=True):
+        seeds = []
+        for judged in self._judged:
             name = judged.item.item_id
             # The ranks have consecutive parts of the responses to an item.
             key = (self.args.seed, mode, step, name, seen[name], self.accelerator.process_index)
-            seed = int(seeded_rng(*key).integers(2**31))
-            asked.append(PairedPrompts(sample, sample, judged.item.letter, seed))
+            seeds.append(int(seeded_rng(*key).integers(2**31)))
             seen[name] += 1
-        texts = self._responses.sample(self.model, asked)
+        texts = self._responses.sample(self.model, self._prompts, seeds)
         self.model.train(training)
         judged = [
             judge_response(t.text, t.cut, j.item, j.predicates)
             for t, j in zip(texts, self._judged, strict=True)
         ]
         if training:
-            self._check_parsed(judged)
+            self._responses.check_parsed([j.letter for j in judged], self.accelerator)
         batch = self._collator(self._prompts)
         prompt_ids = [
             ids[mask.bool()].tolist()
@@ -206,19 +203,6 @@ class MediaGRPOTrainer(GRPOTrainer):
         ]
         ids = [list(t.ids) for t in texts]
         return {"prompt_ids": prompt_ids, "completion_ids": ids, "logprobs": None, "judged": judged}
-
-    def _check_parsed(self, judged: Sequence[JudgedResponse]) -> None:
-        """Raise UserError on all ranks if no response has had an answer for a while."""
-        counts = torch.tensor([len(judged), sum(j.letter is not None for j in judged)])
-        total, parsed = self.accelerator.reduce(counts.to(self.accelerator.device)).tolist()
-        self._unparsed = 0 if parsed else self._unparsed + total
-        if self._unparsed >= MAX_UNPARSED:
-            raise UserError(
-                f"none of the last {self._unparsed} sampled responses has an answer: lower "
-                "train.temperature or train.lr in another run (run=NAME), or train the student "
-                "longer first",
-                code="nothing-parsed",
-            )
 
     def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> Tensor:
         self._inputs = [self._prompts[row] for row in inputs[ROW].tolist()]

@@ -16,35 +16,28 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import log_softmax
-from transformers import ProcessorMixin, SuppressTokensLogitsProcessor
+from transformers import ProcessorMixin
 
 from conf.errors import UserError
 from conf.runs import Run, world_size
-from conf.schema import (
-    DistillCommand,
-    DistillTrainConfig,
-    ReinforceTrainConfig,
-    SftCommand,
-    StudentConfig,
-)
+from conf.schema import DistillCommand, SftCommand
 from models import loading
 from models.distributed import rank_device
-from models.memory import explain_out_of_memory
 from models.resolved import check_base
 from models.student.answer_parser import parse_choice
 from models.student.collator import IGNORED, Collator, letter_ids
-from models.student.generation import generate, sampling_processors
 from models.student.prompts import Sample
 from models.student.responses import GeneratedText
 from models.trained_runs import product_folder, trained_settings
 from train.common.audit import audit_student
 from train.common.callbacks import EpochCallback
-from train.student.divergence import measure_divergence
+from train.on_policy.divergence import measure_divergence
+from train.on_policy.paired_prompts import PairedPrompts
+from train.on_policy.sampling import ResponseSampler
 from train.student.held_out_answers import HeldOutAnswers
 from train.student.lazy_samples import StudentDataset
 from train.student.length_sampler import LengthSampler
 from train.student.metrics import LetterAccuracy
-from train.student.paired_prompts import PairedPrompts
 from train.student.run import student_arguments
 from train.student.trainer import StudentTrainer, TrainerCollator, token_mean
 
@@ -52,8 +45,6 @@ log = logging.getLogger(__name__)
 
 TEACHER = "teacher_inputs"
 """Key of the teacher's inputs in a batch."""
-MAX_UNPARSED = 64
-"""Number of consecutive responses without an answer after which a run stops."""
 
 
 @dataclass(frozen=True)
@@ -67,42 +58,6 @@ class DistillationCollator:
         if isinstance(samples[0], PairedPrompts):
             return {"prompts": list(samples)}
         return self.collate(samples)
-
-
-class ResponseSampler:
-    """Samples a student's responses, each with its own seed.
-
-    Args:
-        student: Settings of the student; those of sampling are replaced.
-    """
-
-    def __init__(
-        self,
-        processor: ProcessorMixin,
-        student: StudentConfig,
-        train: DistillTrainConfig | ReinforceTrainConfig,
-    ) -> None:
-        self._processor, self._precision = processor, train.precision
-        self._sampling = replace(student, temperature=train.temperature, top_p=1.0, top_k=0)
-        self._collate = Collator(processor, student.max_length)
-        # The model would expect pixels for such a token in a response.
-        self._never = [processor.image_token_id, processor.video_token_id]
-
-    def sample(self, model: nn.Module, prompts: Sequence[PairedPrompts]) -> list[GeneratedText]:
-        """Return a response to each student's prompt.
-
-        Raises:
-            UserError: Memory runs out.
-        """
-        model.eval()
-        inputs = self._collate([p.student for p in prompts])
-        steps = sampling_processors(self._sampling, [p.seed for p in prompts])
-        device = next(model.parameters()).device
-        steps.insert(0, SuppressTokensLogitsProcessor(self._never, device=device))
-        when = f"while sampling {len(prompts)} responses"
-        with explain_out_of_memory(when, "lower train.batch in another run (run=NAME)"):
-            limit = self._sampling.max_new_tokens
-            return generate(model, self._processor, inputs, limit, self._precision, steps)
 
 
 class DistillationTrainer(StudentTrainer):
@@ -133,7 +88,6 @@ class DistillationTrainer(StudentTrainer):
         self._beta = beta
         self._teacher_logits: Tensor | None = None
         self._sampled: list[tuple[bool, bool, int]] = []
-        self._unparsed = 0
 
     def get_batch_samples(
         self, epoch_iterator: Iterator, num_batches: int, device: torch.device
@@ -146,20 +100,17 @@ class DistillationTrainer(StudentTrainer):
         return batches, self._get_num_items_in_batch(batches, device)
 
     def _sample_responses(self, prompts: Sequence[PairedPrompts]) -> list[GeneratedText]:
-        texts = self._responses.sample(self.model, prompts) if prompts else []
-        for prompt, text in zip(prompts, texts, strict=True):
-            if not prompt.supervised:
-                continue
-            letter = parse_choice(text.text, cut=text.cut).letter
-            self._unparsed = 0 if letter else self._unparsed + 1
-            self._sampled.append((letter == prompt.letter, letter is not None, len(text.ids)))
-        if self._unparsed >= MAX_UNPARSED:
-            raise UserError(
-                f"none of the last {self._unparsed} sampled responses has an answer: lower "
-                "train.temperature or train.lr in another run (run=NAME), or train the student "
-                "longer first",
-                code="nothing-parsed",
-            )
+        texts = []
+        if prompts:
+            samples, seeds = [p.student for p in prompts], [p.seed for p in prompts]
+            texts = self._responses.sample(self.model, samples, seeds)
+        letters = [parse_choice(t.text, cut=t.cut).letter for t in texts]
+        counted = [k for k, prompt in enumerate(prompts) if prompt.supervised]
+        self._sampled += [
+            (letters[k] == prompts[k].letter, letters[k] is not None, len(texts[k].ids))
+            for k in counted
+        ]
+        self._responses.check_parsed([letters[k] for k in counted], self.accelerator)
         return texts
 
     def _add_responses(
@@ -226,15 +177,14 @@ class DistillationTrainer(StudentTrainer):
         super().log(logs, *args, **settings)
 
 
-def load_teacher(cfg: DistillCommand, trained: SftCommand, processor: ProcessorMixin) -> nn.Module:
-    """Load the teacher, in evaluation mode.
+def teacher_settings(cfg: DistillCommand, trained: SftCommand) -> tuple[Path, SftCommand]:
+    """Return the folder and the settings of the run that trained the teacher.
 
     Args:
         trained: Settings of the student.
-        processor: The student's processor.
 
     Raises:
-        UserError: The teacher cannot be loaded; or it has another tokenizer, regime, vocabulary or
+        UserError: The run cannot be read; or the teacher has another regime, vocabulary or
             benchmark than the student.
     """
     folder = Path(cfg.teacher_model or cfg.model)
@@ -251,8 +201,23 @@ def load_teacher(cfg: DistillCommand, trained: SftCommand, processor: ProcessorM
                 f"{ours}: train a teacher with the student's setting",
                 code="other-settings",
             )
+    return folder, settings
+
+
+def load_teacher(
+    folder: Path, settings: SftCommand, precision: str, processor: ProcessorMixin
+) -> nn.Module:
+    """Load the teacher, in evaluation mode.
+
+    Args:
+        settings: Settings of its run, in `folder`.
+        processor: The student's processor.
+
+    Raises:
+        UserError: The teacher cannot be loaded, or has another tokenizer than the student.
+    """
     weights = product_folder(folder, "student")
-    model, other = loading.load_trained(settings.student, cfg.train.precision, weights)
+    model, other = loading.load_trained(settings.student, precision, weights)
     check_tokenizer(folder, processor, other)
     return model.to(rank_device())
 

@@ -17,7 +17,7 @@ from data.store import Store
 from models.trained_runs import trained_settings
 from train import reinforce, sft
 from train.common.journal import read_journal
-from train.student import reinforcement
+from train.on_policy import reinforcement
 from train.student.trainer import token_losses
 
 pytestmark = pytest.mark.slow
@@ -65,8 +65,8 @@ def test_a_killed_run_samples_the_same_responses(
     sample = reinforcement.ResponseSampler.sample
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
 
-    def recorded(self, model, prompts):
-        texts = sample(self, model, prompts)
+    def recorded(self, model, prompts, seeds):
+        texts = sample(self, model, prompts, seeds)
         if len(prompts) == 8:  # those of a training step
             sampled[current].extend(text.ids for text in texts)
         return texts

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.nn.functional import log_softmax
 
-from train.student.divergence import measure_divergence
+from train.on_policy.divergence import measure_divergence
 
 
 def binary(p: float) -> torch.Tensor:

@@ -19,9 +19,9 @@ from tests.user_errors import raises_user_error
 from train import distill, sft
 from train.common.journal import read_journal
 from train.export import find_run
-from train.student import distillation, paired_prompts
-from train.student.distillation import check_tokenizer
-from train.student.paired_prompts import PairedPrompts
+from train.on_policy import distillation, paired_prompts
+from train.on_policy.distillation import check_tokenizer
+from train.on_policy.paired_prompts import PairedPrompts
 
 pytestmark = pytest.mark.slow
 
@@ -70,8 +70,8 @@ def test_a_killed_run_samples_the_same_responses(settings, tmp_path, monkeypatch
     sample = distillation.ResponseSampler.sample
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
 
-    def recorded(self, model, samples):
-        texts = sample(self, model, samples)
+    def recorded(self, model, prompts, seeds):
+        texts = sample(self, model, prompts, seeds)
         sampled[current].extend(text.ids for text in texts)
         return texts
 

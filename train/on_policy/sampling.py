@@ -1,0 +1,78 @@
+"""Sample the responses of a student that is trained on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from accelerate import Accelerator
+from torch import nn
+from transformers import ProcessorMixin, SuppressTokensLogitsProcessor
+
+from conf.errors import UserError
+from conf.schema import DistillTrainConfig, ReinforceTrainConfig, StudentConfig
+from models.memory import explain_out_of_memory
+from models.student.collator import Collator
+from models.student.generation import generate, sampling_processors
+from models.student.prompts import Sample
+from models.student.responses import GeneratedText
+
+MAX_UNPARSED = 64
+"""Number of consecutive responses without an answer after which a run stops."""
+
+
+class ResponseSampler:
+    """Samples a student's responses, each with its own seed.
+
+    Args:
+        student: Settings of the student; those of sampling are replaced.
+    """
+
+    def __init__(
+        self,
+        processor: ProcessorMixin,
+        student: StudentConfig,
+        train: DistillTrainConfig | ReinforceTrainConfig,
+    ) -> None:
+        self._processor, self._precision = processor, train.precision
+        self._sampling = replace(student, temperature=train.temperature, top_p=1.0, top_k=0)
+        self._collate = Collator(processor, student.max_length)
+        # The model would expect pixels for such a token in a response.
+        self._never = [processor.image_token_id, processor.video_token_id]
+        self._unparsed = 0
+
+    def sample(
+        self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]
+    ) -> list[GeneratedText]:
+        """Return a response to each prompt. The model is then in evaluation mode.
+
+        Raises:
+            UserError: Memory runs out.
+        """
+        model.eval()
+        inputs = self._collate(prompts)
+        steps = sampling_processors(self._sampling, seeds)
+        device = next(model.parameters()).device
+        steps.insert(0, SuppressTokensLogitsProcessor(self._never, device=device))
+        when = f"while sampling {len(prompts)} responses"
+        with explain_out_of_memory(when, "lower train.batch in another run (run=NAME)"):
+            limit = self._sampling.max_new_tokens
+            return generate(model, self._processor, inputs, limit, self._precision, steps)
+
+    def check_parsed(self, letters: Sequence[str | None], accelerator: Accelerator) -> None:
+        """Raise UserError on all ranks if `MAX_UNPARSED` responses in a row had no answer.
+
+        Args:
+            letters: The answers of this rank's responses in a step.
+        """
+        counts = torch.tensor([len(letters), sum(letter is not None for letter in letters)])
+        total, parsed = accelerator.reduce(counts.to(accelerator.device)).tolist()
+        self._unparsed = 0 if parsed else self._unparsed + total
+        if self._unparsed >= MAX_UNPARSED:
+            raise UserError(
+                f"none of the last {self._unparsed} sampled responses has an answer: lower "
+                "train.temperature or train.lr in another run (run=NAME), or train the student "
+                "longer first",
+                code="nothing-parsed",
+            )
