@@ -24,7 +24,7 @@ SPATIAL_WORDS = {
     "heading": COMPASS,
     "region": ("top", "left", "right", "center", "bottom"),
     "speed": ("slowly", "steadily", "quickly", "rests", "stationary"),
-    "gap": ("against", "apart"),
+    "gap": ("touch", "apart"),
     "height": ("above", "below", "level"),
 }
 """Words for places, motion and relations."""

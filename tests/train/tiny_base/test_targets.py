@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from transformers import AutoTokenizer
 
 from data.records import LETTERS, sample_prefix_frames
 from data.store import Store
@@ -17,8 +18,10 @@ from train.tiny_base.mentions import TokenizedText
 from train.tiny_base.oracle_targets import (
     AHEAD,
     RATE,
+    SPATIAL_WORDS,
     UNKNOWN,
     UNSEEN_DISTANCE,
+    WORDS,
     ObjectTarget,
     OracleTargets,
     clip_targets,
@@ -31,7 +34,9 @@ from train.tiny_base.oracle_targets import (
 from train.tiny_base.pointing import locate_objects
 from train.tiny_base.questions import KINDS
 from train.tiny_base.samples import (
+    object_token_ids,
     shown_objects,
+    spatial_token_ids,
     spoken_state,
 )
 
@@ -313,3 +318,13 @@ def test_ranks_share_the_samples_of_a_step(sampler: ItemSampler, monkeypatch) ->
         monkeypatch.setenv("RANK", rank)
         parts.append([s.sample.response for s in sampler.make_batch("words", 3, 4)])
     assert parts == [whole[::2], whole[1::2]]
+
+
+def test_weighed_words_are_single_tokens_of_the_base() -> None:
+    """A piece of a word would also weigh the words that share it."""
+    tokenizer = AutoTokenizer.from_pretrained("checkpoints/bases/tiny")
+    objects, spatial = object_token_ids(tokenizer), spatial_token_ids(tokenizer)
+    assert len(objects) == sum(map(len, WORDS.values()))
+    assert not objects & spatial
+    words = {word for kind in SPATIAL_WORDS.values() for word in kind}
+    assert words <= {tokenizer.decode([i]).strip() for i in spatial}
