@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from conf.schema import DistillCommand, SftCommand
 from data.records import Rationale
@@ -42,21 +43,28 @@ def pair_prompts(
         item: The item with its facts.
         seed: Seed of the responses and, if `permute` is true, of the order of the candidates.
     """
-    order = seed if permute else None
-    student = replace(item, facts="").lazy_sample(frames, frame_count, order)
-    teacher = item.lazy_sample(frames, frame_count, order)
+    student = replace(item, facts="").lazy_sample(frames, frame_count, seed if permute else None)
+    return replace(student, render=partial(_render, item, frames, frame_count, seed, permute))
 
-    def render(epoch: int) -> PairedPrompts:
-        shown = item.permuted(seed, epoch) if permute else item
-        rng = seeded_rng("response", seed, epoch, item.item.item_id)
-        return PairedPrompts(
-            replace(student.render(epoch), response=None),
-            replace(teacher.render(epoch), response=None),
-            shown.item.letter,
-            int(rng.integers(2**31)),
-        )
 
-    return replace(student, render=render)
+def _render(
+    item: SupervisedItem,
+    frames: FrameReader,
+    frame_count: int,
+    seed: int,
+    permute: bool,
+    epoch: int,
+) -> PairedPrompts:
+    shown = item.permuted(seed, epoch) if permute else item
+    student = replace(shown, facts="").render(frames, frame_count, None, epoch)
+    teacher = shown.render(frames, frame_count, None, epoch)
+    rng = seeded_rng("response", seed, epoch, item.item.item_id)
+    return PairedPrompts(
+        replace(student, response=None),
+        replace(teacher, response=None),
+        shown.item.letter,
+        int(rng.integers(2**31)),
+    )
 
 
 def load_datasets(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from conf.schema import DistillCommand, DistillTrainConfig, SftCommand
 from data.store import Store
 from models import loading
 from models.trained_runs import trained_settings
+from teacher.narrate import ensure_rationales
 from tests.user_errors import raises_user_error
 from train import distill, sft
 from train.common.journal import read_journal
@@ -63,6 +65,19 @@ def run_distill(settings: DistillCommand, folder: Path) -> Path:
     folder.mkdir(exist_ok=True)
     distill.main.__wrapped__(settings, Run(folder.name, folder))
     return folder
+
+
+def test_datasets_can_be_sent_to_worker_processes(settings, student, micro_store) -> None:
+    trained = trained_settings(student, SftCommand, "student")
+    rationales = ensure_rationales(micro_store, trained.teacher)
+    training, _ = paired_prompts.load_datasets(settings, trained, micro_store, rationales)
+    copy = pickle.loads(pickle.dumps(training))
+    for dataset in (training, copy):
+        dataset.set_epoch(1)
+    ours, theirs = training[0], copy[0]
+    assert ours.seed == theirs.seed
+    assert ours.letter == theirs.letter
+    assert ours.student.content == theirs.student.content
 
 
 def test_a_killed_run_samples_the_same_responses(settings, tmp_path, monkeypatch) -> None:
