@@ -202,8 +202,9 @@ def build_trl_trainer(
     return SFTTrainer(
         model=model,
         args=SFTConfig(
-            **timing_arguments(replace(train, gradient_checkpointing=False), folder),
-            gradient_checkpointing=train.gradient_checkpointing,
+            # Older releases of transformers name the first setting like the second one.
+            **timing_arguments(replace(train, gradient_checkpointing=False), folder)
+            | {"gradient_checkpointing": train.gradient_checkpointing},
             per_device_train_batch_size=train.micro_batch,
             gradient_accumulation_steps=train.batch // train.micro_batch,
             train_sampling_strategy="sequential",

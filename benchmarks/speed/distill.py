@@ -1,0 +1,121 @@
+"""Compares on-policy distillation with supervised training in speed and memory.
+
+    python -m benchmarks.speed.distill                # the tiny student, on any machine
+    python -m benchmarks.speed.distill qwen3_vl_8b    # a released size, on a GPU
+
+Every variant trains on the same items of the tiny benchmark, in a process of its own. "train.sft"
+trains on rationales, with the settings of the preset. "train.distill" samples a response to each
+item and trains on it, with a teacher of the same size that reads the facts. "sampling" is the part
+of its steps in which the responses are sampled. The script prints medians over the rounds and the
+ratios to train.sft.
+
+A released size has random weights, so that nothing is downloaded. Its responses do not end, so they
+have the full length of --tokens.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+from transformers import set_seed
+
+from benchmarks.speed import comparison
+from benchmarks.speed.comparison import SEED, Measurements
+from benchmarks.speed.sft import VARIANTS as SFT_VARIANTS
+from benchmarks.speed.sft import measure as measure_sft
+from benchmarks.speed.sft import write_base
+from conf.compose import compose
+from conf.runs import Run
+from conf.schema import DistillCommand, SftCommand
+from data.build import ensure_benchmark
+from models import compat, loading
+from models.distributed import rank_device
+from models.lora_kernels import use_fast_layers
+from models.precision import resolve_precision
+from teacher.narrate import ensure_rationales
+from train.on_policy import distillation, sampling
+from train.on_policy.paired_prompts import load_datasets
+
+SFT, DISTILL, SAMPLING = "train.sft", "train.distill", "sampling"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--tokens", type=int, default=200, help="maximum length of a response")
+    comparison.add_arguments(parser, steps=3, variants=[SFT, DISTILL, SAMPLING])
+    args = parser.parse_args()
+    overrides = [
+        "+exp=cot", "train.generated_items=0", f"student={args.preset}", f"store={args.store}",
+        f"student.quantization={args.quantization}", f"student.max_new_tokens={args.tokens}",
+        f"train.precision={resolve_precision(args.precision)}",
+    ]  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        if args.preset != "tiny":
+            comparison.run_in_process(write_base, overrides, args.preset, Path(folder))
+            overrides.append(f"student.model={folder}")
+        comparison.compare(
+            "distill",
+            lambda name: comparison.run_in_process(measure, name, overrides, args.steps),
+            args.only or [SFT, DISTILL, SAMPLING],
+            SFT,
+            "samples",
+            args,
+        )
+
+
+def measure(name: str, overrides: list[str], steps: int) -> Measurements:
+    """Train a variant in this process for `steps` steps after the first one, or sample only."""
+    if name == SFT:
+        return measure_sft(overrides, SFT_VARIANTS[comparison.OURS], steps, False)
+    trained = compose("train.sft", SftCommand, overrides)
+    cfg = compose("train.distill", DistillCommand, ["+exp=on_policy", f"store={trained.store}"])
+    shared = {
+        key: getattr(trained.train, key)
+        for key in ("batch", "micro_batch", "workers", "precision", "gradient_checkpointing")
+    }
+    train = replace(cfg.train, **shared, max_steps=steps + 1, generated_items=0)
+    cfg = replace(cfg, train=train)
+    store = ensure_benchmark(trained.benchmark, Path(cfg.store), trained.workers)
+    rationales = ensure_rationales(store, trained.teacher)
+    compat.keep_freed_memory()
+    set_seed(SEED)
+    student, processor = loading.load_student(trained.student, train.precision, list)
+    use_fast_layers(student)
+    training, validation = load_datasets(cfg, trained, store, rationales)
+    # The responses of a model with random weights contain no answer.
+    unlimited = patch.object(sampling.ResponseSampler, "check_parsed", lambda *_: None)
+    with tempfile.TemporaryDirectory() as folder, unlimited:
+        if name == SAMPLING:
+            student.to(rank_device())
+            prompts = [training[k] for k in range((steps + 1) * train.batch)]
+            sampler = sampling.ResponseSampler(processor, trained.student, train)
+            return measure_sampling(sampler, student, prompts, train.batch)
+        teacher, _ = loading.load_student(trained.student, train.precision, list)
+        run = Run("benchmark", Path(folder))
+        trainer = distillation.build_trainer(
+            cfg, trained, run, student, teacher.eval().to(rank_device()), processor, training,
+            validation, None,
+        )  # fmt: skip
+        return comparison.train(trainer, train.batch)
+
+
+def measure_sampling(sampler, student, prompts, batch: int) -> Measurements:
+    """Sample a response to each prompt, in batches of which the first one is not timed."""
+    comparison.reset_peak_memory()
+    for start in range(0, len(prompts), batch):
+        if start == batch:
+            began = time.perf_counter()
+        part = prompts[start : start + batch]
+        sampler.sample(student, [p.student for p in part], [p.seed for p in part])
+    seconds = time.perf_counter() - began
+    peak = comparison.peak_memory() / 2**30
+    return Measurements((len(prompts) - batch) / seconds, peak, [float("nan")])
+
+
+if __name__ == "__main__":
+    main()
