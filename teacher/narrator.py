@@ -14,12 +14,14 @@ from teacher.predicates.facts import Predicates, RelationalPredicates
 from teacher.writers.paper import Detail, Writer, join_sentences
 from teacher.writers.relational import RelationalWriter
 
-NARRATOR_VERSION = "10"
-SHORT, LONG = 110, 250
-"""A rationale with more than LONG words is written again with less detail, one of fewer than SHORT
-words with more. SHORT is well above the minimum, 80 words (paper, Rationale construction)."""
+NARRATOR_VERSION = "11"
+SHORT, LONG, RELATIONAL_LONG = 110, 250, 235
+"""A rationale with more than LONG words, or RELATIONAL_LONG in the relational vocabulary, is
+written again with less detail, one of fewer than SHORT words with more. SHORT is well above the
+minimum, 80 words (paper, Rationale construction)."""
 BRIEF, SPARSE, FULL = Detail(3, 1, 1, 1), Detail(4, 1, 2, 1), Detail(6, 4, 6, 2)
-RELATIONAL_BRIEF, RELATIONAL_SPARSE = Detail(1, 1, 0, 1, 0), Detail(3, 2, 1, 1)
+RELATIONAL_SPARSE, RELATIONAL_BRIEF = Detail(3, 2, 1, 1), Detail(1, 1, 0, 1, 0)
+RELATIONAL_BRIEFEST = RELATIONAL_BRIEF._replace(compared=False)
 """Relational rationales state fewer facts besides those that decide the item."""
 
 
@@ -32,10 +34,14 @@ def write_rationale(
     """
     keys = (seed, item.item_id, attempt)
     decision = _decide(predicates)
-    sparse, brief = (SPARSE, BRIEF) if decision is None else (RELATIONAL_SPARSE, RELATIONAL_BRIEF)
-    text = _make_writer(predicates, decision, sparse, *keys).text()
-    if len(text.split()) > LONG:
-        text = _make_writer(predicates, decision, brief, *keys).text()
+    details, longest = (SPARSE, BRIEF), LONG
+    if decision is not None:
+        details = RELATIONAL_SPARSE, RELATIONAL_BRIEF, RELATIONAL_BRIEFEST
+        longest = RELATIONAL_LONG
+    for detail in details:
+        text = _make_writer(predicates, decision, detail, *keys).text()
+        if len(text.split()) <= longest:
+            break
     if len(text.split()) < SHORT:
         text = _make_writer(predicates, decision, FULL, *keys, padded=True).text()
     return text

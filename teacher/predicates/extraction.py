@@ -47,6 +47,16 @@ DISPLACED, CLEARLY = 12.0, 40.0
 "clearly" rather than "slightly"."""
 
 
+def describe_distance(distance: float, bounds: Bounds) -> str | None:
+    """Return how far an object is off if its place is at a distance (share of the image's width)
+    from the expected place: slightly, clearly or far; None if it counts as being there."""
+    if distance < DISPLACED / IMAGE_SIZE:
+        return None
+    if distance >= bounds.far:
+        return "far"
+    return "clearly" if distance >= CLEARLY / IMAGE_SIZE else "slightly"
+
+
 def extract_facts(
     scene: Scene, start: int, stop: int, target: int, moment: str = "at the target moment"
 ) -> Facts | None:

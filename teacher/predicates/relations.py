@@ -83,6 +83,9 @@ class Bounds(NamedTuple):
     edge: float = 0.06
     """Distance from the image's edge, as a share of its width or height, below which an object has
     reached the edge."""
+    far: float = 0.25
+    """Distance of an object in a candidate from its place at the target, as a share of the image,
+    from which it is "far off" rather than "clearly off"."""
 
 
 def flip_relation(relation: Relation) -> Relation:

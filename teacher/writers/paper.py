@@ -23,7 +23,7 @@ PHRASES = yaml.safe_load((files("teacher") / "templates" / "phrases.yaml").read_
 
 
 class Detail(NamedTuple):
-    """Maximum numbers of objects and pairs that the sections of a text mention."""
+    """What a text mentions: maximum numbers of objects and pairs in its sections."""
 
     parsed: int
     """Objects in the scene parse."""
@@ -35,6 +35,9 @@ class Detail(NamedTuple):
     """Pairs of objects in each section."""
     relations: int = 1
     """Relations in the scene parse, and changes of relations in the motion analysis."""
+    compared: bool = True
+    """Whether the candidate analysis of a relational text states more of a candidate than what is
+    wrong: the true statements before it, and how far places are off."""
 
 
 def most_discriminative_object(predicates: Predicates) -> ObjectFacts:

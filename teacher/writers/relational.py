@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import math
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from importlib.resources import files
 
 import yaml
 
-from teacher.deciding import Decision, probability_of_falsity
+from teacher.deciding import Decision, find_widest_place
+from teacher.predicates.extraction import describe_distance
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
@@ -55,9 +57,10 @@ def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> Re
 class RelationalWriter(Writer):
     """Writes the sections of a rationale from relational predicates.
 
-    The prediction begins with the statements that decide the item (see `teacher.deciding`), and the
-    candidate analysis compares each candidate with these statements only. Other objects that are
-    out of view at the cut are left out.
+    The prediction begins with the statements that decide the item (see `teacher.deciding`). If none
+    of them says where an object is, the place of the object whose places in the candidates differ
+    most comes first. The candidate analysis compares each candidate with these statements only, and
+    says how far off the places are. Other objects that are out of view at the cut are left out.
     """
 
     facts: RelationalPredicates
@@ -70,10 +73,19 @@ class RelationalWriter(Writer):
         *keys: int | str,
         padded: bool = False,
     ) -> None:
-        named = {name for s in decision.statements for name in s.objects}
+        statements = decision.statements
+        if statements and not any(s.kind == "region" for s in statements):
+            place = find_widest_place(facts)
+            statements = (place, *statements) if place else statements
+        named = {name for s in statements for name in s.objects}
         super().__init__(leave_out_unseen(facts, named), detail, *keys, padded=padded)
         self.rank = {o.object: k for k, o in enumerate(self.ranked)}
-        self.statements = [self.orient(s) for s in decision.statements]
+        # "No red cube and the blue sphere near the top" would deny both, and in "the red cube with
+        # the blue sphere left of it and near the top", either could be near the top.
+        self.statements = sorted(
+            (self.orient(s) for s in statements),
+            key=lambda s: (s.kind == "sight", s.kind in SYMMETRIC),
+        )
         # The objects of the deciding statements come first in every section.
         self.ranked = sorted(self.ranked, key=lambda o: o.object not in named)
         self.view_of = {view.letter: view for view in facts.views}
@@ -127,20 +139,33 @@ class RelationalWriter(Writer):
         """Return a statement as the object of "shows"."""
         return f"the {relation.objects[0]} {self.attribute(relation)}"
 
-    def all_shown(self) -> str:
-        """Return all deciding statements as the object of "shows"."""
-        # "No red cube and the blue sphere near the top" would deny both, and in "the red cube with
-        # the blue sphere left of it and near the top", either could be near the top.
-        ordered = sorted(self.statements, key=lambda s: (s.kind == "sight", s.kind in SYMMETRIC))
-        parts: list[str] = []
-        subject = None
-        for s in ordered:
+    def all_shown(self, statements: Sequence[Relation], view: View) -> str:
+        """Return statements that are true of a candidate as the object of "shows"."""
+        text, subject = "", None
+        for s in statements:
             if s.kind == "sight":
-                parts.append(f"no {s.objects[0]}")
+                part = f"no {s.objects[0]}"
             else:
-                parts.append(self.attribute(s) if s.objects[0] == subject else self.shown(s))
-                subject = s.objects[0]
-        return " and ".join(parts)
+                part = self.attribute(s) if s.objects[0] == subject else self.shown(s)
+                # In "between the cube and the sphere and with the cylinder left of it", "it" would
+                # be the sphere.
+                subject = s.objects[0] if s.kind in ("region", *SYMMETRIC) else None
+            part += self.offset(s, view)
+            separator = ", and " if "," in text else " and "
+            text = f"{text}{separator}{part}" if text else part
+        return text
+
+    def offset(self, s: Relation, view: View) -> str:
+        """Return how far a candidate shows an object from its place at the target, if the statement
+        says where it is."""
+        target, shown = self.facts.target.places.image, view.places.image
+        name = s.objects[0]
+        if not self.detail.compared or s.kind != "region":
+            return ""
+        if name not in target or name not in shown:
+            return ""
+        extent = describe_distance(math.dist(shown[name], target[name]), self.facts.bounds)
+        return f", {extent} off" if extent else ""
 
     # Sections.
 
@@ -181,48 +206,73 @@ class RelationalWriter(Writer):
         return parts
 
     def judgement(self, candidate: CandidateFacts) -> str:
-        """State which deciding statement is false of a candidate, or that all are true."""
+        """Compare a candidate with the deciding statements, in order up to the first false one."""
         if not self.statements:
             return super().judgement(candidate)
-        view = self.view_of[candidate.letter]
-        if (wrong := self.find_false(view)) is not None:
-            return self.contrast(wrong, view)
-        text = f"shows {self.all_shown()}"
+        if (exclusion := self.exclusion(self.view_of[candidate.letter])) is not None:
+            return exclusion
+        text = f"shows {self.all_shown(self.statements, self.view_of[candidate.letter])}"
         if candidate.agrees:
             return f"{text}, and agrees"
         return f"{text} but {self.difference(candidate.differences[0])}"
 
-    def find_false(self, view: View) -> Relation | None:
-        """Return the deciding statement that is most clearly false of a candidate."""
-        bounds = self.facts.bounds
-        clearness = {
-            s: probability_of_falsity(normalize_relation(s), view, bounds) for s in self.statements
-        }
-        return max((s for s in clearness if clearness[s]), key=clearness.get, default=None)
+    def exclusion(self, view: View) -> str | None:
+        """State what a candidate shows, up to the first deciding statement that is false of it;
+        None if all are true and no place is off.
 
-    def contrast(self, s: Relation, view: View) -> str:
-        """State how a candidate differs from a deciding statement that is false of it."""
+        The true statements before it are included, so that a model that writes the text looks at
+        the objects in the same order in every candidate, and finds out which one is wrong only when
+        it has written where the object is.
+        """
+        if (wrong := self.find_false(view)) is None:
+            is_off = any(self.offset(s, view) for s in self.statements)
+            return f"shows {self.all_shown(self.statements, view)}" if is_off else None
+        true = self.statements[: self.statements.index(wrong)] if self.detail.compared else []
+        subject = true[-1].objects[0] if true and true[-1].kind == "region" else ""
+        contrast = self.contrast(wrong, view, subject) + self.offset(wrong, view)
+        before = f"{self.all_shown(true, view)}, but " if true else ""
+        return f"shows {before}{contrast}"
+
+    def mismatch(self, view: View) -> str | None:
+        """State only what is wrong with a candidate; None if `exclusion` states nothing."""
+        if (wrong := self.find_false(view)) is not None:
+            return f"shows {self.contrast(wrong, view)}"
+        return self.exclusion(view)
+
+    def find_false(self, view: View) -> Relation | None:
+        """Return the first deciding statement that is false of a candidate."""
+        false = (s for s in self.statements if normalize_relation(s) not in view.statements)
+        return next(false, None)
+
+    def contrast(self, s: Relation, view: View, subject: str = "") -> str:
+        """Return what a candidate shows instead of a deciding statement that is false of it, as the
+        object of "shows".
+
+        Args:
+            subject: The object that the text named last; a relation of this object does not name it
+                again.
+        """
         facts = {o.object: o for o in view.objects}
         if s.kind == "sight":
-            return f"shows the {s.objects[0]}, which should not be seen"
+            return f"the {s.objects[0]}, which should not be seen"
         unseen = [name for name in s.objects if facts[name].target_sight != "shown"]
         if s.kind == "region":
             actual = "out of sight" if unseen else facts[s.objects[0]].target_region
-            return f"shows the {s.objects[0]} {actual}, not {s.value}"
+            return f"the {s.objects[0]} {actual}, not {s.value}"
         if unseen:
-            return f"shows the {unseen[0]} out of sight"
+            return f"the {unseen[0]} out of sight"
         if actual := find_topic(s, view.relations):
             if s.kind not in SYMMETRIC:
-                return f"shows {self.shown(actual)}"
-            return f"shows {self.shown(actual)}, not {self.place(flip_relation(s), pronoun=True)}"
-        return f"shows the {s.objects[0]}, but not {self.place(s)}"
+                return self.shown(actual)
+            shown = (self.attribute if actual.objects[0] == subject else self.shown)(actual)
+            return f"{shown}, not {self.place(flip_relation(s), pronoun=True)}"
+        return f"the {s.objects[0]} not {self.place(s)}"
 
     def match(self, candidate: CandidateFacts) -> str:
         if candidate.agrees or not self.statements:
             return super().match(candidate)
-        view = self.view_of[candidate.letter]
-        if (wrong := self.find_false(view)) is not None:
-            return f"Candidate {candidate.letter} does not match: it {self.contrast(wrong, view)}."
+        if (mismatch := self.mismatch(self.view_of[candidate.letter])) is not None:
+            return f"Candidate {candidate.letter} does not match: it {mismatch}."
         return super().match(candidate)
 
     def outcome(self) -> list[str]:

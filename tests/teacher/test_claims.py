@@ -151,10 +151,15 @@ def test_false_word_is_contradicted(rationales, source, kind):
 
 
 def add_rare_statements(text, predicates):
-    """Add true statements that few rationales have: extremes and what covers what to the
-    prediction, and which edges objects reach to the motion analysis."""
+    """Add true statements that few rationales have: extremes, what is between what and what covers
+    what to the prediction, and which edges objects reach to the motion analysis."""
     true = sorted(predicates.target.statements)
     extremes = [f" The {s.objects[0]} will be {s.value}." for s in true if s.kind == "extreme"]
+    between = [
+        " The {} will be between the {} and the {}.".format(*s.objects)
+        for s in true
+        if s.kind == "between"
+    ]
     covers = [
         f" The {s.objects[0]} will be {s.value} the {s.objects[1]}."
         for s in true
@@ -163,7 +168,7 @@ def add_rare_statements(text, predicates):
     edges = [f" The {s.objects[0]} {s.value}." for s in true if s.kind == "edge"]
     text = text.replace("\nPrediction:", f"{''.join(edges)}\nPrediction:")
     return text.replace(
-        "\nCandidate analysis:", f"{''.join(extremes + covers)}\nCandidate analysis:"
+        "\nCandidate analysis:", f"{''.join(extremes + between + covers)}\nCandidate analysis:"
     )
 
 

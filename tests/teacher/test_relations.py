@@ -12,7 +12,7 @@ from conf.schema import TeacherConfig
 from conf.schema.servers import RelationBounds
 from data.records import Scene
 from teacher.deciding import choose_statements
-from teacher.narrator import write_match_lines, write_rationale
+from teacher.narrator import FULL, write_match_lines, write_rationale
 from teacher.predicates.facts import Relation
 from teacher.predicates.relations import (
     CHANGES,
@@ -29,6 +29,7 @@ from teacher.predicates.relations import (
 from teacher.sufficiency import find_predicted, measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
+from teacher.writers.relational import RelationalWriter
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 
@@ -265,6 +266,8 @@ def test_wrong_candidates_are_excluded_by_a_deciding_statement() -> None:
         text = write_rationale(predicates, item, seed=0)
         decision = choose_statements(predicates)
         kinds = {s.kind for s in decision.statements} | {"lacks", "extra", "sight"}
+        # Without a region among them, the analysis begins with one, and all say what is off.
+        kinds |= {"region", "displaced"}
         claims = extract_claims(text, predicates)
         for view in predicates.views:
             about = [c for c in claims if c.candidate == view.letter and c.kind != "agrees"]
@@ -292,8 +295,10 @@ def test_objects_out_of_view_at_the_cut_are_named_only_if_they_decide() -> None:
 def test_scene_parses_name_objects_from_left_to_right() -> None:
     for item, predicates in random_cases(60, BOUNDS):
         parse = write_rationale(predicates, item, 0).split("Motion analysis:")[0]
-        found = {name: parse.find(name) for name in predicates.left_to_right if name in parse}
-        assert sorted(found, key=found.get) == [*found]
+        named = [[n for n in predicates.left_to_right if n in s] for s in parse.split(". ")]
+        # Sentences about two objects name the more relevant one first.
+        found = dict.fromkeys(names[0] for names in named if len(names) == 1)
+        assert [*found] == [n for n in predicates.left_to_right if n in found]
 
 
 def test_match_lines_rest_on_the_statements_of_the_rationale() -> None:
@@ -383,3 +388,24 @@ def test_bounds_of_the_settings_are_those_of_the_predicates() -> None:
     assert Bounds(**asdict(RelationBounds())) == Bounds()
     [problem] = TeacherConfig(name="t", bounds=RelationBounds(against=2.0)).check("teacher.")
     assert "teacher.bounds.against=2" in problem
+
+
+def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement() -> None:
+    walked = 0
+    for item, predicates in random_cases(60, BOUNDS):
+        decision = choose_statements(predicates)
+        writer = RelationalWriter(predicates, decision, FULL, item.item_id)
+        for view in predicates.views:
+            holds = [normalize_relation(s) in view.statements for s in writer.statements]
+            is_off = any(writer.offset(s, view) for s in writer.statements)
+            text = writer.exclusion(view)
+            assert (text is None) == (all(holds) and not is_off)
+            if text is None or all(holds):
+                continue
+            # The true statements are stated before the first false one, and none after it.
+            first = holds.index(False)
+            shown = writer.all_shown(writer.statements[:first], view)
+            assert text.startswith(f"shows {shown}, but " if first else "shows ")
+            assert (", but " in text) == (first > 0)
+            walked += first > 0
+    assert walked
