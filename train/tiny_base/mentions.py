@@ -36,12 +36,13 @@ PREDICTED = re.compile(
 )
 """Matches a sentence that says where an object will be."""
 CLAIMED = re.compile(
-    rf"(?:[Cc]andidate \w|it) (?P<verb>shows) the (?P<name>{NAME.pattern}) "
-    rf"(?P<place>between [^.]+? and the (?:{NAME.pattern})|[^.]+?)"
-    r"(?P<comma>,?)(?=(?P<agrees>,? and agrees| and the )| not | but |,? and not |\.)"
+    rf"\b(?P<verb>shows|and|but) the (?P<name>{NAME.pattern}) "
+    rf"(?P<place>between [^.]+? and the (?:{NAME.pattern})|[^.,]+?)(?P<comma>,?)"
+    r"(?=(?P<agrees>,? and agrees| and (?:the|with|no) |,? but | (?:slightly|clearly|far) off)"
+    r"| not |,? and not |\.)"
 )
 """Matches what a text says that a candidate shows of an object. The group `agrees` matches if the
-text says that the candidate agrees, or goes on with another object."""
+text says that the candidate agrees, how far the place is off, or goes on with another object."""
 POSSESSES = re.compile(r"\b(?:with|has|have) the $")
 """Matches the words before the sphere in "the cube has the sphere left of it"."""
 PREDICTION = re.compile("Prediction:")
@@ -131,17 +132,19 @@ class TokenizedText:
         """Yield the index of the last token of each place that a candidate is said to show, also of
         a comma after it, and an index that says whether the place was predicted: that of the last
         token of the predicted place if both are the same, otherwise that of the word "shows". After
-        these tokens, the text says whether both are the same. Objects with several predictions are
-        left out."""
-        predicted: dict[str, list[int]] = {}
+        these tokens, the text says whether both are the same. A region is compared with a predicted
+        region, and a relation with a relation; if an object has several of them, they are left out.
+        """
+        predicted: dict[tuple[str, bool], list[int]] = {}
         for event in self._find(PREDICTION, PREDICTED, CLAIMED):
             if event.re is PREDICTION:
                 predicted.clear()
                 continue
             last = self.token_at(event.end("place") - 1)
+            kind = event["name"], event["place"].startswith("near the ")
             if event.re is PREDICTED:
-                predicted.setdefault(event["name"], []).append(last)
-            elif len(places := predicted.get(event["name"], [])) == 1:
+                predicted.setdefault(kind, []).append(last)
+            elif len(places := predicted.get(kind, [])) == 1:
                 key = places[0] if event["agrees"] else self.token_at(event.start("verb"))
                 yield last, key
                 if event["comma"]:

@@ -26,6 +26,7 @@ SPATIAL_WORDS = {
     "speed": ("slowly", "steadily", "quickly", "rests", "stationary"),
     "gap": ("touch", "apart"),
     "height": ("above", "below", "level"),
+    "extent": ("slightly", "clearly", "far"),
 }
 """Words for places, motion and relations."""
 CLEARLY_VISIBLE = 0.3

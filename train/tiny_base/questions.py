@@ -8,31 +8,30 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     describe   where each candidate shows each object, and how they lie to each other
     compare    for each of two candidates, the statements that tell it apart from the others, and
                which candidates agree with them
-    explain    the steps of a rationale about a statement that is true of the target
+    explain    the steps of a rationale about candidates that do not include the target
     match      as `compare`, without any picture
     narrate    a whole rationale with its answer, without any picture
 
 None of them is the selection task: no answer about pictures says which candidate is the target.
-`compare` asks about candidates sampled at random, whichever is the target. Its statements are
-chosen as those that decide an item, so that the model learns to find the objects that tell
-candidates apart. The statements of `explain` are sampled, and true of at least two candidates. Of
-the sampled statements, the one that fewest candidates agree with is used. `match` teaches
-to compare what a text says of a candidate with what it has predicted. `narrate` teaches the
+`compare` supposes that a candidate is the target, at random. Its statements are chosen as those
+that decide an item, so that the model learns to find the objects that tell candidates apart, and
+how far apart their places are. In `explain`, the prediction is true of the target, but another
+candidate is shown instead of it, so that the model must foresee what it compares with. `match`
+teaches to compare what a text says of a candidate with what it has predicted. `narrate` teaches the
 language of rationales, in both vocabularies, and how an answer follows from what a text says of the
 candidates.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data.records import SelectionItem
+from data.records import LETTERS, SelectionItem
 from models.student.prompts import response
-from teacher.deciding import Decision, choose_statements, probability_of_sight
+from teacher.deciding import Decision, choose_statements
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.facts import Relation, RelationalPredicates, View
 from teacher.predicates.relations import (
@@ -63,8 +62,6 @@ PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
 to `describe`, and of candidates that `compare` supposes to be the target."""
 SUPPOSED_PATH = 0.2
 """Path of objects to a supposed target, as a share of the image; a typical path to the target."""
-OPTIONS = 12
-"""Number of statements that `explain` samples, of which it uses one or two."""
 
 WEIGHTS = {
     "region": 10, "gap": 2, "side": 2, "height": 2, "nearer": 1, "sight": 1, "between": 1,
@@ -82,6 +79,7 @@ class Question:
     Attributes:
         clip, candidates: Whether the prompt shows the clip, and the candidates.
         predicts_target: Whether the answer's predictions are true of the target.
+        order: For each letter, the index of the item's candidate that is shown.
     """
 
     text: str
@@ -89,6 +87,7 @@ class Question:
     clip: bool = True
     candidates: bool = True
     predicts_target: bool = True
+    order: tuple[int, ...] = (0, 1, 2, 3)
 
 
 def ask_parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
@@ -149,38 +148,47 @@ def ask_compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Gen
         statements = choose_statements(supposed).statements
         if not statements:
             continue
-        writer = make_statement_writer(p, item, rng, statements)
+        writer = make_statement_writer(supposed, item, rng, statements)
         predicted = [writer.statement(s, "will be") for s in writer.statements]
-        analysed = [f"candidate {view.letter} {state_verdict(writer, view)}" for view in p.views]
+        views = supposed.views
+        analysed = [f"candidate {view.letter} {state_verdict(writer, view)}" for view in views]
         blocks.append(
+            f"Supposition: candidate {supposed.answer} is the target.\n"
             f"Prediction: {join_sentences(predicted)}\n"
             f"Candidate analysis: {join_sentences(analysed)}\n"
-            f"Outcome: {join_sentences([name_agreeing(p, statements)])}"
+            f"Outcome: {join_sentences([name_agreeing(writer, views)])}"
         )
     return Question(COMPARE, "\n".join(blocks), predicts_target=False)
 
 
 def ask_explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
-    """Ask for the steps of a rationale, with statements that are true of the target and of another
-    candidate; for the first two steps if there are none."""
-    statements = sample_shared_statements(leave_out_unseen(p), rng)
+    """Ask for the steps of a rationale; for the first two steps if no statement decides the item.
+
+    The prediction is that of a rationale, but no picture shows the target: another candidate takes
+    its place. So the answer does not say which candidate is the target.
+    """
+    statements = choose_statements(p).statements
     if not statements:
         return replace(ask_parse(p, item, rng), text=EXPLAIN, candidates=True)
+    order = list(range(len(p.views)))
+    others = [k for k in order if k != item.answer]
+    order[item.answer] = others[rng.integers(len(others))]
+    views = [replace(p.views[k], letter=letter) for letter, k in zip(LETTERS, order, strict=True)]
     writer = make_statement_writer(p, item, rng, statements, SPARSE)
     shortest = min(writer.statements, key=lambda s: len(s.objects))
     sections = {
         "Scene parse": writer.scene_parse(),
         "Motion analysis": writer.motion_analysis(),
         "Prediction": writer.prediction(),
-        "Candidate analysis": [f"candidate {v.letter} {state_verdict(writer, v)}" for v in p.views],
-        "Outcome": [writer.statement(shortest, "is"), name_agreeing(p, statements)],
+        "Candidate analysis": [f"candidate {v.letter} {state_verdict(writer, v)}" for v in views],
+        "Outcome": [writer.statement(shortest, "is"), name_agreeing(writer, views)],
     }
     lines = [f"{title}: {join_sentences(parts)}" for title, parts in sections.items()]
-    for view in p.views:
-        wrong = writer.find_false(view)
-        match = f"does not match: it {writer.contrast(wrong, view)}" if wrong else "matches"
+    for view in views:
+        mismatch = writer.mismatch(view)
+        match = f"does not match: it {mismatch}" if mismatch else "matches"
         lines.append(f"Candidate {view.letter} {match}.")
-    return Question(EXPLAIN, "\n".join(lines))
+    return Question(EXPLAIN, "\n".join(lines), order=tuple(order))
 
 
 def ask_match(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
@@ -230,22 +238,18 @@ def suppose_target(p: RelationalPredicates, letter: str) -> RelationalPredicates
 
 
 def state_verdict(writer: RelationalWriter, view: View) -> str:
-    """Return a clause that says which of the writer's statements is false of a candidate, or that
-    all are true."""
-    if (wrong := writer.find_false(view)) is not None:
-        return writer.contrast(wrong, view)
-    return f"shows {writer.all_shown()}, and agrees"
+    """Return a clause that compares a candidate with the writer's statements, up to the first one
+    that is false of it."""
+    shown = writer.all_shown(writer.statements, view)
+    return writer.exclusion(view) or f"shows {shown}, and agrees"
 
 
-def find_agreeing(p: RelationalPredicates, statements: Sequence[Relation]) -> list[str]:
-    """Return the letters of the candidates of which all statements are true."""
-    wanted = {normalize_relation(s) for s in statements}
-    return [view.letter for view in p.views if wanted <= view.statements]
-
-
-def name_agreeing(p: RelationalPredicates, statements: Sequence[Relation]) -> str:
-    """Return the clause that names the candidates of which all statements are true."""
-    *letters, last = find_agreeing(p, statements)
+def name_agreeing(writer: RelationalWriter, views: Sequence[View]) -> str:
+    """Return the clause that names the candidates that agree with the writer's statements."""
+    agreeing = [view.letter for view in views if writer.exclusion(view) is None]
+    if not agreeing:
+        return "no candidate agrees"
+    *letters, last = agreeing
     if not letters:
         return f"candidate {last} agrees"
     return f"candidates {', '.join(letters)} and {last} agree"
@@ -276,29 +280,3 @@ def sample_statements(
         options = by_kind[kinds[rng.choice(len(kinds), p=weights / weights.sum())]]
         chosen[options[rng.integers(len(options))]] = None
     return [flip_relation(s) if s.kind in SYMMETRIC and rng.random() < 0.5 else s for s in chosen]
-
-
-def sample_shared_statements(p: RelationalPredicates, rng: np.random.Generator) -> list[Relation]:
-    """Sample one or two statements that are true of the target and of another candidate, the first
-    chosen by `choose_rarest`. The list is empty if there are none."""
-    options = sample_statements(p, p.target, rng, OPTIONS)
-    shared = [s for s in options if len(find_agreeing(p, [s])) > 1]
-    if not shared:
-        return []
-    first = [choose_rarest(p, shared)]
-    if rng.random() < 0.6:
-        return first
-    second = [s for s in shared if s not in first and len(find_agreeing(p, [*first, s])) > 1]
-    return first + second[:1]
-
-
-def choose_rarest(p: RelationalPredicates, statements: Sequence[Relation]) -> Relation:
-    """Return the statement that the fewest candidates agree with. Of several, this is the one that
-    a reader whose places are inexact most likely judges correctly for all candidates."""
-
-    def rank(statement: Relation) -> tuple[int, float]:
-        normalized = normalize_relation(statement)
-        seen = [probability_of_sight(normalized, view, p.bounds) for view in p.views]
-        return len(find_agreeing(p, [statement])), -math.prod(seen)
-
-    return min(statements, key=rank)

@@ -75,14 +75,15 @@ def make_sample(
     parts: list[str | np.ndarray] = [item.question]
     clip, last, observed, future = None, -1, {}, {}
     if question.clip:
-        shown = sample_prefix_frames(item.prefix_start, item.prefix_stop, frame_count)
-        clip, last = load_clip(item.scene_id, shown, frames), (len(shown) + 1) // 2 - 1
-        targets += clip_targets(scene, shown)
+        seen = sample_prefix_frames(item.prefix_start, item.prefix_stop, frame_count)
+        clip, last = load_clip(item.scene_id, seen, frames), (len(seen) + 1) // 2 - 1
+        targets += clip_targets(scene, seen)
         observed = observed_states(scene, find_cut(scene, item.prefix_start, item.prefix_stop))
         future = future_displacements(scene, item.prefix_stop, item.target_frame)
     if question.candidates:
         images = []
-        for picture, (letter, c) in enumerate(zip(LETTERS, item.candidates, strict=True), last + 1):
+        shown = [item.candidates[k] for k in question.order]
+        for picture, (letter, c) in enumerate(zip(LETTERS, shown, strict=True), last + 1):
             follows = original_scene_id(c.scene_id) == original_scene_id(item.scene_id)
             before = (scene, item.prefix_stop) if follows and clip else None
             images.append([*image_targets(frames.scene(c.scene_id), c.frame, picture, before)])

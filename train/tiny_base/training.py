@@ -62,14 +62,16 @@ CHECKPOINT = "state.pt"
 WARMUP_STEPS, LEAST_RATE = 40, 0.05
 DENSE = 0.5
 """Weight, in the stage of words, of the losses at visual tokens and of the colours, materials and
-shapes at names, relative to the loss of all words."""
-POINTING = 1.0
-"""Weight of the losses of attention heads."""
-NAMED = 3.0
+shapes at names."""
+POINTING = 0.5
+"""Weight, in the stage of words, of the losses of attention heads."""
+NAMED = 2.0
 """Weight of the losses of places and motion in texts."""
-WORD_GROUPS = {"object words": 1.0, "spatial words": 1.0}
-"""Weights of the words for colours, materials and shapes, and of those for places, motion and
-relations. They are a third and a tenth of all words, and harder to predict than the others."""
+WORD_LOSSES = 3.0
+"""Weight of the losses of words: of all words, of those for colours, materials and shapes, and of
+those for places, motion and relations. The last two are a third and a tenth of all words, and
+harder to predict than the others. With a weight of 1, the gradient of these losses was a tenth of
+that of the losses of places and attention heads, and the base named objects that do not exist."""
 
 
 def eyes_losses(
@@ -107,7 +109,7 @@ def words_losses(
         spelled = heads.spelled_losses(trace.outputs[MIDDLE], targets)
         losses |= {f"spelled {kind}": DENSE * loss for kind, loss in spelled.items()}
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()
-    losses["words"] = cross_entropy(predicted, following, ignore_index=IGNORED)
+    losses["words"] = WORD_LOSSES * cross_entropy(predicted, following, ignore_index=IGNORED)
     # The logits and labels are those of the last tokens.
     start = batch["input_ids"].shape[1] - labels.shape[1]
     groups = {"object words": targets.object_words, "spatial words": targets.spatial_words}
@@ -115,7 +117,7 @@ def words_losses(
         row, at = tokens.T
         if len(row):
             predicted = logits[row, at - start - 1].float()
-            losses[name] = WORD_GROUPS[name] * cross_entropy(predicted, labels[row, at - start])
+            losses[name] = WORD_LOSSES * cross_entropy(predicted, labels[row, at - start])
     return losses
 
 

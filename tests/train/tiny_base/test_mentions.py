@@ -62,12 +62,31 @@ def test_places_in_candidates_are_compared_with_the_predicted_ones(processor) ->
     )
     ends = [text.token_at(m.end() - 1) for m in re.finditer("near the [a-z-]+", text.text)]
     shows = [text.token_at(m.start()) for m in re.finditer("shows", text.text)]
-    commas = [text.token_at(m.start()) for m in re.finditer(", not", text.text)]
-    # The gray cube has two predictions.
+    commas = [text.token_at(m.start()) for m in re.finditer(", (not|and)", text.text)]
+    # The gray cube has one predicted region.
     assert [*text.comparisons()] == [
         (ends[2], shows[0]), (commas[0], shows[0]),
+        (ends[4], ends[1]), (commas[1], ends[1]),
         (ends[5], ends[0]),
-        (ends[6], shows[3]), (commas[1], shows[3]),
+        (ends[6], shows[3]), (commas[2], shows[3]),
+    ]  # fmt: skip
+
+
+def test_compared_places_end_before_how_far_they_are_off(processor) -> None:
+    text = TokenizedText(
+        "Prediction: At the end, the red metal cube will be near the left. The gray metal cube "
+        "will be near the top.\n"
+        "Candidate analysis: Candidate A shows the red metal cube near the left, slightly off "
+        "toward the north, but the gray metal cube near the center, not near the top, clearly off "
+        "toward the south.",
+        processor.tokenizer,
+    )
+    ends = [text.token_at(m.end() - 1) for m in re.finditer("near the [a-z]+", text.text)]
+    commas = [text.token_at(m.start()) for m in re.finditer(", (slightly|not)", text.text)]
+    but = text.token_at(text.text.index("but "))
+    assert [*text.comparisons()] == [
+        (ends[2], ends[0]), (commas[0], ends[0]),
+        (ends[3], but), (commas[1], but),
     ]  # fmt: skip
 
 
