@@ -23,7 +23,7 @@ from teacher.narrator import list_clauses
 from teacher.predicates.facts import Predicates
 from teacher.sections import SECTIONS
 
-CITED_VERSION = "2"
+CITED_VERSION = "3"
 """Changes with the form of cited rationales and the rules for the words around slots."""
 SLOT = "{}"
 ANALYSIS = "Candidate analysis"

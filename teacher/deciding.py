@@ -64,12 +64,24 @@ def choose_statements(predicates: RelationalPredicates) -> Decision:
     ]
     holds = np.array([_probability_of_truth(s, predicates) for s in statements])
     bounds = predicates.bounds
-    excludes = np.array([[probability_of_falsity(s, v, bounds) for v in wrong] for s in statements])
+    excludes = np.array(
+        [[_probability_of_falsity(s, v, bounds) for v in wrong] for s in statements]
+    )
     excludes = excludes.reshape(len(statements), len(wrong))
     possible = excludes.any(axis=0)
     rivals = tuple(v.letter for v, excluded in zip(wrong, possible, strict=True) if not excluded)
     chosen = _choose_set(holds, excludes[:, possible]) if possible.any() else ()
     return Decision(tuple(statements[k] for k in chosen), rivals)
+
+
+def list_compared(decision: Decision, predicates: RelationalPredicates) -> tuple[Relation, ...]:
+    """Return the statements with which a rationale compares the candidates: those that decide the
+    item and, before them, the widest place if none of them says where an object is."""
+    statements = decision.statements
+    if statements and not any(s.kind == "region" for s in statements):
+        place = find_widest_place(predicates)
+        return (place, *statements) if place else statements
+    return statements
 
 
 def find_widest_place(predicates: RelationalPredicates) -> Relation | None:
@@ -80,6 +92,8 @@ def find_widest_place(predicates: RelationalPredicates) -> Relation | None:
     def spread(place: Relation) -> float:
         found = [view.places.image.get(place.objects[0]) for view in predicates.views]
         points = np.array([p for p in found if p is not None])
+        if not len(points):
+            return 0.0
         distances = np.hypot(*(points - points.mean(axis=0)).T).tolist()
         return sum(distances) + UNSEEN_DISTANCE * found.count(None)
 
@@ -110,13 +124,13 @@ def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:
     return tuple(int(k) for k in (holds[:, None] * excludes).argmax(axis=0))
 
 
-def probability_of_falsity(statement: Relation, view: View, bounds: Bounds) -> float:
+def _probability_of_falsity(statement: Relation, view: View, bounds: Bounds) -> float:
     """Return the probability that a reader finds a statement false of a candidate; 0 if it is
     true."""
-    return 0.0 if statement in view.statements else probability_of_sight(statement, view, bounds)
+    return 0.0 if statement in view.statements else _probability_of_sight(statement, view, bounds)
 
 
-def probability_of_sight(statement: Relation, view: View, bounds: Bounds) -> float:
+def _probability_of_sight(statement: Relation, view: View, bounds: Bounds) -> float:
     """Return the probability that a reader finds a statement true of a candidate if it is true, or
     false if it is false."""
     margin = abs(measure_margin(statement, view.places, bounds))
@@ -130,7 +144,7 @@ def _probability_of_truth(statement: Relation, predicates: RelationalPredicates)
     paths = [predicates.paths.get(name, UNKNOWN_PATH) for name in _involved(statement, target)]
     error = _error(statement, [SEEN_ERROR + PREDICTED_ERROR * path for path in paths])
     predicted = _normal_cdf(measure_margin(statement, target.places, bounds) / error)
-    return predicted * probability_of_sight(statement, target, bounds)
+    return predicted * _probability_of_sight(statement, target, bounds)
 
 
 def _error(statement: Relation, errors: Sequence[float]) -> float:

@@ -5,12 +5,15 @@ mistake.
     python -m benchmarks.experiments.simulated_reader
     python -m benchmarks.experiments.simulated_reader --benchmark tiny_balanced
 
-Each pair of rows has a standard deviation of the seen places (% of the image) and one of the
+Each group of rows has a standard deviation of the seen places (% of the image) and one of the
 predicted places (% of an object's path from the cut to the target, added to the first). There are
-two readers:
+three readers:
 
-    rationale    states the topics of the deciding statements as it predicts them, and guesses among
+    statements   states the topics of the deciding statements as it predicts them, and guesses among
                  the candidates that it sees to agree with all of them
+    distances    says of the places among these statements how far off each candidate is, in the
+                 words of the candidate analysis, and guesses among the candidates that are least
+                 off and, of these, agree with most statements
     nearest      chooses the candidate whose places differ least from the predicted ones, which
                  needs no words
 """
@@ -27,10 +30,10 @@ import numpy as np
 
 from benchmarks.experiments.experiment import open_benchmark, print_header, print_row
 from conf.failures import report_failures
-from data.records import FAMILIES, LETTERS, SelectionItem
+from data.records import FAMILIES, SelectionItem
 from data.store import Store
-from teacher.deciding import UNKNOWN_PATH, choose_statements
-from teacher.predicates.extraction import extract_predicates
+from teacher.deciding import UNKNOWN_PATH, UNSEEN_DISTANCE, choose_statements, list_compared
+from teacher.predicates.extraction import describe_distance, extract_predicates
 from teacher.predicates.facts import Relation
 from teacher.predicates.places import region_at
 from teacher.predicates.relations import (
@@ -44,14 +47,13 @@ from teacher.predicates.relations import (
 ERRORS = ((0.0, 0.0), (0.02, 0.0), (0.02, 0.15), (0.02, 0.3), (0.03, 0.4))
 """Standard deviations of the seen places, and of the predicted ones as shares of the paths. Those
 of the tiny base are about 0.02 and 0.3."""
+READERS = ("statements", "distances", "nearest")
 BOUNDS = Bounds()
-LOST = 0.3
-"""Distance that counts for an object that is visible in only one of two frames."""
 
 
 class Case(NamedTuple):
-    """An item as the reader meets it: its deciding statements, the places in its candidates, and
-    the paths of its objects from the cut to the target."""
+    """An item as the reader meets it: the statements that the candidate analysis compares with, the
+    places in its candidates, and the paths of its objects from the cut to the target."""
 
     item: SelectionItem
     statements: tuple[Relation, ...]
@@ -70,11 +72,11 @@ def main() -> None:
     print_header("seen", "predicted", "reader", *FAMILIES, "macro")
     for seen, predicted in ERRORS:
         rng = np.random.default_rng(0)
-        right: dict[str, list[tuple[float, float]]] = {family: [] for family in FAMILIES}
+        right: dict[str, list[tuple[float, ...]]] = {family: [] for family in FAMILIES}
         for case in cases * args.samples:
             right[case.item.family].append(answer(case, seen, predicted, rng))
         means = np.array([np.mean(right[family], axis=0) for family in FAMILIES])
-        for name, column in zip(("rationale", "nearest"), means.T, strict=True):
+        for name, column in zip(READERS, means.T, strict=True):
             shares = [f"{100 * x:.1f}" for x in (*column, column.mean())]
             print_row(f"{100 * seen:.0f}%", f"{100 * predicted:.0f}%", name, *shares)
 
@@ -83,7 +85,10 @@ def read_cases(store: Store) -> Iterator[Case]:
     """Yield the test items that statements decide, at least in part."""
     for item in store.selection("test"):
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene, BOUNDS)
-        if predicates is None or not (statements := choose_statements(predicates).statements):
+        if predicates is None:
+            continue
+        statements = list_compared(choose_statements(predicates), predicates)
+        if not statements:
             continue
         candidates = [Places.of(store.scene(c.scene_id), c.frame) for c in item.candidates]
         yield Case(item, statements, candidates, predicates.paths)
@@ -91,8 +96,8 @@ def read_cases(store: Store) -> Iterator[Case]:
 
 def answer(
     case: Case, seen: float, predicted: float, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Return the probability of a right answer by the rationale, and by the nearest candidate."""
+) -> tuple[float, ...]:
+    """Return the probability of a right answer of each of the `READERS`."""
     ground = fit_ground(case.candidates)
     target = case.candidates[case.item.answer]
     errors = {name: seen + predicted * case.paths.get(name, UNKNOWN_PATH) for name in target.image}
@@ -103,14 +108,35 @@ def answer(
     ]
     names = {name for statement in case.statements for name in statement.objects}
     stated = state_topics(case.statements, find_statements(expected, names))
-    agreeing = [
-        letter
-        for letter, places in zip(LETTERS, candidates, strict=True)
-        if stated <= find_statements(places, names)
-    ] or LETTERS
-    by_rationale = (case.item.letter in agreeing) / len(agreeing)
+    missed = [len(stated - find_statements(places, names)) for places in candidates]
+    placed = [s.objects[0] for s in case.statements if s.kind == "region"]
+    off = [
+        (sum(count_steps(expected, p, name) for name in placed), m)
+        for p, m in zip(candidates, missed, strict=True)
+    ]
     distances = [distance(expected, places) for places in candidates]
-    return by_rationale, float(np.argmin(distances) == case.item.answer)
+    return (
+        probability_of([m == 0 for m in missed], case.item.answer),
+        probability_of([o == min(off) for o in off], case.item.answer),
+        float(np.argmin(distances) == case.item.answer),
+    )
+
+
+def probability_of(chosen: list[bool], answer: int) -> float:
+    """Return the probability of an answer if one of the chosen candidates is guessed; of all
+    candidates if none is chosen."""
+    return chosen[answer] / sum(chosen) if any(chosen) else 1 / len(chosen)
+
+
+def count_steps(expected: Places, places: Places, name: str) -> int:
+    """Return how far off an object is: 0 if it is where it is expected, then 1 slightly, 2 clearly,
+    3 far, and 4 if only one of the frames shows it."""
+    if (name in expected.image) != (name in places.image):
+        return 4
+    if name not in expected.image:
+        return 0
+    extent = describe_distance(dist(expected.image[name], places.image[name]), BOUNDS)
+    return (None, "slightly", "clearly", "far").index(extent)
 
 
 def displace(
@@ -168,10 +194,10 @@ def state_topics(statements: tuple[Relation, ...], found: set[Relation]) -> set[
 
 def distance(one: Places, other: Places) -> float:
     """Return the sum of the distances between the places of each object in two frames. An object
-    that only one of them shows counts `LOST`."""
+    that only one of them shows counts `UNSEEN_DISTANCE`."""
     names = one.image.keys() | other.image.keys()
     both = one.image.keys() & other.image.keys()
-    return sum(dist(one.image[name], other.image[name]) for name in both) + LOST * (
+    return sum(dist(one.image[name], other.image[name]) for name in both) + UNSEEN_DISTANCE * (
         len(names) - len(both)
     )
 

@@ -3,11 +3,12 @@
     python -m benchmarks.speed.distill                # the tiny student, on any machine
     python -m benchmarks.speed.distill qwen3_vl_8b    # a released size, on a GPU
 
-Every variant trains on the same items of the tiny benchmark, in a process of its own. "train.sft"
-trains on rationales, with the settings of the preset. "train.distill" samples a response to each
-item and trains on it, with a teacher of the same size that reads the facts. "sampling" is the part
-of its steps in which the responses are sampled. The script prints medians over the rounds and the
-ratios to train.sft.
+Every variant trains on items of the tiny benchmark, in a process of its own. "train.sft" trains on
+its usual samples, half of which are answers without a rationale. "train.distill" samples a response
+to each item and trains on it, with a teacher of the same size that reads the facts. Both have the
+batch, the micro-batch and the memory settings of the student's preset. "sampling" is the part of
+the steps of train.distill in which the responses are sampled. The script prints medians over the
+rounds and the ratios to train.sft.
 
 A released size has random weights, so that nothing is downloaded. Its responses do not end, so they
 have the full length of --tokens.

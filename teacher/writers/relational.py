@@ -9,7 +9,7 @@ from importlib.resources import files
 
 import yaml
 
-from teacher.deciding import Decision, find_widest_place
+from teacher.deciding import Decision, list_compared
 from teacher.predicates.extraction import describe_distance
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
@@ -73,19 +73,18 @@ class RelationalWriter(Writer):
         *keys: int | str,
         padded: bool = False,
     ) -> None:
-        statements = decision.statements
-        if statements and not any(s.kind == "region" for s in statements):
-            place = find_widest_place(facts)
-            statements = (place, *statements) if place else statements
+        statements = list_compared(decision, facts)
         named = {name for s in statements for name in s.objects}
         super().__init__(leave_out_unseen(facts, named), detail, *keys, padded=padded)
         self.rank = {o.object: k for k, o in enumerate(self.ranked)}
-        # "No red cube and the blue sphere near the top" would deny both, and in "the red cube with
-        # the blue sphere left of it and near the top", either could be near the top.
+        # Regions come first. "No red cube and the blue sphere near the top" would deny both, and in
+        # "the red cube with the blue sphere left of it and near the top", either could be near the
+        # top.
         self.statements = sorted(
             (self.orient(s) for s in statements),
-            key=lambda s: (s.kind == "sight", s.kind in SYMMETRIC),
+            key=lambda s: (s.kind == "sight", s.kind in SYMMETRIC, s.kind != "region"),
         )
+        self.deciding = set(decision.statements)
         # The objects of the deciding statements come first in every section.
         self.ranked = sorted(self.ranked, key=lambda o: o.object not in named)
         self.view_of = {view.letter: view for view in facts.views}
@@ -149,9 +148,9 @@ class RelationalWriter(Writer):
                 part = self.attribute(s) if s.objects[0] == subject else self.shown(s)
                 # In "between the cube and the sphere and with the cylinder left of it", "it" would
                 # be the sphere.
-                subject = s.objects[0] if s.kind in ("region", *SYMMETRIC) else None
+                subject = s.objects[0] if len(s.objects) == 1 or s.kind in SYMMETRIC else None
             part += self.offset(s, view)
-            separator = ", and " if "," in text else " and "
+            separator = ", and " if "," in text + part else " and "
             text = f"{text}{separator}{part}" if text else part
         return text
 
@@ -221,20 +220,22 @@ class RelationalWriter(Writer):
         None if all are true and no place is off.
 
         The true statements before it are included, so that a model that writes the text looks at
-        the objects in the same order in every candidate, and finds out which one is wrong only when
-        it has written where the object is.
+        the objects in the same order in every candidate, and decides that a statement is false only
+        after it has written where its object is.
         """
         if (wrong := self.find_false(view)) is None:
             is_off = any(self.offset(s, view) for s in self.statements)
             return f"shows {self.all_shown(self.statements, view)}" if is_off else None
         true = self.statements[: self.statements.index(wrong)] if self.detail.compared else []
-        subject = true[-1].objects[0] if true and true[-1].kind == "region" else ""
-        contrast = self.contrast(wrong, view, subject) + self.offset(wrong, view)
-        before = f"{self.all_shown(true, view)}, but " if true else ""
-        return f"shows {before}{contrast}"
+        if not true:
+            return f"shows {self.contrast(wrong, view)}"
+        subject = true[-1].objects[0] if len(true[-1].objects) == 1 else ""
+        adverb = "also " if wrong.kind == "sight" else ""
+        contrast = self.contrast(wrong, view, subject)
+        return f"shows {self.all_shown(true, view)}, but {adverb}{contrast}"
 
     def mismatch(self, view: View) -> str | None:
-        """State only what is wrong with a candidate; None if `exclusion` states nothing."""
+        """State the first false statement only or, if all are true, what `exclusion` states."""
         if (wrong := self.find_false(view)) is not None:
             return f"shows {self.contrast(wrong, view)}"
         return self.exclusion(view)
@@ -249,8 +250,7 @@ class RelationalWriter(Writer):
         object of "shows".
 
         Args:
-            subject: The object that the text named last; a relation of this object does not name it
-                again.
+            subject: The object that the text named last, which is not named again.
         """
         facts = {o.object: o for o in view.objects}
         if s.kind == "sight":
@@ -258,15 +258,19 @@ class RelationalWriter(Writer):
         unseen = [name for name in s.objects if facts[name].target_sight != "shown"]
         if s.kind == "region":
             actual = "out of sight" if unseen else facts[s.objects[0]].target_region
-            return f"the {s.objects[0]} {actual}, not {s.value}"
+            return f"the {s.objects[0]} {actual}{self.offset(s, view)}, not {s.value}"
         if unseen:
             return f"the {unseen[0]} out of sight"
         if actual := find_topic(s, view.relations):
-            if s.kind not in SYMMETRIC:
-                return self.shown(actual)
             shown = (self.attribute if actual.objects[0] == subject else self.shown)(actual)
+            if s.kind not in SYMMETRIC:
+                return shown
             return f"{shown}, not {self.place(flip_relation(s), pronoun=True)}"
-        return f"the {s.objects[0]} not {self.place(s)}"
+        return (
+            f"not {self.place(s)}"
+            if s.objects[0] == subject
+            else f"the {s.objects[0]} not {self.place(s)}"
+        )
 
     def match(self, candidate: CandidateFacts) -> str:
         if candidate.agrees or not self.statements:
@@ -278,5 +282,10 @@ class RelationalWriter(Writer):
     def outcome(self) -> list[str]:
         if not self.statements:
             return super().outcome()
-        shortest = min(self.statements, key=lambda s: len(s.objects))
-        return [self.statement(shortest, "is"), self.say("answer", answer=self.facts.answer)]
+        return [self.statement(self.conclusion, "is"), self.say("answer", answer=self.facts.answer)]
+
+    @property
+    def conclusion(self) -> Relation:
+        """The shortest deciding statement."""
+        deciding = [s for s in self.statements if normalize_relation(s) in self.deciding]
+        return min(deciding, key=lambda s: len(s.objects))

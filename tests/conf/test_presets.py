@@ -96,7 +96,7 @@ def test_student_preset_sets_its_training_recipe():
     assert (tiny.train.lr, tiny.train.batch, tiny.train.regime) == (2e-3, 16, "cot")
     train, student = paper.train, paper.student
     assert (train.lr, train.epochs, train.precision) == (2e-5, 3, "bf16")
-    assert (train.batch, train.micro_batch) == (16, 1)
+    assert train.batch == 16
     assert (student.lora.rank, student.lora.alpha) == (16, 32)
     assert (student.frames, student.image_size, student.max_length) == (12, 336, 3072)
 

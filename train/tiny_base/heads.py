@@ -34,7 +34,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
-from train.tiny_base.oracle_targets import AHEAD, PICTURES, UNSEEN_DISTANCE, OracleTargets
+from teacher.deciding import UNSEEN_DISTANCE
+from train.tiny_base.oracle_targets import AHEAD, PICTURES, OracleTargets
 
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
 DISPLACEMENTS = ("velocity", *AHEADS, "since")

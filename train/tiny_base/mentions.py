@@ -36,13 +36,16 @@ PREDICTED = re.compile(
 )
 """Matches a sentence that says where an object will be."""
 CLAIMED = re.compile(
-    rf"\b(?P<verb>shows|and|but) the (?P<name>{NAME.pattern}) "
+    rf"\b(?P<verb>shows|and|but) the (?P<name>{NAME.pattern}) (?!not )"
     rf"(?P<place>between [^.]+? and the (?:{NAME.pattern})|[^.,]+?)(?P<comma>,?)"
-    r"(?=(?P<agrees>,? and agrees| and (?:the|with|no) |,? but | (?:slightly|clearly|far) off)"
-    r"| not |,? and not |\.)"
+    r"(?P<off> (?:slightly|clearly|far) off,?)?"
+    r"(?=(?P<agrees>,? and agrees|,? and (?:the|with|no) |,? but |(?<=off)\.)"
+    r"| not |,? not |,? and not |\.)"
 )
-"""Matches what a text says that a candidate shows of an object. The group `agrees` matches if the
-text says that the candidate agrees, how far the place is off, or goes on with another object."""
+"""Matches what a text says that a candidate shows of an object, and how far off it is. The group
+`agrees` matches if the text does not say next that this is not what was predicted."""
+SHOWN = re.compile(r"(?:[Cc]andidate \w|\bit) shows\b")
+"""Matches the beginning of what a candidate shows."""
 POSSESSES = re.compile(r"\b(?:with|has|have) the $")
 """Matches the words before the sphere in "the cube has the sphere left of it"."""
 PREDICTION = re.compile("Prediction:")
@@ -130,10 +133,11 @@ class TokenizedText:
 
     def comparisons(self) -> Iterator[tuple[int, int]]:
         """Yield the index of the last token of each place that a candidate is said to show, also of
-        a comma after it, and an index that says whether the place was predicted: that of the last
-        token of the predicted place if both are the same, otherwise that of the word "shows". After
-        these tokens, the text says whether both are the same. A region is compared with a predicted
-        region, and a relation with a relation; if an object has several of them, they are left out.
+        a comma and of how far off it is, and an index that says whether the place was predicted:
+        that of the last token of the predicted place if both are the same, otherwise that of the
+        word before the object (shows, and, but). After these tokens, the text says whether both are
+        the same. A region is compared with a predicted region, and a relation with a relation; if
+        an object has several of them, they are left out.
         """
         predicted: dict[tuple[str, bool], list[int]] = {}
         for event in self._find(PREDICTION, PREDICTED, CLAIMED):
@@ -141,14 +145,20 @@ class TokenizedText:
                 predicted.clear()
                 continue
             last = self.token_at(event.end("place") - 1)
-            kind = event["name"], event["place"].startswith("near the ")
+            kind = event["name"], event["place"].startswith(("near the ", "out of "))
             if event.re is PREDICTED:
                 predicted.setdefault(kind, []).append(last)
-            elif len(places := predicted.get(kind, [])) == 1:
-                key = places[0] if event["agrees"] else self.token_at(event.start("verb"))
+                continue
+            sentence = max(self.text.rfind(end, 0, event.start()) for end in (". ", "\n"))
+            places = predicted.get(kind, [])
+            if len(places) == 1 and SHOWN.search(self.text, max(sentence, 0), event.end("verb")):
+                before = self.token_at(event.start("verb"))
+                key = before if event["agrees"] is None else places[0]
                 yield last, key
                 if event["comma"]:
                     yield self.token_at(event.start("comma")), key
+                if event["off"]:
+                    yield self.token_at(event.end("off") - 1), key
 
     def _find(self, *patterns: re.Pattern[str]) -> list[re.Match[str]]:
         """Return the matches of all patterns in the order of the text."""

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from data.records import COLORS, LETTERS, MATERIALS, SHAPES, Scene
+from teacher.deciding import UNSEEN_DISTANCE
 from teacher.predicates.facts import COMPASS
 from teacher.predicates.motion import motion_start
 
@@ -40,8 +41,6 @@ FARTHEST = 1.0
 PICTURES = 1 + len(LETTERS)
 """Pictures in which a named object is found: the last one of the clip, and the candidates."""
 UNKNOWN = (float("nan"), float("nan"))
-UNSEEN_DISTANCE = 0.3
-"""Distance, as a share of the image, that counts for a candidate that does not show an object."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +132,7 @@ class OracleTargets:
             of the word that says that the candidate agrees.
         comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
             and position of the end of the predicted place of the same object if both are the same,
-            otherwise of the word "shows".
+            otherwise of the word before the object: shows, and, but.
         next_in_clip: (_, 3) row, position before the first mention of an object in a scene parse,
             and token of the object at the end of the clip.
         next_in_candidates: (_, 3) row, position before the first mention of an object in a text and

@@ -31,7 +31,8 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     subject             RECALLING 0    token that describes an object -> the object's name
     repeat              RECALLING 1    token before a repeated name -> the name's last mention
     comparison          RECALLING 2    end of a place in a candidate -> the end of the predicted
-                                       place if both are the same, otherwise the word "shows"
+                                       place if both are the same, otherwise the word before
+                                       the object: shows, and, but
     owner               RECALLING 3    token that describes the sphere in "the cube has the sphere
                                        left of it" -> the cube's name
     verdict             SPEAKING 0     token before a letter in an outcome -> "agrees" of this

@@ -12,11 +12,13 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     match      as `compare`, without any picture
     narrate    a whole rationale with its answer, without any picture
 
-None of them is the selection task: no answer about pictures says which candidate is the target.
-`compare` supposes that a candidate is the target, at random. Its statements are chosen as those
-that decide an item, so that the model learns to find the objects that tell candidates apart, and
-how far apart their places are. In `explain`, the prediction is true of the target, but another
-candidate is shown instead of it, so that the model must foresee what it compares with. `match`
+None of them is the selection task: no answer about pictures depends on which candidate is the
+target, except through what it predicts.
+`compare` supposes that a candidate, sampled at random, is the target. Its statements are chosen as
+those that decide an item, so that the model learns to find the objects that tell candidates apart,
+and how far apart their places are. In `explain`, the prediction is true of the target, but another
+candidate is shown instead of it, so that the model has to derive the prediction from the clip.
+Candidates that agree with a prediction occur in `compare` only. `match`
 teaches to compare what a text says of a candidate with what it has predicted. `narrate` teaches the
 language of rationales, in both vocabularies, and how an answer follows from what a text says of the
 candidates.
@@ -47,7 +49,7 @@ from teacher.writers.relational import RelationalWriter, leave_out_unseen
 PARSE = "Describe the scene, and how its objects move."
 PREDICT = "Say what will be true of the scene."
 DESCRIBE = "Describe the candidates."
-COMPARE = "Compare the candidates with predictions."
+COMPARE = "Suppose that a candidate is the target, and compare the candidates."
 EXPLAIN = (
     "Check a prediction step by step: scene parse, motion analysis, prediction, candidate analysis "
     "and outcome. Then say of each candidate, in a line of its own, whether it matches and why."
@@ -175,13 +177,12 @@ def ask_explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Gen
     order[item.answer] = others[rng.integers(len(others))]
     views = [replace(p.views[k], letter=letter) for letter, k in zip(LETTERS, order, strict=True)]
     writer = make_statement_writer(p, item, rng, statements, SPARSE)
-    shortest = min(writer.statements, key=lambda s: len(s.objects))
     sections = {
         "Scene parse": writer.scene_parse(),
         "Motion analysis": writer.motion_analysis(),
         "Prediction": writer.prediction(),
         "Candidate analysis": [f"candidate {v.letter} {state_verdict(writer, v)}" for v in views],
-        "Outcome": [writer.statement(shortest, "is"), name_agreeing(writer, views)],
+        "Outcome": [writer.statement(writer.conclusion, "is"), name_agreeing(writer, views)],
     }
     lines = [f"{title}: {join_sentences(parts)}" for title, parts in sections.items()]
     for view in views:

@@ -76,18 +76,37 @@ def test_compared_places_end_before_how_far_they_are_off(processor) -> None:
     text = TokenizedText(
         "Prediction: At the end, the red metal cube will be near the left. The gray metal cube "
         "will be near the top.\n"
-        "Candidate analysis: Candidate A shows the red metal cube near the left, slightly off "
-        "toward the north, but the gray metal cube near the center, not near the top, clearly off "
-        "toward the south.",
+        "Candidate analysis: Candidate A shows the red metal cube near the left, slightly off, but "
+        "the gray metal cube near the center, clearly off, not near the top. Candidate B shows the "
+        "red metal cube near the left, slightly off. Candidate C shows the red metal cube out of "
+        "sight, not near the left.\n"
+        "Outcome: The red metal cube and the gray metal cube are very close.",
         processor.tokenizer,
     )
-    ends = [text.token_at(m.end() - 1) for m in re.finditer("near the [a-z]+", text.text)]
-    commas = [text.token_at(m.start()) for m in re.finditer(", (slightly|not)", text.text)]
+    places = re.finditer("near the [a-z]+|out of sight", text.text)
+    ends = [text.token_at(m.end() - 1) for m in places]
+    commas = [text.token_at(m.start()) for m in re.finditer(", (slightly|clearly|not)", text.text)]
+    off = [text.token_at(m.end() - 1) for m in re.finditer("off,?", text.text)]
     but = text.token_at(text.text.index("but "))
+    shows = [text.token_at(m.start()) for m in re.finditer("shows", text.text)]
     assert [*text.comparisons()] == [
-        (ends[2], ends[0]), (commas[0], ends[0]),
-        (ends[3], but), (commas[1], but),
+        (ends[2], ends[0]), (commas[0], ends[0]), (off[0], ends[0]),
+        (ends[3], but), (commas[1], but), (off[1], but),
+        (ends[5], ends[0]), (commas[3], ends[0]), (off[2], ends[0]),
+        (ends[6], shows[2]), (commas[4], shows[2]),
     ]  # fmt: skip
+
+
+def test_denied_places_and_closeness_are_not_compared(processor) -> None:
+    text = TokenizedText(
+        "Prediction: The red metal cube and the gray metal cube will be very close near the top. "
+        "The blue metal cube will be between the red metal cube and the gray metal cube.\n"
+        "Candidate analysis: Candidate A shows the blue metal cube not between the red metal cube "
+        "and the gray metal cube.\n"
+        "Outcome: The red metal cube and the gray metal cube are very close near the top.",
+        processor.tokenizer,
+    )
+    assert [*text.comparisons()] == []
 
 
 def test_a_place_between_two_objects_ends_after_both(processor) -> None:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from math import dist
 
 import numpy as np
 import pytest
 
 from data.records import LETTERS, SelectionItem
 from data.store import Store
+from teacher.deciding import choose_statements, list_compared
 from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.facts import RelationalPredicates, View
 from teacher.predicates.relations import Bounds, normalize_relation
 from teacher.validation.claim_extraction import extract_claims
-from train.tiny_base.questions import KINDS, Question, sample_statements
+from train.tiny_base.questions import KINDS, Question, sample_statements, suppose_target
 
 RELATIVE = ("agrees", "extra", "displaced")
 """Kinds of claims about a candidate that refer to what was predicted."""
@@ -67,12 +69,23 @@ def test_supposed_targets_agree(described: Described) -> None:
             judged = re.findall(r"Candidate ([A-D]) (shows[^.]+)\.", block)
             assert [letter for letter, _ in judged] == list(LETTERS)
             letters = [letter for letter, text in judged if text.endswith(", and agrees")]
-            assert re.match(r"candidate ([A-D]) is the target", block)[1] in letters
+            supposed = suppose_target(p, re.match(r"candidate ([A-D]) is the target", block)[1])
+            assert letters == [v.letter for v in supposed.views if agrees(v, supposed)]
             outcome = re.search(r"Candidates? ([^.]+) agrees?\.$", block.strip())[1]
             assert re.findall(r"\b[A-D]\b", outcome) == letters
             agreeing.append(len(letters))
-    assert max(agreeing) <= 4
     assert np.mean(np.array(agreeing) == 1) > 0.7
+
+
+def agrees(view: View, p: RelationalPredicates) -> bool:
+    """Whether all compared statements are true of a candidate, and no place is off."""
+    compared = list_compared(choose_statements(p), p)
+    there = [
+        dist(view.places.image.get(s.objects[0], (9, 9)), p.target.places.image[s.objects[0]])
+        for s in compared
+        if s.kind == "region"
+    ]
+    return {*compared} <= view.statements and max(there, default=0) < 12 / 336
 
 
 def test_explained_candidates_do_not_include_the_target(described: Described) -> None:
