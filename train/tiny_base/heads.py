@@ -39,7 +39,7 @@ from train.tiny_base.oracle_targets import AHEAD, PICTURES, OracleTargets
 
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
 DISPLACEMENTS = ("velocity", *AHEADS, "since")
-SCALES = {"place": 6.0, "offset": 3.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
+SCALES = {"place": 6.0, "offset": 3.0, "off": 6.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
     (*DISPLACEMENTS, "apart"), 5.0
 )
 """Factors on places and displacements, so that their losses are of similar size."""
@@ -77,7 +77,7 @@ class OracleHeads(nn.Module):
         self.seen = heads({"presence": 1, "inside": 2, "shift": 2, "place": 2})
         self.known = heads({"place": 2, "moving": 1, "apart": 1} | dict.fromkeys(DISPLACEMENTS, 2))
         self.named = heads({"visible": PICTURES, "places": 2 * PICTURES, "future": 2})
-        self.spoken = heads({"place": 2, "velocity": 2, "offset": 2})
+        self.spoken = heads({"place": 2, "velocity": 2, "offset": 2, "off": 2})
         self.spread = nn.Linear(hidden, 1)
         self.norms = nn.ModuleDict(
             {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled", "spoken")}

@@ -15,11 +15,12 @@ from teacher.sections import SECTIONS
 NAME = re.compile(" ".join(f"(?:{'|'.join(words)})" for words in (COLORS, MATERIALS, SHAPES)))
 """Matches the noun phrase of an object."""
 EVENTS = re.compile(
-    rf"(?P<name>{NAME.pattern})|[Cc]andidate (?P<letter>[{''.join(LETTERS)}])\b"
+    rf"Supposition: candidate (?P<supposed>[{''.join(LETTERS)}])\b"
+    rf"|(?P<name>{NAME.pattern})|[Cc]andidate (?P<letter>[{''.join(LETTERS)}])\b"
     rf"|(?P<section>{'|'.join(SECTIONS)}):|(?P<end>\.(?=\s|$))"
 )
-"""Matches where a text begins to speak of an object, a candidate or a section, and where a sentence
-ends."""
+"""Matches where a text supposes that a candidate is the target, where it begins to speak of an
+object, a candidate or a section, and where a sentence ends."""
 AGREES = re.compile(
     r"[Cc]andidate (?P<letter>\w) [^.]*,? and (?P<word>agrees)(?=\.| with the prediction\.)"
 )
@@ -62,6 +63,7 @@ class Mention:
         section: Title of the section of the rationale; None before the first.
         letter: The candidate that the text speaks of; None if it speaks of the scene.
         letter_at: Index of the token of the letter, if any.
+        supposed: The candidate that the text supposes to be the target, if any.
         owner: Index of the mention of the cube if this is the sphere in "the cube has the sphere
             left of it", otherwise None.
     """
@@ -73,6 +75,7 @@ class Mention:
     section: str | None
     letter: str | None
     letter_at: int | None
+    supposed: str | None
     owner: int | None
 
 
@@ -94,7 +97,7 @@ class TokenizedText:
 
     def mentions(self) -> Iterator[Mention]:
         """Yield the names of objects in the order of the text."""
-        section = letter = letter_at = previous = None
+        section = letter = letter_at = supposed = previous = None
         end = count = 0
         events = [*EVENTS.finditer(self.text)]
         starts = [*(e.start() for e in events), len(self.text)]
@@ -106,9 +109,12 @@ class TokenizedText:
                     owner = count - 1 if previous.owner is None else previous.owner
                 first, last = self.token_at(event.start()), self.token_at(event.end() - 1)
                 stop = self.token_at(following)
-                previous = Mention(name, first, last, stop, section, letter, letter_at, owner)
+                where = section, letter, letter_at, supposed
+                previous = Mention(name, first, last, stop, *where, owner)
                 end, count = event.end(), count + 1
                 yield previous
+            elif event["supposed"]:
+                supposed = event["supposed"]
             elif event["letter"]:
                 letter, letter_at = event["letter"], self.token_at(event.end() - 1)
             elif event["section"]:

@@ -112,8 +112,8 @@ class OracleTargets:
         name_displacements: (M, 2) its displacement up to the moment that the item asks for, or NaN.
         description_tokens: (S, 2) row and position of the tokens that describe a named object, from
             the end of its name on.
-        description_states: (S, 6) place and velocity of the object there, and its displacement from
-            its owner, or NaN.
+        description_states: (S, 8) place and velocity of the object there, its displacement from its
+            owner, and that from the place where it is expected, or NaN.
         subjects: (_, 3) row, position after a name, and position of the name.
         owners: (_, 3) row, position of a token that describes the sphere in "the cube has the
             sphere left of it", and position of the cube's name.

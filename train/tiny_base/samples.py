@@ -182,6 +182,8 @@ class LocatedMention:
             it", otherwise None.
         offset: The displacement from the owner to this object in the picture that the text speaks
             of, or NaN.
+        off: If the text speaks of a candidate, the displacement of the object there from the place
+            where it is expected, otherwise NaN.
     """
 
     name: str
@@ -198,6 +200,7 @@ class LocatedMention:
     future: tuple[float, float]
     owner: int | None
     offset: tuple[float, float]
+    off: tuple[float, float]
 
 
 def locate_mentions(
@@ -228,6 +231,7 @@ def locate_mentions(
             sample.future.get(m.name, UNKNOWN),
             owner,
             offset,
+            measure_error(sample, shown, m),
         )
 
 
@@ -288,8 +292,8 @@ def stack_samples(
         name_displacements=torch.tensor([m.future for m in mentions]).reshape(-1, 2),
         description_tokens=integers([(m.row, k) for m in mentions for k in m.spoken], 2),
         description_states=torch.tensor(
-            [(*m.state, *m.offset) for m in mentions for _ in m.spoken]
-        ).reshape(-1, 6),
+            [(*m.state, *m.offset, *m.off) for m in mentions for _ in m.spoken]
+        ).reshape(-1, 8),
         subjects=integers([(m.row, k, m.position) for m in mentions for k in m.spoken[1:]], 3),
         owners=integers(
             [(m.row, k, m.owner) for m in mentions if m.owner is not None for k in m.spoken], 3
@@ -370,6 +374,36 @@ def shown_objects(sample: OracleSample) -> dict[tuple[int, str], ObjectTarget]:
     return {(t.picture, t.name): t for t in sample.targets}
 
 
+def measure_error(
+    sample: OracleSample, shown: Mapping[tuple[int, str], ObjectTarget], mention: Mention
+) -> tuple[float, float]:
+    """Return the displacement of a named object in the candidate that the text speaks of from its
+    place in the supposed target or, if none is supposed, at the target; NaN where the oracle does
+    not determine it."""
+    if mention.letter is None:
+        return UNKNOWN
+    there = shown.get((sample.last + 1 + LETTERS.index(mention.letter), mention.name))
+    if mention.supposed is not None:
+        place = sample.last + 1 + LETTERS.index(mention.supposed), mention.name
+        expected = shown[place].place if place in shown else UNKNOWN
+    else:
+        expected = predicted_place(sample, shown, mention.name)
+    if there is None:
+        return UNKNOWN
+    return there.place[0] - expected[0], there.place[1] - expected[1]
+
+
+def predicted_place(
+    sample: OracleSample, shown: Mapping[tuple[int, str], ObjectTarget], name: str
+) -> tuple[float, float]:
+    """Return the place of an object at the target, if the response predicts it; NaN if it does not
+    or if the object is not visible at the end of the clip or at the target."""
+    now, moved = shown.get((sample.last, name)), sample.future.get(name)
+    if now is None or moved is None or not sample.predicts_target:
+        return UNKNOWN
+    return now.place[0] + moved[0], now.place[1] + moved[1]
+
+
 def spoken_state(
     sample: OracleSample, shown: Mapping[tuple[int, str], ObjectTarget], mention: Mention
 ) -> tuple[float, ...]:
@@ -380,9 +414,7 @@ def spoken_state(
         seen = shown.get((sample.last + 1 + LETTERS.index(mention.letter), mention.name))
         place = seen.place if seen else UNKNOWN
     elif mention.section in ("Prediction", "Outcome"):
-        now, moved = shown.get((sample.last, mention.name)), sample.future.get(mention.name)
-        if now and moved and sample.predicts_target:
-            place = now.place[0] + moved[0], now.place[1] + moved[1]
+        place = predicted_place(sample, shown, mention.name)
     elif mention.name in sample.observed:
         state = sample.observed[mention.name]
         place, velocity = state[:2], state[2:]

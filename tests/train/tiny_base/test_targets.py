@@ -34,6 +34,7 @@ from train.tiny_base.oracle_targets import (
 from train.tiny_base.pointing import locate_objects
 from train.tiny_base.questions import KINDS
 from train.tiny_base.samples import (
+    measure_error,
     object_token_ids,
     shown_objects,
     spatial_token_ids,
@@ -274,11 +275,38 @@ def test_offsets_lead_from_the_owner_to_the_object(sampler, collate) -> None:
     for position, state in states.items():
         if position in owners:
             expected = state[:2] - states[owners[position]][:2]
-            assert torch.allclose(state[4:], expected, equal_nan=True)
+            assert torch.allclose(state[4:6], expected, equal_nan=True)
             compared += int(not expected.isnan().any())
         else:
-            assert state[4:].isnan().all()
+            assert state[4:6].isnan().all()
     assert compared > 10
+
+
+def test_errors_lead_from_the_expected_place_to_the_shown_one(sampler, processor) -> None:
+    zero = compared = 0
+    for kind in ("compare", "explain"):
+        for item in sampler.items[:8]:
+            sample = sampler.make_sample(item, kind, "test")
+            shown = {(t.picture - sample.last - 1, t.name): t.place for t in sample.targets}
+            for m in TokenizedText(sample.sample.response, processor.tokenizer).mentions():
+                error = measure_error(sample, shown_objects(sample), m)
+                place = m.letter and shown.get((LETTERS.index(m.letter), m.name))
+                if not place:
+                    assert np.isnan(error).all()
+                    continue
+                expected = None
+                if kind == "compare":
+                    expected = shown.get((LETTERS.index(m.supposed), m.name))
+                elif (now := shown.get((-1, m.name))) and m.name in sample.future:
+                    expected = np.add(now, sample.future[m.name])
+                if expected is None:
+                    assert np.isnan(error).all()
+                    continue
+                assert error == pytest.approx(np.subtract(place, expected), nan_ok=True)
+                zero += kind == "compare" and m.letter == m.supposed and error == (0, 0)
+                compared += 1
+    assert compared > 40
+    assert zero > 10
 
 
 def test_observed_states_are_those_of_the_cut(micro_store: Store, items) -> None:
