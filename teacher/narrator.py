@@ -17,12 +17,14 @@ from teacher.writers.relational import RelationalWriter
 NARRATOR_VERSION = "11"
 SHORT, LONG, RELATIONAL_LONG = 110, 250, 235
 """A rationale with more than LONG words, or RELATIONAL_LONG in the relational vocabulary, is
-written again with less detail, one of fewer than SHORT words with more. SHORT is well above the
-minimum, 80 words (paper, Rationale construction)."""
+written again with less detail, one of fewer than SHORT words with more. RELATIONAL_LONG keeps
+relational rationales shorter on average than those of the paper's vocabulary. SHORT is well above
+the minimum, 80 words (paper, Rationale construction)."""
 BRIEF, SPARSE, FULL = Detail(3, 1, 1, 1), Detail(4, 1, 2, 1), Detail(6, 4, 6, 2)
 RELATIONAL_SPARSE, RELATIONAL_BRIEF = Detail(3, 2, 1, 1), Detail(1, 1, 0, 1, 0)
 RELATIONAL_BRIEFEST = RELATIONAL_BRIEF._replace(compared=False)
-"""Relational rationales state fewer facts besides those that decide the item."""
+"""Relational rationales state fewer facts besides those that decide the item. The briefest ones
+state only what is wrong with a candidate."""
 
 
 def write_rationale(

@@ -19,17 +19,19 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
+from torch import nn
 from transformers import set_seed
 
 from benchmarks.speed import comparison
 from benchmarks.speed.comparison import SEED, Measurements
 from benchmarks.speed.sft import VARIANTS as SFT_VARIANTS
+from benchmarks.speed.sft import list_overrides, write_base
 from benchmarks.speed.sft import measure as measure_sft
-from benchmarks.speed.sft import write_base
 from conf.compose import compose
 from conf.runs import Run
 from conf.schema import DistillCommand, SftCommand
@@ -37,10 +39,9 @@ from data.build import ensure_benchmark
 from models import compat, loading
 from models.distributed import rank_device
 from models.lora_kernels import use_fast_layers
-from models.precision import resolve_precision
 from teacher.narrate import ensure_rationales
 from train.on_policy import distillation, sampling
-from train.on_policy.paired_prompts import load_datasets
+from train.on_policy.paired_prompts import PairedPrompts, load_datasets
 
 SFT, DISTILL, SAMPLING = "train.sft", "train.distill", "sampling"
 
@@ -50,11 +51,7 @@ def main() -> None:
     parser.add_argument("--tokens", type=int, default=200, help="maximum length of a response")
     comparison.add_arguments(parser, steps=3, variants=[SFT, DISTILL, SAMPLING])
     args = parser.parse_args()
-    overrides = [
-        "+exp=cot", "train.generated_items=0", f"student={args.preset}", f"store={args.store}",
-        f"student.quantization={args.quantization}", f"student.max_new_tokens={args.tokens}",
-        f"train.precision={resolve_precision(args.precision)}",
-    ]  # fmt: skip
+    overrides = [*list_overrides(args), f"student.max_new_tokens={args.tokens}"]
     with tempfile.TemporaryDirectory() as folder:
         if args.preset != "tiny":
             comparison.run_in_process(write_base, overrides, args.preset, Path(folder))
@@ -105,7 +102,12 @@ def measure(name: str, overrides: list[str], steps: int) -> Measurements:
         return comparison.train(trainer, train.batch)
 
 
-def measure_sampling(sampler, student, prompts, batch: int) -> Measurements:
+def measure_sampling(
+    sampler: sampling.ResponseSampler,
+    student: nn.Module,
+    prompts: Sequence[PairedPrompts],
+    batch: int,
+) -> Measurements:
     """Sample a response to each prompt, in batches of which the first one is not timed."""
     comparison.reset_peak_memory()
     for start in range(0, len(prompts), batch):

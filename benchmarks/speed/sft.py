@@ -107,11 +107,7 @@ def main() -> None:
         parser.error("--losses needs TRL: pip install -e '.[rl]'")
     if args.losses:
         args.precision, args.quantization = "fp32", "none"
-    overrides = [
-        "+exp=cot", "train.generated_items=0", f"student={args.preset}", f"store={args.store}",
-        f"student.quantization={args.quantization}",
-        f"train.precision={resolve_precision(args.precision)}",
-    ]  # fmt: skip
+    overrides = list_overrides(args)
     with tempfile.TemporaryDirectory() as folder:
         if args.preset != "tiny":
             comparison.run_in_process(write_base, overrides, args.preset, Path(folder))
@@ -128,6 +124,15 @@ def main() -> None:
                 "samples",
                 args,
             )
+
+
+def list_overrides(args: argparse.Namespace) -> list[str]:
+    """Return the settings of train.sft that the options of a comparison determine."""
+    return [
+        "+exp=cot", "train.generated_items=0", f"student={args.preset}", f"store={args.store}",
+        f"student.quantization={args.quantization}",
+        f"train.precision={resolve_precision(args.precision)}",
+    ]  # fmt: skip
 
 
 def compare_losses(overrides: list[str], steps: int) -> None:
