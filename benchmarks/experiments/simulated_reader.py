@@ -33,12 +33,13 @@ from conf.failures import report_failures
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
 from teacher.deciding import UNKNOWN_PATH, UNSEEN_DISTANCE, choose_statements, list_compared
-from teacher.predicates.extraction import describe_distance, extract_predicates
+from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation
 from teacher.predicates.places import region_at
 from teacher.predicates.relations import (
     Bounds,
     Places,
+    describe_distance,
     find_relations,
     find_topic,
     normalize_relation,

@@ -35,26 +35,20 @@ from teacher.predicates.places import (
     object_sight,
     square_position,
 )
-from teacher.predicates.relations import Bounds, Places, find_changes, find_relations
+from teacher.predicates.relations import (
+    CLEARLY,
+    DISPLACED,
+    Bounds,
+    Places,
+    find_changes,
+    find_relations,
+)
 
 STAYS, SHIFTS = 8.0, 60.0
 """Upper bounds of the displacement (px of the square image) of an object that "stays", and of one
 that "shifts slightly". An object that moves further "moves across"."""
 BORDER = 6.0
 """Displacement (px of the square image) below which a change of region is ignored."""
-DISPLACED, CLEARLY = 12.0, 40.0
-"""Displacements (px of the square image) from which an object counts as displaced, and as displaced
-"clearly" rather than "slightly"."""
-
-
-def describe_distance(distance: float, bounds: Bounds) -> str | None:
-    """Return how far an object is off if its place is at a distance (share of the image's width)
-    from the expected place: slightly, clearly or far; None if it counts as being there."""
-    if distance < DISPLACED / IMAGE_SIZE:
-        return None
-    if distance >= bounds.far:
-        return "far"
-    return "clearly" if distance >= CLEARLY / IMAGE_SIZE else "slightly"
 
 
 def extract_facts(

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 from data.records import Scene
 from teacher.predicates.facts import Relation
-from teacher.predicates.places import CONTACT, object_sight
+from teacher.predicates.places import CONTACT, IMAGE_SIZE, object_sight
 
 OPPOSITES = {
     "left of": "right of", "above": "below", "in front of": "behind",
@@ -55,6 +55,11 @@ CHANGES = ("passing", "arrival", "edge")
 SYMMETRIC = {"side", "height", "gap", "cover"}
 """Kinds that are true of two objects in either order, with the opposite value."""
 EDGES = ("left", "right", "top", "bottom")
+EXTENTS = ("slightly", "clearly", "far")
+"""How far off an object is in a candidate."""
+DISPLACED, CLEARLY = 12.0, 40.0
+"""Displacements (px of the square image) from which an object counts as displaced, and as displaced
+"clearly" rather than "slightly"."""
 
 
 class Bounds(NamedTuple):
@@ -86,6 +91,16 @@ class Bounds(NamedTuple):
     far: float = 0.25
     """Distance of an object in a candidate from its place at the target, as a share of the image,
     from which it is "far off" rather than "clearly off"."""
+
+
+def describe_distance(distance: float, bounds: Bounds) -> str | None:
+    """Return how far an object is off if its place is at a distance (share of the image's width)
+    from the expected place: slightly, clearly or far; None if it counts as being there."""
+    if distance < DISPLACED / IMAGE_SIZE:
+        return None
+    if distance >= bounds.far:
+        return "far"
+    return "clearly" if distance >= CLEARLY / IMAGE_SIZE else "slightly"
 
 
 def flip_relation(relation: Relation) -> Relation:

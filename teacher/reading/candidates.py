@@ -105,6 +105,8 @@ class CandidateReader(TopicReader):
     def on_clear(self, tag: Tag) -> None:
         if tag.words == "clearly":
             self._add_extent("clearly", tag)
+        elif tag.words == "far" and self.near(1).name == "off":
+            self._add_extent("far", tag)
 
     def _add_extent(self, extent: str, tag: Tag) -> None:
         beside = (self.near(1).name, self.near(-1).name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
@@ -16,7 +17,13 @@ from teacher.predicates.facts import (
     RelationalPredicates,
     View,
 )
-from teacher.predicates.relations import VALUES, normalize_relation
+from teacher.predicates.relations import (
+    EXTENTS,
+    VALUES,
+    Bounds,
+    describe_distance,
+    normalize_relation,
+)
 from teacher.reading.phrases import COARSE
 
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
@@ -76,9 +83,11 @@ class IndexedPredicates:
         self.observed: frozenset[Relation] | None = None
         """Relations at the cut; None if the predicates have no relations."""
         self.views: dict[str, View] = {}
+        self.bounds: Bounds | None = None
         if isinstance(predicates, RelationalPredicates):
             self.observed = frozenset(predicates.observed)
             self.views = {view.letter: view for view in predicates.views}
+            self.bounds = predicates.bounds
         self.answer = predicates.answer
         self.extras = {
             name
@@ -154,7 +163,24 @@ class IndexedPredicates:
         if claim.kind == "region" and self._is_shown_at(letter, name, claim.value):
             # The differences leave out an object that is in another region only by a little.
             return True
+        if claim.kind == "displaced" and claim.value in ("", *EXTENTS):
+            extent = self._find_extent(letter, name)
+            if extent is not None:
+                return not claim.value or _has_extent(extent, claim.value)
         return SHOWN_CHECKS[claim.kind](self.objects.get(name), differences.get(name), claim.value)
+
+    def _find_extent(self, letter: str, name: str) -> str | None:
+        """Return how far from its place at the target a candidate shows an object, in words; None
+        if it shows the object there, or if the predicates do not tell."""
+        views = [self.views[v] for v in (letter, self.answer) if v in self.views]
+        places = [v.places.image[name] for v in views if name in v.places.image]
+        if self.bounds is not None and len(places) == 2:
+            extent = describe_distance(math.dist(*places), self.bounds)
+            if extent is not None:
+                return extent
+        # The largest difference of a candidate has an extent even if it is small.
+        difference = self.differences[letter].get(name)
+        return None if difference is None else difference.extent
 
     def _is_shown_at(self, letter: str, name: str, region: str) -> bool:
         """Return whether the view of a candidate shows an object in a region."""
@@ -345,13 +371,17 @@ def _extra(facts: ObjectFacts | None, difference: Difference | None, value: str)
     return difference is not None and difference.kind == "extra"
 
 
+def _has_extent(extent: str, value: str) -> bool:
+    """Return whether a word for a distance describes an extent. An object that is far off is
+    clearly off."""
+    return value == extent or (value == "clearly" and extent == "far")
+
+
 def _displaced(facts: ObjectFacts | None, difference: Difference | None, value: str) -> bool | None:
     if difference is None or difference.kind == "missing":
         return False
     if difference.kind != "displaced":
         return None
-    if value in ("slightly", "clearly"):
-        return value == difference.extent
     return True if not value else _same(value, difference.heading)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Container, Sequence
 
+from teacher.predicates.relations import EXTENTS
 from teacher.reading.certainty import CertaintyCheck
 from teacher.reading.grounding import CUT, EITHER, Claim, IndexedPredicates
 from teacher.reading.tagging import Noun, RelationPhrase, Sentence, Tag
@@ -107,7 +108,7 @@ class Reader:
     def record_shared(self, kind: str, value: str, subjects: Names, tag: Tag) -> None:
         """Record a value stated of several objects, if an object has only one value of the kind."""
         exclusive = kind in ("region", "direction", "speed", "displaced")
-        if len(subjects) > 1 and exclusive and value not in ("", "slightly", "clearly"):
+        if len(subjects) > 1 and exclusive and value not in ("", *EXTENTS):
             self.shared_values[kind, tuple(subjects)][tag.start, tag.stop] = value
 
     def _assign_shared(self, claims: list[Claim]) -> list[Claim]:

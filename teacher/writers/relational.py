@@ -10,7 +10,6 @@ from importlib.resources import files
 import yaml
 
 from teacher.deciding import Decision, list_compared
-from teacher.predicates.extraction import describe_distance
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
@@ -22,6 +21,7 @@ from teacher.predicates.facts import (
 from teacher.predicates.relations import (
     CHANGES,
     SYMMETRIC,
+    describe_distance,
     find_topic,
     flip_relation,
     normalize_relation,

@@ -14,7 +14,6 @@ from conf.schema.servers import RelationBounds
 from data.records import Scene
 from teacher.deciding import choose_statements, find_widest_place, list_compared
 from teacher.narrator import FULL, write_match_lines, write_rationale
-from teacher.predicates.extraction import describe_distance
 from teacher.predicates.facts import Relation
 from teacher.predicates.relations import (
     CHANGES,
@@ -23,6 +22,7 @@ from teacher.predicates.relations import (
     SYMMETRIC,
     Bounds,
     Places,
+    describe_distance,
     find_changes,
     find_relations,
     flip_relation,
@@ -453,6 +453,28 @@ def test_only_displaced_objects_are_off() -> None:
                     assert text.endswith(" off")
                 found.add(text)
     assert found == {"", ", slightly off", ", clearly off", ", far off"}
+
+
+def test_the_oracle_checks_how_far_off_an_object_is() -> None:
+    extents = ("slightly", "clearly", "far")
+    checked = set()
+    for item, predicates in random_cases(30, BOUNDS):
+        writer = RelationalWriter(predicates, choose_statements(predicates), FULL, item.item_id)
+        for view in predicates.views:
+            if view.letter == predicates.answer:
+                continue
+            for s in (s for s in predicates.target.statements if s.kind == "region"):
+                offset = writer.offset(s, view).strip(", ")
+                region = f"Candidate {view.letter} shows the {s.objects[0]} {s.value}"
+                for extent in extents if offset else ():
+                    text = f"Candidate analysis: {region}, {extent} off."
+                    claims = [c for c in extract_claims(text, predicates) if c.kind == "displaced"]
+                    verdicts = {c.value: c.verdict for c in claims}
+                    true = {offset.split()[0]} | ({"clearly"} if offset == "far off" else set())
+                    expected = "supported" if extent in true else "contradicted"
+                    assert verdicts == {extent: expected, "": "supported"}
+                    checked.add((extent, expected))
+    assert len(checked) == 6
 
 
 def test_the_widest_place_is_that_of_an_object_seen_at_the_cut() -> None:

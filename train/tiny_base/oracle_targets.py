@@ -18,6 +18,7 @@ from data.records import COLORS, LETTERS, MATERIALS, SHAPES, Scene
 from teacher.deciding import UNSEEN_DISTANCE
 from teacher.predicates.facts import COMPASS
 from teacher.predicates.motion import motion_start
+from teacher.predicates.relations import EXTENTS
 
 WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
 """The words of a noun phrase, in their order."""
@@ -27,7 +28,7 @@ SPATIAL_WORDS = {
     "speed": ("slowly", "steadily", "quickly", "rests", "stationary"),
     "gap": ("touch", "apart"),
     "height": ("above", "below", "level"),
-    "extent": ("slightly", "clearly", "far"),
+    "extent": EXTENTS,
 }
 """Words for places, motion and relations."""
 CLEARLY_VISIBLE = 0.3
