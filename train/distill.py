@@ -35,13 +35,14 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
         source_settings,
         train_and_save,
     )
-    from train.on_policy.distillation import build_trainer, load_teacher, teacher_settings
+    from train.on_policy.distillation import build_trainer
     from train.on_policy.paired_prompts import load_datasets
+    from train.on_policy.teachers import LocalTeacher, ServerTeacher, load_teacher, teacher_settings
 
     compat.keep_freed_memory()
     distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)
     source, trained = source_settings(cfg.model)
-    teacher_run = teacher_settings(cfg, trained)
+    teacher_run = None if cfg.teacher_server.url else teacher_settings(cfg, trained)
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.
     with distributed.main_first():
@@ -49,13 +50,18 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
         store = ensure_benchmark(trained.benchmark, Path(cfg.store), cfg.workers)
         rationales = ensure_rationales(store, trained.teacher)
     training, validation = load_datasets(cfg, trained, store, rationales)
-    weights = weights_digest(*(product_folder(f, "student") for f in (source, teacher_run[0])))
+    folders = [source] if teacher_run is None else [source, teacher_run[0]]
+    weights = weights_digest(*(product_folder(folder, "student") for folder in folders))
     data = data_digest(store.identity, [*training.texts, weights])
     cfg, trained = resolve_continuation(cfg, run, trained, data)
 
     precision = cfg.train.precision
     model, processor = load_source(source, trained, precision)
-    teacher = load_teacher(*teacher_run, precision, processor)
+    if teacher_run is None:
+        teacher = ServerTeacher(cfg.teacher_server, processor)
+    else:
+        teacher_model = load_teacher(*teacher_run, precision, processor)
+        teacher = LocalTeacher(teacher_model, processor, cfg.train.beta, precision == "bf16")
     trainer = build_trainer(
         cfg, trained, run, model, teacher, processor, training, validation, checkpoint
     )

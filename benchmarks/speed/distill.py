@@ -42,6 +42,7 @@ from models.lora_kernels import use_fast_layers
 from teacher.narrate import ensure_rationales
 from train.on_policy import distillation, sampling
 from train.on_policy.paired_prompts import PairedPrompts, load_datasets
+from train.on_policy.teachers import LocalTeacher
 
 SFT, DISTILL, SAMPLING = "train.sft", "train.distill", "sampling"
 
@@ -93,12 +94,13 @@ def measure(name: str, overrides: list[str], steps: int) -> Measurements:
             prompts = [training[k] for k in range((steps + 1) * train.batch)]
             sampler = sampling.ResponseSampler(processor, trained.student, train)
             return measure_sampling(sampler, student, prompts, train.batch)
-        teacher, _ = loading.load_student(trained.student, train.precision, list)
+        model, _ = loading.load_student(trained.student, train.precision, list)
+        model.eval().to(rank_device())
+        teacher = LocalTeacher(model, processor, train.beta, train.precision == "bf16")
         run = Run("benchmark", Path(folder))
         trainer = distillation.build_trainer(
-            cfg, trained, run, student, teacher.eval().to(rank_device()), processor, training,
-            validation, None,
-        )  # fmt: skip
+            cfg, trained, run, student, teacher, processor, training, validation, None
+        )
         return comparison.train(trainer, train.batch)
 
 

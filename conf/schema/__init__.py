@@ -39,7 +39,12 @@ from conf.schema.models import (
     RetrieverConfig,
     StudentConfig,
 )
-from conf.schema.servers import ServerConfig, ServersConfig, TeacherConfig
+from conf.schema.servers import (
+    ServerConfig,
+    ServersConfig,
+    TeacherConfig,
+    TeacherServerConfig,
+)
 from conf.schema.training import (
     BaseTrainConfig,
     ContrastiveTrainConfig,

@@ -10,7 +10,7 @@ from omegaconf import MISSING
 from conf.runs import TRAINER_FOLDERS, is_inside, runs_folder
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
-from conf.schema.servers import TeacherConfig
+from conf.schema.servers import TeacherConfig, TeacherServerConfig
 from conf.schema.settings import Settings, check_run, setting
 from conf.schema.training import (
     BaseTrainConfig,
@@ -156,7 +156,23 @@ class DistillCommand(ContinuationCommand):
     """Folder of the run that trained the teacher, for example with train.sft train.facts=true; null
     uses the student itself, as it is at the start. The teacher reads the facts of an item as text
     instead of its frames, and needs the student's tokenizer."""
+    teacher_server: TeacherServerConfig = field(default_factory=TeacherServerConfig)
     train: DistillTrainConfig = field(default_factory=DistillTrainConfig)
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        if self.teacher_server.url is None:
+            return
+        if self.teacher_model is not None:
+            yield (
+                f"teacher_model={self.teacher_model} and teacher_server.url="
+                f"{self.teacher_server.url} are two teachers: give one of them"
+            )
+        if self.train.beta != 1:
+            yield (
+                f"train.beta={self.train.beta:g} with teacher_server.url: a server returns the "
+                "log-probabilities of the sampled tokens only, which estimate the reverse "
+                "Kullback-Leibler divergence, train.beta=1"
+            )
 
 
 @dataclass

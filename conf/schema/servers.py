@@ -65,6 +65,25 @@ class ServerConfig(ServersConfig):
 
 
 @dataclass
+class TeacherServerConfig(ServersConfig):
+    """Servers of the teacher of `train.distill`, which return the log-probabilities of prompts."""
+
+    GROUP: ClassVar[str] = "teacher_server"
+
+    model: str | None = None
+    """Name of the teacher on the server. It needs the student's tokenizer."""
+
+    def find_problems(self, group: str) -> Iterator[str]:
+        yield from super().find_problems(group)
+        if (self.model is None) != (self.url is None):
+            given, missing = ("url", "model") if self.model is None else ("model", "url")
+            yield (
+                f"{group}{given}={getattr(self, given)} without {group}{missing}: give the address "
+                "of the teacher's server and its name on it"
+            )
+
+
+@dataclass
 class RelationBounds(Settings):
     """Bounds of the words for relations between objects (`teacher.predicates=relational`)."""
 

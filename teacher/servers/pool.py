@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from conf.errors import UserError
 from conf.schema import ServersConfig
-from teacher.servers.responses import Response
+from teacher.servers.responses import Response, ScoredPrompt
 from teacher.servers.server import (
     MalformedReplyError,
     Messages,
@@ -28,6 +28,7 @@ from teacher.servers.server import (
 
 log = logging.getLogger(__name__)
 Job = TypeVar("Job")
+Reply = TypeVar("Reply")
 
 PAUSE, LONGEST_PAUSE = 0.5, 10.0
 """The upper bound (s) of a random pause before a retry is PAUSE, doubled with each failure, and at
@@ -81,11 +82,20 @@ class ServerPool:
                 does not serve the model, rejects the API key, refuses every request, or does not
                 follow OpenAI's API.
         """
+        return await self._request(lambda s: s.complete(messages, n, self.fields | fields))
+
+    async def score(self, token_ids: Sequence[int]) -> ScoredPrompt:
+        """Return the log-probabilities of a prompt's tokens, after waiting for a server if
+        necessary. It raises the errors of `complete`, and those of `ServerClient.score`."""
+        return await self._request(lambda server: server.score(token_ids))
+
+    async def _request(self, send: Callable[[ServerClient], Awaitable[Reply]]) -> Reply:
+        """Return the reply of the first server that answers a request."""
         failures = 0
         while True:
             server = await self._wait_for_server()
             try:
-                return await self._send(server, messages, n, self.fields | fields)
+                return await self._send(server, send)
             except RateLimitedError as limit:
                 self._pause(server, limit)
             except RequestError as error:
@@ -97,15 +107,15 @@ class ServerPool:
                 await asyncio.sleep(random_pause(failures))
 
     async def _send(
-        self, server: ServerClient, messages: Messages, n: int, fields: RequestFields
-    ) -> list[Response]:
+        self, server: ServerClient, send: Callable[[ServerClient], Awaitable[Reply]]
+    ) -> Reply:
         server.in_flight += 1
         try:
-            responses = await server.complete(messages, n, fields)
+            reply = await send(server)
         finally:
             server.in_flight -= 1
         server.problem, server.pauses, self.failing_since = None, 0, None
-        return responses
+        return reply
 
     async def _wait_for_server(self) -> ServerClient:
         """Wait until a server is available, and return the one with the fewest requests in flight.
@@ -153,7 +163,8 @@ class ServerPool:
                 server.checked_at = time.monotonic()
                 url = server.url
                 try:
-                    await self._send(server, self.canary, 1, self.fields | {"max_tokens": 1})
+                    fields = self.fields | {"max_tokens": 1}
+                    await self._send(server, lambda s: s.complete(self.canary, 1, fields))
                 except RefusedError as error:
                     raise UserError(
                         f"{url} refuses every request ({error}): check the server's log and the "

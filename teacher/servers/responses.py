@@ -33,6 +33,15 @@ class Response:
     reasoning: str = ""
 
 
+@dataclass(frozen=True)
+class ScoredPrompt:
+    """The text and the log-probability (nat) of each token of a prompt. The first token, which
+    nothing precedes, has none."""
+
+    tokens: list[str]
+    log_probabilities: list[float | None]
+
+
 def parse_completion(completion: Any, n: int) -> list[Response]:
     """Convert the first `n` choices of the openai library's chat completion to responses.
 

@@ -5,18 +5,20 @@ from __future__ import annotations
 import asyncio
 import math
 import os
-from typing import Any
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, TypeVar
 
 import openai
 
 from conf.errors import UserError
 from conf.schema import ServersConfig
-from teacher.servers.responses import Response, parse_completion
+from teacher.servers.responses import Response, ScoredPrompt, parse_completion
 
 Messages = list[dict[str, Any]]
 """A prompt in the chat format."""
 RequestFields = dict[str, Any]
 """Fields of a chat completion request; those outside OpenAI's API are in `extra_body`."""
+Reply = TypeVar("Reply")
 
 MALFORMED_REPLY_ERRORS = (AttributeError, IndexError, TypeError, ValueError)
 """Errors that the openai client or `parse_completion` raises for a reply that does not follow the
@@ -91,14 +93,46 @@ class ServerClient:
             RequestError: The request failed.
             UserError: The server does not serve the model, or rejects the API key.
         """
+
+        async def request() -> list[Response]:
+            completion = await self.client.chat.completions.create(
+                model=self.cfg.model, messages=messages, n=n, **fields
+            )
+            return parse_completion(completion, n)
+
+        return await self._translate_errors(request)
+
+    async def score(self, token_ids: Sequence[int]) -> ScoredPrompt:
+        """Return the log-probabilities that the model gives the tokens of a prompt.
+
+        Raises:
+            RequestError: The request failed.
+            UserError: The server does not serve the model, rejects the API key, or returns no
+                log-probabilities of prompts.
+        """
+
+        async def request() -> ScoredPrompt:
+            completion = await self.client.completions.create(
+                model=self.cfg.model, prompt=list(token_ids), echo=True, logprobs=0, max_tokens=0
+            )
+            found = completion.choices[0].logprobs
+            if found is None or len(found.token_logprobs or ()) != len(token_ids):
+                raise UserError(
+                    f"{self.url} returns no log-probabilities of prompts: serve the model with a "
+                    "server that answers completions with echo and logprobs, such as vLLM",
+                    code="no-prompt-logprobs",
+                )
+            return ScoredPrompt(found.tokens, found.token_logprobs)
+
+        return await self._translate_errors(request)
+
+    async def _translate_errors(self, request: Callable[[], Awaitable[Reply]]) -> Reply:
+        """Send a request, and raise the errors of `complete` instead of the openai library's."""
         cfg = self.cfg
         try:
             # The openai client's own timeout starts again with every byte that arrives.
             async with asyncio.timeout(cfg.timeout):
-                completion = await self.client.chat.completions.create(
-                    model=cfg.model, messages=messages, n=n, **fields
-                )
-                return parse_completion(completion, n)
+                return await request()
         except openai.NotFoundError as error:
             raise await self._unknown_model_error() from error
         except openai.AuthenticationError as error:

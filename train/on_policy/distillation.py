@@ -15,25 +15,19 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import log_softmax
 from transformers import ProcessorMixin
 
-from conf.errors import UserError
 from conf.runs import Run, world_size
 from conf.schema import DistillCommand, SftCommand
-from models import loading
-from models.distributed import rank_device
-from models.resolved import check_base
 from models.student.answer_parser import parse_choice
 from models.student.collator import IGNORED, Collator, letter_ids
 from models.student.prompts import Sample
 from models.student.responses import GeneratedText
-from models.trained_runs import product_folder, trained_settings
 from train.common.audit import audit_student
 from train.common.callbacks import EpochCallback
-from train.on_policy.divergence import measure_divergence
 from train.on_policy.paired_prompts import PairedPrompts
 from train.on_policy.sampling import ResponseSampler
+from train.on_policy.teachers import Teacher
 from train.student.held_out_answers import HeldOutAnswers
 from train.student.lazy_samples import StudentDataset
 from train.student.length_sampler import LengthSampler
@@ -66,27 +60,23 @@ class DistillationTrainer(StudentTrainer):
     Evaluations are those of `StudentTrainer`, with the narrator's rationales as responses.
 
     Args:
-        teacher: The teacher's model, which is not trained.
+        teacher: Measures the divergence.
         responses: Samples the responses.
-        student_collator, teacher_collator: Make the inputs of both models.
-        beta: See `measure_divergence`.
+        student_collator: Makes the inputs of the student.
     """
 
     def __init__(
         self,
         *args: Any,
-        teacher: nn.Module,
+        teacher: Teacher,
         responses: ResponseSampler,
         student_collator: TrainerCollator,
-        teacher_collator: Collator,
-        beta: float,
         **settings: Any,
     ) -> None:
         super().__init__(*args, compute_loss_func=self._mean_divergence, **settings)
         self._teacher, self._responses = teacher, responses
-        self._student_collator, self._teacher_collator = student_collator, teacher_collator
-        self._beta = beta
-        self._teacher_logits: Tensor | None = None
+        self._student_collator = student_collator
+        self._read: Any = None
         self._sampled: list[tuple[bool, bool, int]] = []
 
     def get_batch_samples(
@@ -96,7 +86,12 @@ class DistillationTrainer(StudentTrainer):
         batches, _ = super().get_batch_samples(epoch_iterator, num_batches, device)
         parts = [batch["prompts"] for batch in batches]
         texts = iter(self._sample_responses([p for part in parts for p in part]))
-        batches = [self._add_responses(part, [next(texts) for _ in part]) for part in parts]
+        pairs = [[add_response(p, next(texts)) for p in part] for part in parts]
+        read = self._teacher.read([[teacher for _, teacher in part] for part in pairs])
+        batches = [
+            {**self._student_collator([student for student, _ in part]), TEACHER: found}
+            for part, found in zip(pairs, read, strict=True)
+        ]
         return batches, self._get_num_items_in_batch(batches, device)
 
     def _sample_responses(self, prompts: Sequence[PairedPrompts]) -> list[GeneratedText]:
@@ -113,22 +108,6 @@ class DistillationTrainer(StudentTrainer):
         self._responses.check_parsed([letters[k] for k in counted], self.accelerator)
         return texts
 
-    def _add_responses(
-        self, prompts: Sequence[PairedPrompts], texts: Sequence[GeneratedText]
-    ) -> dict[str, Any]:
-        """Return the inputs of student and teacher. The labels of both are the responses."""
-
-        def respond(samples: Sequence[Sample]) -> list[Sample]:
-            return [
-                replace(s, response=t.text, response_ids=t.ids, supervised=p.supervised)
-                for s, t, p in zip(samples, texts, prompts, strict=True)
-            ]
-
-        teacher = self._teacher_collator(respond([p.teacher for p in prompts]))
-        teacher.pop("labels", None)
-        student = self._student_collator(respond([p.student for p in prompts]))
-        return {**student, TEACHER: teacher}
-
     def compute_loss(
         self,
         model: nn.Module,
@@ -136,11 +115,7 @@ class DistillationTrainer(StudentTrainer):
         return_outputs: bool = False,
         **settings: Any,
     ) -> Any:
-        teacher = inputs.pop(TEACHER, None)
-        if teacher is not None:
-            device, bf16 = self.args.device.type, self.args.bf16
-            with torch.no_grad(), torch.autocast(device, torch.bfloat16, enabled=bf16):
-                self._teacher_logits = self._teacher(**teacher, use_cache=False).logits
+        self._read = inputs.pop(TEACHER, None)
         return super().compute_loss(model, inputs, return_outputs, **settings)
 
     def _mean_divergence(
@@ -148,17 +123,11 @@ class DistillationTrainer(StudentTrainer):
     ) -> Tensor:
         """Return a micro-batch's part of the mean divergence over an accumulated batch's tokens;
         in an evaluation, of the mean cross entropy."""
-        teacher, self._teacher_logits = self._teacher_logits, None
-        if teacher is None:
+        if self._read is None:
             return token_mean(outputs, labels, num_items_in_batch)
         supervised = labels[:, 1:] != IGNORED
-        # A larger model's table of tokens may be padded to another size.
-        width = min(outputs.logits.shape[-1], teacher.shape[-1])
-        student, teacher = (
-            log_softmax(logits[:, :-1][supervised][:, :width].float(), dim=-1)
-            for logits in (outputs.logits, teacher)
-        )
-        total = measure_divergence(student, teacher, self._beta).sum()
+        logits, tokens = outputs.logits[:, :-1][supervised], labels[:, 1:][supervised]
+        total = self._teacher.measure(self._read, logits, tokens).sum()
         return total / (supervised.sum() if num_items_in_batch is None else num_items_in_batch)
 
     def log(self, logs: dict[str, float], *args: Any, **settings: Any) -> None:
@@ -177,64 +146,10 @@ class DistillationTrainer(StudentTrainer):
         super().log(logs, *args, **settings)
 
 
-def teacher_settings(cfg: DistillCommand, trained: SftCommand) -> tuple[Path, SftCommand]:
-    """Return the folder and the settings of the run that trained the teacher.
-
-    Args:
-        trained: Settings of the student.
-
-    Raises:
-        UserError: The run cannot be read; or the teacher has another regime, vocabulary or
-            benchmark than the student.
-    """
-    folder = Path(cfg.teacher_model or cfg.model)
-    settings = trained_settings(folder, SftCommand, "student", "teacher_model")
-    check_base(folder, settings.student)
-    for name, ours, theirs in (
-        ("train.regime", trained.train.regime, settings.train.regime),
-        ("teacher.predicates", trained.teacher.predicates, settings.teacher.predicates),
-        ("benchmark.name", trained.benchmark.name, settings.benchmark.name),
-    ):
-        if ours != theirs:
-            raise UserError(
-                f"teacher_model={folder} was trained with {name}={theirs}, and the student with "
-                f"{ours}: train a teacher with the student's setting",
-                code="other-settings",
-            )
-    return folder, settings
-
-
-def load_teacher(
-    folder: Path, settings: SftCommand, precision: str, processor: ProcessorMixin
-) -> nn.Module:
-    """Load the teacher, in evaluation mode.
-
-    Args:
-        settings: Settings of its run, in `folder`.
-        processor: The student's processor.
-
-    Raises:
-        UserError: The teacher cannot be loaded, or has another tokenizer than the student.
-    """
-    weights = product_folder(folder, "student")
-    model, other = loading.load_trained(settings.student, precision, weights)
-    check_tokenizer(folder, processor, other)
-    return model.to(rank_device())
-
-
-def check_tokenizer(folder: Path, student: ProcessorMixin, teacher: ProcessorMixin) -> None:
-    """Raise UserError if a teacher divides texts into other tokens than the student."""
-    ours, theirs = (p.tokenizer.get_vocab() for p in (student, teacher))
-    if ours == theirs:
-        return
-    differing = {token for token, _ in ours.items() ^ theirs.items()}
-    first = min(differing, key=lambda token: ours.get(token, theirs.get(token)))
-    raise UserError(
-        f"teacher_model={folder} has another tokenizer than the student: the first token that "
-        f"differs is {first!r} (id {ours.get(first)} in the student, {theirs.get(first)} in the "
-        "teacher); choose a teacher of the student's family",
-        code="other-tokenizer",
-    )
+def add_response(prompts: PairedPrompts, text: GeneratedText) -> tuple[Sample, Sample]:
+    """Return the prompts of student and teacher with the same response."""
+    given = {"response": text.text, "response_ids": text.ids, "supervised": prompts.supervised}
+    return replace(prompts.student, **given), replace(prompts.teacher, **given)
 
 
 def build_trainer(
@@ -242,7 +157,7 @@ def build_trainer(
     trained: SftCommand,
     run: Run,
     model: nn.Module,
-    teacher: nn.Module,
+    teacher: Teacher,
     processor: ProcessorMixin,
     training: StudentDataset,
     validation: dict[str, StudentDataset],
@@ -265,8 +180,6 @@ def build_trainer(
     log.info(audit_student(model, processor, student, longest, collator))
     lengths = training.lengths(processor, student.image_size)
     sampler = LengthSampler(lengths, train.batch, cfg.seed, train.micro_batch, world_size())
-    # The sampled responses are limited by student.max_new_tokens already.
-    unlimited = Collator(processor, None)
     answers = HeldOutAnswers(train, student, processor, run.folder)
     return DistillationTrainer(
         model=model,
@@ -280,7 +193,6 @@ def build_trainer(
         answers=answers if train.generated_items else None,
         teacher=teacher,
         responses=ResponseSampler(processor, student, train),
-        student_collator=TrainerCollator(unlimited, digests=False),
-        teacher_collator=unlimited,
-        beta=train.beta,
+        # The sampled responses are limited by student.max_new_tokens already.
+        student_collator=TrainerCollator(Collator(processor, None), digests=False),
     )

@@ -32,3 +32,17 @@ def kl_divergence(log_p: Tensor, log_q: Tensor) -> Tensor:
     """Return the Kullback-Leibler divergence KL(p || q) (N,) of distributions (N, V), given as
     logarithms."""
     return (log_p.exp() * (log_p - log_q)).sum(dim=-1)
+
+
+def estimate_divergence(student: Tensor, teacher: Tensor) -> Tensor:
+    """Return estimates (N,) of the reverse Kullback-Leibler divergence KL(S || T) from one token
+    each that was sampled from S. Over the tokens of S, the means of an estimate and of its gradient
+    are the divergence and its gradient.
+
+    Args:
+        student: (N,) logarithms of the student's probabilities S of the tokens.
+        teacher: (N,) logarithms of the teacher's probabilities T of the tokens.
+    """
+    difference = (student - teacher).detach()
+    # The second term is 0. Its gradient is that of log S, weighted by the difference.
+    return difference + difference * (student - student.detach())

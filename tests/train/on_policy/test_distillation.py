@@ -22,8 +22,8 @@ from train import distill, sft
 from train.common.journal import read_journal
 from train.export import find_run
 from train.on_policy import distillation, paired_prompts
-from train.on_policy.distillation import check_tokenizer
 from train.on_policy.paired_prompts import PairedPrompts
+from train.on_policy.teachers import check_tokenizer
 
 pytestmark = pytest.mark.slow
 
@@ -160,7 +160,8 @@ def test_a_teacher_with_another_tokenizer_is_refused(processor, student, tmp_pat
     other = loading.AutoProcessor.from_pretrained(folder)
     other.tokenizer.add_tokens(["zebra"])
     with raises_user_error("other-tokenizer", contains="'zebra' (id None in the student"):
-        check_tokenizer(tmp_path, loading.AutoProcessor.from_pretrained(folder), other)
+        tokenizer = loading.AutoProcessor.from_pretrained(folder).tokenizer
+        check_tokenizer(tmp_path, tokenizer, other.tokenizer)
 
 
 def test_unsuitable_runs_are_refused(settings, student, teacher, few_steps, tmp_path) -> None:

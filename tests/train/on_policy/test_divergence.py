@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.nn.functional import log_softmax
 
-from train.on_policy.divergence import measure_divergence
+from train.on_policy.divergence import estimate_divergence, measure_divergence
 
 
 def binary(p: float) -> torch.Tensor:
@@ -75,3 +75,17 @@ def test_gradient_is_that_of_the_expectation_over_sequences(beta: float) -> None
     weights = torch.stack([probability(prefix) for prefix in prefixes])
     exact = (weights * measure_divergence(student, teacher, beta)).sum()
     torch.testing.assert_close(sampled, torch.autograd.grad(exact, logits)[0])
+
+
+def test_estimates_have_the_mean_and_the_gradient_of_the_divergence() -> None:
+    torch.manual_seed(1)
+    logits = torch.randn(4, 5, dtype=torch.float64, requires_grad=True)
+    teacher = log_softmax(torch.randn(4, 5, dtype=torch.float64), dim=-1)
+    student = log_softmax(logits, dim=-1)
+    exact = measure_divergence(student, teacher, 1).sum()
+    (gradient,) = torch.autograd.grad(exact, logits, retain_graph=True)
+    weights = student.exp().detach()
+    estimates = estimate_divergence(student.flatten(), teacher.flatten()).view(4, 5)
+    mean = (weights * estimates).sum()
+    torch.testing.assert_close(mean, exact)
+    torch.testing.assert_close(torch.autograd.grad(mean, logits)[0], gradient)

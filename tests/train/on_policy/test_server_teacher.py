@@ -1,0 +1,146 @@
+"""Distillation from a teacher on a server: a real vLLM server, and servers with faults."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn.functional import log_softmax
+from transformers import AutoModelForImageTextToText, ProcessorMixin
+
+from conf.entry import Run
+from conf.runs import open_run
+from conf.schema import DistillCommand, DistillTrainConfig, SftCommand, TeacherServerConfig
+from data.store import Store
+from models.student.collator import IGNORED, Collator
+from models.student.prompts import Sample
+from models.trained_runs import trained_settings
+from teacher.narrate import ensure_rationales
+from tests.local import JsonHandler, LocalServer
+from tests.teacher.vllm_server import VllmServer
+from tests.train.on_policy.test_distillation import finish_run
+from tests.user_errors import raises_user_error
+from train import distill
+from train.common.journal import read_journal
+from train.on_policy.paired_prompts import load_datasets
+from train.on_policy.teachers import ServerTeacher
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def vllm(saved_base: str, tmp_path_factory) -> Iterator[VllmServer]:
+    """The untrained base as a teacher."""
+    server = VllmServer(Path(saved_base), tmp_path_factory.mktemp("serve"), "dtype=float32")
+    server.start()
+    yield server
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def student(few_steps, tmp_path_factory) -> Path:
+    return finish_run(few_steps(max_steps=1), tmp_path_factory.mktemp("student"))
+
+
+@pytest.fixture
+def settings(student: Path, micro_store: Store) -> DistillCommand:
+    train = DistillTrainConfig(
+        lr=1e-2, max_steps=2, batch=4, micro_batch=2, precision="fp32", evaluations=1,
+        validation_items=2, generated_items=0,
+    )  # fmt: skip
+    return DistillCommand(
+        model=str(student), store=str(micro_store.folder.parent), workers=1, train=train
+    )
+
+
+@pytest.fixture
+def samples(settings, student, micro_store) -> list[Sample]:
+    """The teacher's prompts about four items, with the narrator's rationales as responses."""
+    trained = trained_settings(student, SftCommand, "student")
+    rationales = ensure_rationales(micro_store, trained.teacher)
+    training, _ = load_datasets(settings, trained, micro_store, rationales)
+    texts = [r.text for r in rationales if r.accepted]
+    return [replace(training[k].teacher, response=texts[k], supervised=k != 2) for k in range(4)]
+
+
+def serve(url: str) -> TeacherServerConfig:
+    return TeacherServerConfig(url=url, model="tiny", timeout=60, unreachable_timeout=60)
+
+
+def test_vllm_gives_the_log_probabilities_of_the_same_model(
+    vllm: VllmServer, saved_base: str, processor: ProcessorMixin, samples: list[Sample]
+) -> None:
+    read = ServerTeacher(serve(vllm.url), processor).read([samples[:3], samples[3:]])
+    batch = Collator(processor, None)(samples)
+    tokens = batch.pop("labels")[:, 1:]
+    model = AutoModelForImageTextToText.from_pretrained(saved_base).eval()
+    with torch.no_grad():
+        found = log_softmax(model(**batch).logits[:, :-1], dim=-1)
+    supervised = tokens != IGNORED
+    expected = found[supervised].gather(1, tokens[supervised][:, None])[:, 0]
+    torch.testing.assert_close(torch.cat(read), expected, rtol=1e-3, atol=1e-3)
+    assert len(read[0]) > 10 < len(read[1])
+
+
+def test_a_student_is_distilled_from_a_server(vllm, settings, tmp_path) -> None:
+    run = Run("run", tmp_path)
+    cfg = replace(settings, teacher_server=serve(vllm.url))
+    distill.main.__wrapped__(cfg, run)
+    losses = [r["loss"] for r in read_journal(run.folder) if "loss" in r]
+    # The teacher has another prompt than the student.
+    assert len(losses) == 2
+    assert all(0 < abs(loss) < 20 for loss in losses)
+
+
+class FaultyHandler(JsonHandler):
+    """Answers a completion with the tokens of `texts`, or without log-probabilities."""
+
+    texts: list[str] | None = None
+
+    def post(self, body: dict) -> None:
+        count = len(body["prompt"])
+        logprobs = None
+        if self.texts is not None:
+            values = [None, *[-1.0] * (count - 1)]
+            logprobs = {"tokens": (self.texts * count)[:count], "token_logprobs": values}
+        choice = {"index": 0, "text": "", "finish_reason": "length", "logprobs": logprobs}
+        self.respond(200, {"id": "0", "object": "text_completion", "choices": [choice]})
+
+
+@pytest.mark.parametrize(
+    ("texts", "code", "message"),
+    [
+        (None, "no-prompt-logprobs", "returns no log-probabilities of prompts"),
+        (["zebra"], "other-tokenizer", "'zebra' on the server"),
+    ],
+)
+def test_unsuitable_servers_are_named(processor, samples, texts, code, message) -> None:
+    handler = type("Handler", (FaultyHandler,), {"texts": texts})
+    server = LocalServer(handler)
+    with raises_user_error(code, contains=message):
+        ServerTeacher(serve(server.url), processor).read([samples])
+    server.stop()
+
+
+def test_two_teachers_and_other_divergences_are_refused() -> None:
+    server = serve("http://127.0.0.1:1/v1")
+    problems = DistillCommand(
+        teacher_model="run", teacher_server=server, train=DistillTrainConfig(beta=0.5)
+    ).check()
+    assert any("are two teachers" in p for p in problems)
+    assert any("train.beta=0.5 with teacher_server.url" in p for p in problems)
+    (problem,) = DistillCommand(teacher_server=replace(server, model=None)).check()
+    assert "without teacher_server.model" in problem
+
+
+def test_a_run_goes_on_with_a_server_at_another_address(settings, tmp_path) -> None:
+    run = Run("run", tmp_path)
+    open_run(run, asdict(replace(settings, teacher_server=serve("http://a/v1"))), "train.distill")
+    (tmp_path / "metrics.jsonl").touch()
+    open_run(run, asdict(replace(settings, teacher_server=serve("http://b/v1"))), "train.distill")
+    other = replace(serve("http://b/v1"), model="other")
+    with raises_user_error("other-settings", contains="teacher_server.model"):
+        open_run(run, asdict(replace(settings, teacher_server=other)), "train.distill")
