@@ -44,6 +44,8 @@ def main(cfg: ServeCommand, run: Run) -> None:
     environment = get_clean_environment()
     if Path(model).is_dir():
         environment["HF_HUB_OFFLINE"] = "1"
+    if cfg.adapter_rank:
+        environment["VLLM_ALLOW_RUNTIME_LORA_UPDATING"] = "True"
     log.info("starting vLLM; stop it with Ctrl-C or SIGTERM")
     log.info(shlex.join(arguments))
     logging.shutdown()
@@ -152,10 +154,13 @@ def vllm_arguments(
         # Without the second flag, clips are normalized like single images.
         arguments += ["--trust-request-mm-kwargs", "--no-mm-device-do-normalize"]
     if cfg.adapter is not None:
-        rank = read_adapter_rank(cfg.adapter)
-        max_rank = next((r for r in LORA_RANKS if r >= rank), LORA_RANKS[-1])
-        arguments += ["--enable-lora", "--max-lora-rank", str(max_rank)]
         arguments += ["--lora-modules", f"adapter={Path(cfg.adapter).absolute()}"]
+    ranks = [cfg.adapter_rank] if cfg.adapter_rank else []
+    if cfg.adapter is not None:
+        ranks.append(read_adapter_rank(cfg.adapter))
+    if ranks:
+        max_rank = next((r for r in LORA_RANKS if r >= max(ranks)), LORA_RANKS[-1])
+        arguments += ["--enable-lora", "--max-lora-rank", str(max_rank)]
     if (cfg.gpus or 0) > available:
         raise UserError(
             f"gpus={cfg.gpus}: vLLM finds only {available} on this machine", code="too-few-gpus"

@@ -10,7 +10,7 @@ from omegaconf import MISSING
 from conf.runs import TRAINER_FOLDERS, is_inside, runs_folder
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
-from conf.schema.servers import TeacherConfig, TeacherServerConfig
+from conf.schema.servers import SamplingServerConfig, TeacherConfig, TeacherServerConfig
 from conf.schema.settings import Settings, check_run, setting
 from conf.schema.training import (
     BaseTrainConfig,
@@ -120,6 +120,10 @@ class ServeCommand(CommandConfig):
     frames are preprocessed, so give access only to clients that you trust."""
     adapter: str | None = None
     """Folder of a student's adapters to serve under the model name `adapter`."""
+    adapter_rank: int | None = setting(None, least=1)
+    """Maximum LoRA rank of the adapters that clients load while the server runs, such as
+    train.distill with sampling_server.url; null allows none. Such clients name folders of this
+    machine, so give access only to clients that you trust."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         if len(self.teacher.urls) != 1:
@@ -146,6 +150,7 @@ class ContinuationCommand(CommandConfig):
     model: str | None = None
     """Folder of the run of train.sft whose student is trained further. It determines the benchmark,
     the narrator's settings and the student."""
+    sampling_server: SamplingServerConfig = field(default_factory=SamplingServerConfig)
     seed: int = setting(0, least=0)
     """Seed of the order of the items and of the sampled responses."""
 

@@ -84,6 +84,19 @@ class TeacherServerConfig(ServersConfig):
 
 
 @dataclass
+class SamplingServerConfig(ServersConfig):
+    """Servers that sample the responses of a student that `train.distill` trains."""
+
+    GROUP: ClassVar[str] = "sampling_server"
+
+    model: str = "student"
+    """Name under which the servers load the student's adapters, anew at each step. They serve the
+    student's base."""
+    timeout: float = setting(600.0, least=1)
+    """Timeout of a request (s)."""
+
+
+@dataclass
 class RelationBounds(Settings):
     """Bounds of the words for relations between objects (`teacher.predicates=relational`)."""
 

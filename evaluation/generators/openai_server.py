@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
-import io
 import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -13,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import openai
-from PIL import Image
 
 from conf.errors import UserError
 from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageCommand
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import schema
 from models.fingerprints import processor_digest, weights_digest
+from models.student.chat_requests import build_messages, sampling_fields
 from models.student.prompts import Clip, Sample
 from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.trained_runs import product_folder, run_title
@@ -129,32 +127,6 @@ class ServedModel:
                 await run_limited(subjects, server.concurrency, respond)
 
 
-def build_messages(sample: Sample) -> Messages:
-    """Return a sample as the messages of a chat request, with its frames as PNGs in base64.
-
-    A clip becomes a video in vLLM's format, whose times `request_fields` contains.
-    """
-    images = iter(sample.images)
-    parts: list[dict[str, Any]] = []
-    for part in sample.content:
-        if part["type"] == "text":
-            parts.append(part)
-        elif part["type"] == "image":
-            url = f"data:image/png;base64,{_encode_png(next(images))}"
-            parts.append({"type": "image_url", "image_url": {"url": url}})
-        else:
-            frames = ",".join(map(_encode_png, sample.clip.pixels))
-            url = f"data:video/jpeg;base64,{frames}"
-            parts.append({"type": "video_url", "video_url": {"url": url}})
-    return [{"role": "user", "content": parts}]
-
-
-def _encode_png(pixels: np.ndarray) -> str:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
-    return base64.b64encode(buffer.getvalue()).decode()
-
-
 def blank_sample(sample: Sample) -> Sample:
     """Return a sample with the same text and number of frames, but with small blank frames."""
     blank = np.zeros((CANARY_SIZE, CANARY_SIZE, 3), np.uint8)
@@ -163,33 +135,10 @@ def blank_sample(sample: Sample) -> Sample:
 
 
 def request_fields(student: StudentConfig, mode: str, clip: Clip | None) -> RequestFields:
-    """Return the fields of a request besides its messages: sampling, schema and preprocessing.
-
-    The server keeps all frames of a clip, and resizes a frame only to the nearest size on the grid
-    of the vision tower, as a local model does (see `models.loading.pin_sizes`).
-    """
-    # Both edges are numbers of pixels.
-    max_pixels = 2 * student.image_size**2
-    images = {"size": {"shortest_edge": 1, "longest_edge": max_pixels}}
-    videos = {"size": {"shortest_edge": 1, "longest_edge": max_pixels * student.frames}}
-    extra: dict[str, Any] = {
-        "chat_template_kwargs": {"enable_thinking": student.thinking},
-        "mm_processor_kwargs": {
-            "images_kwargs": images,
-            "videos_kwargs": {**videos, "do_sample_frames": False},
-        },
-    }
-    if clip:
-        extra["media_io_kwargs"] = {"video": {"num_frames": -1, **clip.metadata}}
-    if student.temperature:
-        # -1 sets no limit. Without this field, the model's generation_config.json sets the limit.
-        extra["top_k"] = student.top_k or -1
-    request = {
-        "temperature": student.temperature,
-        "top_p": student.top_p,
-        "max_tokens": response_token_limit(mode, student.max_new_tokens, student.thinking),
-        "extra_body": extra,
-    }
+    """Return the fields of a request besides its messages: those of `sampling_fields` and, in
+    constrained mode, the JSON schema of the response."""
+    limit = response_token_limit(mode, student.max_new_tokens, student.thinking)
+    request = sampling_fields(student, limit, clip)
     if mode == "constrained":
         record = {"name": "record", "strict": True, "schema": schema()}
         request["response_format"] = {"type": "json_schema", "json_schema": record}

@@ -22,7 +22,7 @@ class GeneratedText:
 
     Attributes:
         cut: Whether it was cut off at the token limit.
-        ids: Its token ids, with the one that ends it; empty if a server generated it.
+        ids: Its token ids, with the one that ends it; empty if they are not known.
     """
 
     text: str

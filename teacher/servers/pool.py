@@ -11,6 +11,7 @@ import logging
 import random
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 from conf.errors import UserError
@@ -88,6 +89,18 @@ class ServerPool:
         """Return the log-probabilities of a prompt's tokens, after waiting for a server if
         necessary. It raises the errors of `complete`, and those of `ServerClient.score`."""
         return await self._request(lambda server: server.score(token_ids))
+
+    async def load_adapter(self, folder: Path) -> None:
+        """Load adapters on every server under the name `cfg.model`.
+
+        Raises:
+            NoResponseError: A server cannot load them, or is not available.
+            UserError: A server loads no adapters, or rejects the API key.
+        """
+        try:
+            await asyncio.gather(*(server.load_adapter(folder) for server in self.servers))
+        except RequestError as error:
+            raise NoResponseError(str(error)) from error
 
     async def _request(self, send: Callable[[ServerClient], Awaitable[Reply]]) -> Reply:
         """Return the reply of the first server that answers a request."""

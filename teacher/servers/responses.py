@@ -23,6 +23,8 @@ class Response:
             if the server does not report it.
         finished: Arrival time (Unix time, s).
         reasoning: The text that the server's reasoning parser separated from the response.
+        token_ids: The token ids of the response, if the request asks for them with vLLM's
+            `return_token_ids`; otherwise empty.
     """
 
     text: str
@@ -31,6 +33,7 @@ class Response:
     completion_tokens: int | None = None
     finished: float | None = None
     reasoning: str = ""
+    token_ids: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ def parse_completion(completion: Any, n: int) -> list[Response]:
                 completion_tokens=usage and (usage.completion_tokens + k) // len(choices),
                 finished=time.time(),
                 reasoning=reasoning,
+                token_ids=tuple(getattr(choice, "token_ids", None) or ()),
             )
         )
     return responses

@@ -6,6 +6,7 @@ import asyncio
 import math
 import os
 from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import openai
@@ -125,6 +126,27 @@ class ServerClient:
             return ScoredPrompt(found.tokens, found.token_logprobs)
 
         return await self._translate_errors(request)
+
+    async def load_adapter(self, folder: Path) -> None:
+        """Load adapters under the name `cfg.model`, instead of earlier ones with this name.
+
+        Raises:
+            RequestError: The request failed.
+            UserError: The server loads no adapters, or rejects the API key.
+        """
+        body = {"lora_name": self.cfg.model, "lora_path": str(folder), "load_inplace": True}
+
+        async def request() -> None:
+            try:
+                await self.client.post("/load_lora_adapter", cast_to=str, body=body)
+            except openai.NotFoundError as error:
+                raise UserError(
+                    f"{self.url} loads no adapters while it runs: start it with python -m "
+                    "teacher.serve frames=true adapter_rank=RANK",
+                    code="no-adapters",
+                ) from error
+
+        await self._translate_errors(request)
 
     async def _translate_errors(self, request: Callable[[], Awaitable[Reply]]) -> Reply:
         """Send a request, and raise the errors of `complete` instead of the openai library's."""

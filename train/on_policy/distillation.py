@@ -27,6 +27,7 @@ from train.common.audit import audit_student
 from train.common.callbacks import EpochCallback
 from train.on_policy.paired_prompts import PairedPrompts
 from train.on_policy.sampling import ResponseSampler
+from train.on_policy.served_sampling import build_sampler
 from train.on_policy.teachers import Teacher
 from train.student.held_out_answers import HeldOutAnswers
 from train.student.lazy_samples import StudentDataset
@@ -192,7 +193,7 @@ def build_trainer(
         accuracy=LetterAccuracy(letter_ids(processor)),
         answers=answers if train.generated_items else None,
         teacher=teacher,
-        responses=ResponseSampler(processor, student, train),
+        responses=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
         # The sampled responses are limited by student.max_new_tokens already.
         student_collator=TrainerCollator(Collator(processor, None), digests=False),
     )

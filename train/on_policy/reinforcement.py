@@ -40,6 +40,7 @@ from train.common.arguments import common_arguments
 from train.common.callbacks import EpochCallback
 from train.common.held_out import check_not_empty
 from train.on_policy.sampling import ResponseSampler
+from train.on_policy.served_sampling import build_sampler
 from train.rewards import REWARDS, JudgedResponse, judge_response
 from train.student.dataset import split_items
 from train.student.lazy_samples import seeded_rng
@@ -313,7 +314,7 @@ def build_trainer(
         eval_dataset=make_rows(validation, "eval"),
         processing_class=processor,
         items={"train": training, "eval": validation},
-        responses=ResponseSampler(processor, student, train),
+        responses=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
         collator=Collator(processor, student.max_length),
     )
     trainer.add_callback(EpochCallback(trainer))

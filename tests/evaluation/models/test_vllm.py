@@ -16,10 +16,11 @@ from conf.schema import LoraConfig, SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import FrameReader
 from evaluation import select
 from evaluation.generators.base import item_sample
-from evaluation.generators.openai_server import build_messages, request_fields
+from evaluation.generators.openai_server import request_fields
 from evaluation.generators.response_schema import schema
 from models import loading
 from models.student.answer_parser import Reason, parse_choice
+from models.student.chat_requests import build_messages
 from models.student.collator import Collator, encode
 from tests.teacher.vllm_server import VllmServer
 from tests.tiny_models import SMALL, randomize_adapters

@@ -1,4 +1,4 @@
-"""Distillation from a teacher on a server: a real vLLM server, and servers with faults."""
+"""Teachers and samplers on servers: a real vLLM server, and servers with faults."""
 
 from __future__ import annotations
 
@@ -13,19 +13,29 @@ from transformers import AutoModelForImageTextToText, ProcessorMixin
 
 from conf.entry import Run
 from conf.runs import open_run
-from conf.schema import DistillCommand, DistillTrainConfig, SftCommand, TeacherServerConfig
+from conf.schema import (
+    DistillCommand,
+    DistillTrainConfig,
+    LoraConfig,
+    SamplingServerConfig,
+    SftCommand,
+    TeacherServerConfig,
+)
 from data.store import Store
+from models import loading
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
 from models.trained_runs import trained_settings
 from teacher.narrate import ensure_rationales
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.vllm_server import VllmServer
+from tests.tiny_models import randomize_adapters
 from tests.train.on_policy.test_distillation import finish_run
 from tests.user_errors import raises_user_error
 from train import distill
 from train.common.journal import read_journal
 from train.on_policy.paired_prompts import load_datasets
+from train.on_policy.served_sampling import build_sampler
 from train.on_policy.teachers import ServerTeacher
 
 pytestmark = pytest.mark.slow
@@ -33,8 +43,9 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def vllm(saved_base: str, tmp_path_factory) -> Iterator[VllmServer]:
-    """The untrained base as a teacher."""
-    server = VllmServer(Path(saved_base), tmp_path_factory.mktemp("serve"), "dtype=float32")
+    """The untrained base, as a teacher and as the base of a student."""
+    settings = ("dtype=float32", "frames=true", "adapter_rank=4")
+    server = VllmServer(Path(saved_base), tmp_path_factory.mktemp("serve"), *settings)
     server.start()
     yield server
     server.stop()
@@ -95,6 +106,52 @@ def test_a_student_is_distilled_from_a_server(vllm, settings, tmp_path) -> None:
     assert all(0 < abs(loss) < 20 for loss in losses)
 
 
+def distance_from_greedy(model, processor, prompts, texts) -> float:
+    """Return how far a response's token is at most from the token with the largest logit."""
+    answered = [replace(p, response_ids=t.ids) for p, t in zip(prompts, texts, strict=True)]
+    batch = Collator(processor, None)(answered)
+    tokens = batch.pop("labels")[:, 1:]
+    with torch.no_grad():
+        logits = model(**batch).logits[:, :-1][tokens != IGNORED]
+    chosen = logits.gather(1, tokens[tokens != IGNORED][:, None])[:, 0]
+    return float((logits.max(dim=1).values - chosen).max())
+
+
+def test_vllm_samples_from_the_current_adapters(
+    vllm, settings, student, micro_store, tmp_path
+) -> None:
+    """At a temperature near 0, the tokens have the largest logits of the model in this process."""
+    trained = trained_settings(student, SftCommand, "student")
+    cfg = replace(trained.student, quantization="none", max_new_tokens=12, max_length=4000)
+    train = replace(settings.train, temperature=1e-4)
+    torch.manual_seed(0)
+    model, processor = loading.load_student(cfg, "fp32", list)
+    model.eval()
+    rationales = ensure_rationales(micro_store, trained.teacher)
+    training, _ = load_datasets(settings, trained, micro_store, rationales)
+    prompts = [training[k].student for k in range(6)]
+    servers = SamplingServerConfig(url=vllm.url, unreachable_timeout=60)
+    sampler = build_sampler(processor, cfg, train, servers, tmp_path)
+    found = []
+    for _ in range(2):
+        randomize_adapters(model, 0.6)
+        texts = sampler.sample(model, prompts, range(6))
+        assert all(text.cut and len(text.ids) == 12 for text in texts)
+        assert distance_from_greedy(model, processor, prompts, texts) < 0.05
+        found.append(texts)
+    assert distance_from_greedy(model, processor, prompts, found[0]) > 0.5
+    assert len(list((tmp_path / "sampled_adapters").iterdir())) == 1
+
+
+def test_a_student_is_distilled_from_responses_of_a_server(vllm, settings, tmp_path) -> None:
+    run = Run("run", tmp_path)
+    servers = SamplingServerConfig(url=vllm.url, unreachable_timeout=60)
+    distill.main.__wrapped__(replace(settings, sampling_server=servers), run)
+    losses = [r for r in read_journal(run.folder) if "loss" in r]
+    assert len(losses) == 2
+    assert all(r["loss"] > 0 and r["sampled_length"] == 8 for r in losses)
+
+
 class FaultyHandler(JsonHandler):
     """Answers a completion with the tokens of `texts`, or without log-probabilities."""
 
@@ -123,6 +180,40 @@ def test_unsuitable_servers_are_named(processor, samples, texts, code, message) 
     with raises_user_error(code, contains=message):
         ServerTeacher(serve(server.url), processor).read([samples])
     server.stop()
+
+
+class FixedHandler(JsonHandler):
+    """A server that loads no adapters (404), or whose responses have no token ids."""
+
+    loads = True
+
+    def post(self, body: dict) -> None:
+        if self.path.endswith("/load_lora_adapter"):
+            self.respond(200 if self.loads else 404, {})
+            return
+        message = {"role": "assistant", "content": "Answer: A"}
+        choice = {"index": 0, "message": message, "finish_reason": "stop"}
+        self.respond(200, {"id": "0", "object": "chat.completion", "choices": [choice]})
+
+
+@pytest.mark.parametrize(
+    ("loads", "code", "message"),
+    [(False, "no-adapters", "adapter_rank=RANK"), (True, "no-token-ids", "return no token ids")],
+)
+def test_servers_that_cannot_sample_are_named(
+    settings, student, samples, loads, code, message, tmp_path
+) -> None:
+    trained = trained_settings(student, SftCommand, "student")
+    model, processor = loading.load_student(trained.student, "fp32", list)
+    server = LocalServer(type("Handler", (FixedHandler,), {"loads": loads}))
+    servers = SamplingServerConfig(url=server.url, unreachable_timeout=5)
+    sampler = build_sampler(processor, trained.student, settings.train, servers, tmp_path)
+    with raises_user_error(code, contains=message):
+        sampler.sample(model, samples, range(len(samples)))
+    server.stop()
+    whole = replace(trained.student, lora=LoraConfig(rank=0))
+    with raises_user_error("no-adapters", contains="student.lora.rank is 0"):
+        build_sampler(processor, whole, settings.train, servers, tmp_path)
 
 
 def test_two_teachers_and_other_divergences_are_refused() -> None:

@@ -1,0 +1,73 @@
+"""Requests for responses to a student's prompts, in the format of vLLM's chat completions."""
+
+from __future__ import annotations
+
+import base64
+import io
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from conf.schema import StudentConfig
+from models.student.prompts import Clip, Sample
+from teacher.servers.server import Messages, RequestFields
+
+
+def build_messages(sample: Sample) -> Messages:
+    """Return a sample as the messages of a chat request, with its frames as PNGs in base64.
+
+    A clip becomes a video in vLLM's format, whose times `sampling_fields` contains.
+    """
+    images = iter(sample.images)
+    parts: list[dict[str, Any]] = []
+    for part in sample.content:
+        if part["type"] == "text":
+            parts.append(part)
+        elif part["type"] == "image":
+            url = f"data:image/png;base64,{_encode_png(next(images))}"
+            parts.append({"type": "image_url", "image_url": {"url": url}})
+        else:
+            frames = ",".join(map(_encode_png, sample.clip.pixels))
+            url = f"data:video/jpeg;base64,{frames}"
+            parts.append({"type": "video_url", "video_url": {"url": url}})
+    return [{"role": "user", "content": parts}]
+
+
+def _encode_png(pixels: np.ndarray) -> str:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def sampling_fields(student: StudentConfig, limit: int, clip: Clip | None) -> RequestFields:
+    """Return the fields of a request besides its messages: sampling and preprocessing.
+
+    The server keeps all frames of a clip, and resizes a frame only to the nearest size on the grid
+    of the vision tower, as a local model does (see `models.loading.pin_sizes`).
+
+    Args:
+        limit: Maximum number of new tokens.
+    """
+    # Both edges are numbers of pixels.
+    max_pixels = 2 * student.image_size**2
+    images = {"size": {"shortest_edge": 1, "longest_edge": max_pixels}}
+    videos = {"size": {"shortest_edge": 1, "longest_edge": max_pixels * student.frames}}
+    extra: dict[str, Any] = {
+        "chat_template_kwargs": {"enable_thinking": student.thinking},
+        "mm_processor_kwargs": {
+            "images_kwargs": images,
+            "videos_kwargs": {**videos, "do_sample_frames": False},
+        },
+    }
+    if clip:
+        extra["media_io_kwargs"] = {"video": {"num_frames": -1, **clip.metadata}}
+    if student.temperature:
+        # -1 sets no limit. Without this field, the model's generation_config.json sets the limit.
+        extra["top_k"] = student.top_k or -1
+    return {
+        "temperature": student.temperature,
+        "top_p": student.top_p,
+        "max_tokens": limit,
+        "extra_body": extra,
+    }

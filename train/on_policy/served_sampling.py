@@ -1,0 +1,138 @@
+"""Sample the responses of a student on vLLM servers, which load its adapters anew at each step."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import peft
+from torch import nn
+from transformers import ProcessorMixin
+
+from conf.errors import UserError
+from conf.runs import rank
+from conf.schema import (
+    DistillTrainConfig,
+    ReinforceTrainConfig,
+    SamplingServerConfig,
+    StudentConfig,
+)
+from models.distributed import main_first
+from models.student.chat_requests import build_messages, sampling_fields
+from models.student.prompts import Sample
+from models.student.responses import GeneratedText
+from teacher.servers.pool import NoResponseError, ServerPool, run_limited
+from teacher.servers.responses import TRUNCATED, Response
+from train.on_policy.sampling import ResponseSampler
+
+ADAPTERS = "sampled_adapters"
+"""Folder of a run that contains the adapters of the current step."""
+
+
+class ServedSampler(ResponseSampler):
+    """Samples a student's responses on servers of its base.
+
+    Args:
+        student: Settings of the student; those of sampling are replaced.
+        folder: Folder of the run. The servers read the adapters from it.
+
+    Raises:
+        UserError: The student has no adapters.
+    """
+
+    def __init__(
+        self,
+        processor: ProcessorMixin,
+        student: StudentConfig,
+        train: DistillTrainConfig | ReinforceTrainConfig,
+        servers: SamplingServerConfig,
+        folder: Path,
+    ) -> None:
+        super().__init__(processor, student, train)
+        if not student.lora.rank:
+            raise UserError(
+                "sampling_server.url needs a student with adapters, which the servers load at each "
+                "step, and student.lora.rank is 0: leave out sampling_server.url",
+                code="no-adapters",
+            )
+        self._servers = servers
+        self._folder = folder.absolute() / ADAPTERS
+
+    def sample(
+        self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]
+    ) -> list[GeneratedText]:
+        """Return a response to each prompt.
+
+        Raises:
+            UserError: The servers do not respond, load no adapters, or return no token ids.
+        """
+        return asyncio.run(self._sample(model, prompts, seeds))
+
+    async def _sample(
+        self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]
+    ) -> list[GeneratedText]:
+        texts = [GeneratedText("") for _ in prompts]
+        async with ServerPool(self._servers, {}) as pool:
+            try:
+                # The other ranks wait until the main rank has given the adapters to the servers.
+                with main_first():
+                    if rank() == 0:
+                        await pool.load_adapter(self._save_adapters(model))
+
+                async def respond(index: int) -> None:
+                    texts[index] = await self._request(pool, prompts[index], seeds[index])
+
+                await run_limited(range(len(prompts)), self._servers.concurrency, respond)
+            except NoResponseError as error:
+                raise UserError(
+                    f"the servers of sampling_server.url sample no responses ({error}): correct "
+                    "the cause and run the same command again, which resumes",
+                    code="no-response",
+                ) from error
+        return texts
+
+    def _save_adapters(self, model: nn.Module) -> Path:
+        """Save the adapters of a step in a new folder, and delete those of the step before."""
+        assert isinstance(model, peft.PeftModel)
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._folder.mkdir()
+        # vLLM would reuse the cached prefixes of earlier weights from the same folder.
+        folder = Path(tempfile.mkdtemp(dir=self._folder))
+        model.save_pretrained(folder)
+        return folder
+
+    async def _request(self, pool: ServerPool, prompt: Sample, seed: int) -> GeneratedText:
+        fields = sampling_fields(self._sampling, self._sampling.max_new_tokens, prompt.clip)
+        fields["extra_body"]["return_token_ids"] = True
+        never = {str(token): -100 for token in self._never}
+        [response] = await pool.complete(
+            build_messages(prompt), **fields, seed=seed, logit_bias=never
+        )
+        return self._read(response)
+
+    def _read(self, response: Response) -> GeneratedText:
+        ids = response.token_ids
+        if not ids:
+            raise UserError(
+                "the servers of sampling_server.url return no token ids: use vLLM, whose responses "
+                "contain them",
+                code="no-token-ids",
+            )
+        text = self._processor.tokenizer.decode(ids, skip_special_tokens=True)
+        return GeneratedText(text, response.flaw == TRUNCATED, ids)
+
+
+def build_sampler(
+    processor: ProcessorMixin,
+    student: StudentConfig,
+    train: DistillTrainConfig | ReinforceTrainConfig,
+    servers: SamplingServerConfig,
+    folder: Path,
+) -> ResponseSampler:
+    """Return a sampler on servers, if there are any, or one in this process."""
+    if servers.url is None:
+        return ResponseSampler(processor, student, train)
+    return ServedSampler(processor, student, train, servers, folder)
