@@ -178,6 +178,12 @@ class DistillCommand(ContinuationCommand):
                 "log-probabilities of the sampled tokens only, which estimate the reverse "
                 "Kullback-Leibler divergence, train.beta=1"
             )
+        if self.train.temperature != 1:
+            yield (
+                f"train.temperature={self.train.temperature:g} with teacher_server.url: the "
+                "estimate of the divergence is right for tokens that are sampled at "
+                "train.temperature=1 only"
+            )
 
 
 @dataclass

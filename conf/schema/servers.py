@@ -85,13 +85,15 @@ class TeacherServerConfig(ServersConfig):
 
 @dataclass
 class SamplingServerConfig(ServersConfig):
-    """Servers that sample the responses of a student that `train.distill` trains."""
+    """Servers that sample the responses of the student in training."""
 
     GROUP: ClassVar[str] = "sampling_server"
 
     model: str = "student"
-    """Name under which the servers load the student's adapters, anew at each step. They serve the
-    student's base."""
+    """Start of the names under which the servers load the student's adapters. Each step has a name
+    of its own. The servers serve the student's base."""
+    concurrency: int = setting(32, least=1)
+    """Number of concurrent requests of each process; each contains the frames of one item."""
     timeout: float = setting(600.0, least=1)
     """Timeout of a request (s)."""
 

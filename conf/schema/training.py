@@ -222,7 +222,7 @@ class BaseTrainConfig(Settings):
     """The vision tower learns to see objects in single pictures."""
     motion: StageConfig = stage(2500, 8, 1e-3)
     """The whole model learns where objects are and where they go."""
-    words: StageConfig = stage(5000, 8, 1e-3)
+    words: StageConfig = stage(4000, 8, 1e-3)
     """The model learns to answer questions in words."""
     weight_decay: float = setting(0.05, least=0)
     """Weight decay of AdamW."""

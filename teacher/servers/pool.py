@@ -7,10 +7,12 @@ request fails only if servers that answer other requests do not answer it.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import random
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -94,13 +96,28 @@ class ServerPool:
         """Load adapters on every server under the name `cfg.model`.
 
         Raises:
-            NoResponseError: A server cannot load them, or is not available.
+            NoResponseError: A server cannot load them, or was not available for
+                `cfg.unreachable_timeout` seconds.
             UserError: A server loads no adapters, or rejects the API key.
         """
-        try:
-            await asyncio.gather(*(server.load_adapter(folder) for server in self.servers))
-        except RequestError as error:
-            raise NoResponseError(str(error)) from error
+        await asyncio.gather(*(self._load_adapter(server, folder) for server in self.servers))
+
+    async def _load_adapter(self, server: ServerClient, folder: Path) -> None:
+        end = time.monotonic() + self.cfg.unreachable_timeout
+        for failures in itertools.count(1):
+            try:
+                return await server.load_adapter(folder)
+            except RequestError as error:
+                if isinstance(error, RefusedError) or time.monotonic() > end:
+                    raise NoResponseError(f"{server.url}: {error}") from error
+            await asyncio.sleep(random_pause(failures))
+
+    async def unload_adapter(self, name: str) -> None:
+        """Unload the adapters with a name on every server that has them."""
+        for server in self.servers:
+            # A server that was started again does not have them.
+            with suppress(RequestError):
+                await server.unload_adapter(name)
 
     async def _request(self, send: Callable[[ServerClient], Awaitable[Reply]]) -> Reply:
         """Return the reply of the first server that answers a request."""

@@ -117,7 +117,13 @@ class ServerClient:
                 model=self.cfg.model, prompt=list(token_ids), echo=True, logprobs=0, max_tokens=0
             )
             found = completion.choices[0].logprobs
-            if found is None or len(found.token_logprobs or ()) != len(token_ids):
+            count = len(token_ids)
+            if (
+                found is None
+                or len(found.tokens or ()) != count
+                or len(found.token_logprobs or ()) != count
+                or None in found.token_logprobs[1:]
+            ):
                 raise UserError(
                     f"{self.url} returns no log-probabilities of prompts: serve the model with a "
                     "server that answers completions with echo and logprobs, such as vLLM",
@@ -128,23 +134,36 @@ class ServerClient:
         return await self._translate_errors(request)
 
     async def load_adapter(self, folder: Path) -> None:
-        """Load adapters under the name `cfg.model`, instead of earlier ones with this name.
+        """Load adapters under the name `cfg.model`.
 
         Raises:
             RequestError: The request failed.
             UserError: The server loads no adapters, or rejects the API key.
         """
-        body = {"lora_name": self.cfg.model, "lora_path": str(folder), "load_inplace": True}
+        await self._change_adapters("load", {"lora_name": self.cfg.model, "lora_path": str(folder)})
 
+    async def unload_adapter(self, name: str) -> None:
+        """Unload the adapters with a name. It raises the errors of `load_adapter`."""
+        await self._change_adapters("unload", {"lora_name": name})
+
+    async def _change_adapters(self, action: str, body: dict[str, str]) -> None:
         async def request() -> None:
             try:
-                await self.client.post("/load_lora_adapter", cast_to=str, body=body)
+                await self.client.post(f"/{action}_lora_adapter", cast_to=str, body=body)
+            except openai.AuthenticationError:
+                raise
             except openai.NotFoundError as error:
+                # vLLM also answers 404 if it finds no adapters in the folder.
+                if body["lora_name"] in error.message:
+                    raise RefusedError(error.message) from error
                 raise UserError(
                     f"{self.url} loads no adapters while it runs: start it with python -m "
                     "teacher.serve frames=true adapter_rank=RANK",
                     code="no-adapters",
                 ) from error
+            except openai.APIStatusError as error:
+                # For adapters that do not fit, vLLM answers 500 with the reason.
+                raise RefusedError(error.message) from error
 
         await self._translate_errors(request)
 

@@ -36,7 +36,9 @@ class ResponseSampler:
         train: DistillTrainConfig | ReinforceTrainConfig,
     ) -> None:
         self._processor, self._precision = processor, train.precision
-        self._sampling = replace(student, temperature=train.temperature, top_p=1.0, top_k=0)
+        self._sampling = replace(
+            student, temperature=train.temperature, top_p=1.0, top_k=0, thinking=False
+        )
         self._collate = Collator(processor, student.max_length)
         # The model would expect pixels for such a token in a response.
         self._never = [processor.image_token_id, processor.video_token_id]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import tempfile
+import uuid
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import peft
@@ -75,34 +76,50 @@ class ServedSampler(ResponseSampler):
         self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]
     ) -> list[GeneratedText]:
         texts = [GeneratedText("") for _ in prompts]
-        async with ServerPool(self._servers, {}) as pool:
-            try:
-                # The other ranks wait until the main rank has given the adapters to the servers.
-                with main_first():
-                    if rank() == 0:
-                        await pool.load_adapter(self._save_adapters(model))
+        try:
+            # The other ranks wait until the main rank has given the adapters to the servers.
+            with main_first():
+                if rank() == 0:
+                    await self._replace_adapters(model)
+            (adapters,) = self._list_adapters()
+            async with self._connect(adapters.name) as pool:
 
                 async def respond(index: int) -> None:
                     texts[index] = await self._request(pool, prompts[index], seeds[index])
 
                 await run_limited(range(len(prompts)), self._servers.concurrency, respond)
-            except NoResponseError as error:
-                raise UserError(
-                    f"the servers of sampling_server.url sample no responses ({error}): correct "
-                    "the cause and run the same command again, which resumes",
-                    code="no-response",
-                ) from error
+        except NoResponseError as error:
+            raise UserError(
+                f"the servers of sampling_server.url sample no responses ({error}): correct the "
+                "cause and run the same command again, which resumes",
+                code="no-response",
+            ) from error
         return texts
 
-    def _save_adapters(self, model: nn.Module) -> Path:
-        """Save the adapters of a step in a new folder, and delete those of the step before."""
+    def _connect(self, name: str) -> ServerPool:
+        return ServerPool(replace(self._servers, model=name), {})
+
+    def _list_adapters(self) -> list[Path]:
+        return [path for path in self._folder.iterdir() if path.is_dir()]
+
+    async def _replace_adapters(self, model: nn.Module) -> None:
+        """Save the adapters of this step and load them on the servers, and remove those of the step
+        before.
+
+        Each step has a new name: vLLM caches prefixes by the name of the adapters, and runs that
+        share a server do not replace each other's adapters.
+        """
         assert isinstance(model, peft.PeftModel)
-        shutil.rmtree(self._folder, ignore_errors=True)
-        self._folder.mkdir()
-        # vLLM would reuse the cached prefixes of earlier weights from the same folder.
-        folder = Path(tempfile.mkdtemp(dir=self._folder))
-        model.save_pretrained(folder)
-        return folder
+        self._folder.mkdir(exist_ok=True)
+        earlier = self._list_adapters()
+        folder = self._folder / f"{self._servers.model}-{uuid.uuid4().hex[:12]}"
+        # By default, PEFT looks up the base on the hub to find out whether its table has grown.
+        model.save_pretrained(folder, save_embedding_layers=False)
+        async with self._connect(folder.name) as pool:
+            await pool.load_adapter(folder)
+            for path in earlier:
+                await pool.unload_adapter(path.name)
+                shutil.rmtree(path)
 
     async def _request(self, pool: ServerPool, prompt: Sample, seed: int) -> GeneratedText:
         fields = sampling_fields(self._sampling, self._sampling.max_new_tokens, prompt.clip)
