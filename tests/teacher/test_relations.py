@@ -28,9 +28,12 @@ from teacher.predicates.relations import (
     flip_relation,
     normalize_relation,
 )
+from teacher.servers.responses import Response
 from teacher.sufficiency import find_predicted, measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
+from teacher.validation.grader import RationaleGrader
 from teacher.validation.validator import validate_rationale
+from teacher.vocabulary import choose_vocabulary
 from teacher.writers.relational import RelationalWriter
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
@@ -492,3 +495,19 @@ def test_the_widest_place_is_that_of_an_object_seen_at_the_cut() -> None:
         assert place.objects[0] in seen
         compared = list_compared(choose_statements(predicates), predicates)
         assert not compared or any(s.kind == "region" for s in compared)
+
+
+def test_a_rationale_that_does_not_decide_a_decidable_item_is_insufficient() -> None:
+    """The paper's words decide fewer items than relations."""
+    reasons = {"paper": set(), "relational": set()}
+    for item, predicates in random_cases(60, BOUNDS):
+        for vocabulary, found in reasons.items():
+            cfg = TeacherConfig(name="t", predicates=vocabulary, sufficient=True)
+            text = write_rationale(choose_vocabulary(predicates, cfg), item, 0)
+            graded = RationaleGrader(cfg).grade(Response(text), predicates, item, 0)
+            assert graded.accepted == (graded.sufficiency == 1)
+            assert graded.undecided == ("undecided" in graded.reasons)
+            found |= {(item.item_id, reason) for reason in graded.reasons}
+    insufficient = {i for i, reason in reasons["paper"] if reason == "insufficient"}
+    assert insufficient
+    assert not {i for i, reason in reasons["relational"] if reason == "insufficient"}

@@ -60,6 +60,27 @@ def test_figures_equal_counts_by_hand():
     assert figures["requests"] == 0
 
 
+def test_sufficiency_is_a_mean_by_family_and_difficulty():
+    kinds = [("event", None), ("window", "easy"), ("window", "hard"), ("window", "hard")]
+    items = [
+        replace(item, family=family, difficulty=difficulty)
+        for item, (family, difficulty) in zip(ITEMS, kinds, strict=False)
+    ]
+    responses = [
+        response(k, 0, sufficiency=value, undecided=value == 0.25)
+        for k, value in enumerate((1.0, 1.0, 0.25, 0.5))
+    ]
+    figures = summarize(items, {r.item_id: [r] for r in responses})
+    assert figures["sufficiency"] == {
+        "all": [0.6875, 0.5, 4],
+        "event": [1, 1, 1],
+        "window": [pytest.approx(1.75 / 3), pytest.approx(1 / 3), 3],
+        "window, easy": [1, 1, 1],
+        "window, hard": [0.375, 0, 2],
+    }
+    assert figures["undecided"] == 1
+
+
 def test_claims_are_summed_and_shown_as_shares():
     figures = figures_of(
         response(0, 0, claims={"direction": [3, 0, 1]}),

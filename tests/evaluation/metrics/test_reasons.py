@@ -14,6 +14,7 @@ from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.reasons import ReasonSummary, measure_reasons, read_reasons
 from evaluation.reporting.item_browser import mark_claims
 from evaluation.reporting.run_responses import parse_response
+from evaluation.reporting.tables import reason_table
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.relations import Bounds
@@ -53,6 +54,20 @@ def test_true_rationales_give_true_reasons(micro_store, rationales) -> None:
         assert part.contradicted.value == 0
         assert part.supported.value > 0.8
         assert part.claims.value > 1
+
+
+def test_the_table_has_a_row_for_the_answers_and_one_for_each_part(micro_store, rationales) -> None:
+    summary = summarize(rationales, micro_store, [item.letter for item, _ in rationales])
+    table = reason_table({"narrator": summary})
+    answers, *parts = table.groups[""]
+    assert answers["name"] == "narrator"
+    assert (answers["Follows"].value, answers["True reasons"].value) == (1, 1)
+    assert answers["Items"] == len(rationales)
+    assert [row["name"].strip() for row in parts] == [*PARTS]
+    for row in parts:
+        found = summary.parts[row["name"].strip()]
+        assert row["Claims"].startswith(f"{found.claims.value:.1f} [")
+        assert (row["Supported"], row["Contradicted"]) == (found.supported, found.contradicted)
 
 
 def test_answer_that_the_analysis_does_not_give_does_not_follow(micro_store, rationales) -> None:
