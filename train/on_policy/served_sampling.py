@@ -1,4 +1,4 @@
-"""Sample the responses of a student on vLLM servers, which load its adapters anew at each step."""
+"""Sample the responses of a student on vLLM servers, which load its adapters at each step."""
 
 from __future__ import annotations
 
