@@ -55,7 +55,7 @@ REMEDIES: Mapping[str, str] = {
     NO_PLACE: "lower objects.scale or objects.max_count, raise start.speed, or move the camera or "
     "the parts",
     TOO_MANY: "raise start.max_collisions or set it to null",
-    FALLEN: "raise physics.substeps, or lower start.speed or start.height",
+    FALLEN: "raise physics.substeps, or lower start.speed, start.height or physics.gravity",
 }
 """What to change in the world, by the reason for which most samples were rejected."""
 
@@ -130,13 +130,14 @@ def check_sample(sample: Sample, world: WorldConfig) -> None:
     motion, most = sample.motion, world.start.max_collisions
     if motion.touching_at_start:
         raise RejectedError(OVERLAP)
+    # Objects that fall through the floor often miss all others, so that this is checked before the
+    # collisions. NaN counts as fallen.
+    if not (motion.positions[..., 2] > LOWEST).all():
+        raise RejectedError(FALLEN)
     if not motion.collisions:
         raise RejectedError(NO_COLLISION)
     if most is not None and len(motion.collisions) > most:
         raise RejectedError(TOO_MANY)
-    # NaN counts as fallen.
-    if not (motion.positions[..., 2] > LOWEST).all():
-        raise RejectedError(FALLEN)
 
 
 def format_scene_id(seed: int, index: int) -> str:

@@ -28,7 +28,7 @@ from conf.schema.world import (
     ObjectsConfig,
     StartConfig,
 )
-from data.build import check_quota_names, ensure_items
+from data.build import check_quota_names, ensure_items, world_changes
 from data.parallel import Workers
 from data.records import FPS, FRAMES, SPEED_BOUNDS, SceneObject
 from data.render.bullet import BulletRenderer
@@ -159,6 +159,30 @@ def test_identity_contains_the_world(world_store: Store) -> None:
     assert replace(world_store, manifest=changed).identity != world_store.identity
 
 
+def test_standard_world_is_no_part_of_the_identity() -> None:
+    """Benchmarks of the world clevrer keep the identity that they had without worlds."""
+    cfg = compose("data.build", BuildCommand, ["benchmark=tiny", "world=clevrer"]).benchmark
+    assert world_changes(cfg.world) == {}
+
+
+@pytest.mark.parametrize(
+    ("index", "collisions", "last_places"),
+    [
+        (0, [45, 60], [[-0.6318, -1.6439], [-0.9185, -0.7244], [-2.3619, -2.2223],
+                       [-2.7528, -2.2490], [0.4133, 1.2634], [-1.3834, 1.3038]]),
+        (1, [12, 89], [[-0.1486, -1.8600], [-0.8891, -1.1464], [-0.9602, -0.4050],
+                       [0.1618, 0.2448], [1.1275, -0.4233]]),
+    ],
+)  # fmt: skip
+def test_scenes_of_the_standard_world_never_change(
+    index: int, collisions: list[int], last_places: list[list[float]]
+) -> None:
+    """Benchmarks of the world clevrer can be built again only if its scenes stay the same."""
+    scene = simulate_scene(0, index)
+    assert [c.frame for c in scene.collisions] == collisions
+    np.testing.assert_allclose(scene.positions[-1, :, :2], last_places, atol=1.1e-4)
+
+
 @pytest.fixture(scope="module", params=["movi_a", "physion"])
 def standin(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Store:
     """A benchmark of the preset's stand-in, with fewer scenes and items than the preset."""
@@ -216,6 +240,20 @@ def test_frames_have_the_light_and_floor_of_their_world(standin: Store) -> None:
             {"parts": {"wall": PartConfig([4.0, 0.0, 2.0])}},
             "benchmark.world.parts.wall",
         ),
+        (
+            {"parts": {"wall": PartConfig([-1.0, 0.0, 0.2])}},
+            "benchmark.world.parts.wall reaches 0.30 below the floor",
+        ),
+        (
+            {
+                "physics": PhysicsConfig(substeps=1, gravity=900.0),
+                "objects": ObjectsConfig(min_count=2, max_count=2),
+                "start": StartConfig(
+                    kind="throw", area=[-1.5, -1.2, 0.2, 1.2], height=[0.5, 1.0], at_rest=0.0
+                ),
+            },
+            "falls through the floor: raise physics.substeps",
+        ),
     ],
 )
 def test_world_without_suitable_scenes_is_refused(world: dict[str, Any], key: str) -> None:
@@ -253,6 +291,8 @@ def test_world_whose_objects_are_all_hidden_is_refused(tmp_path: Path) -> None:
                                objects=ObjectsConfig(max_count=7))}, "objects.max_count=7"),
         ({"world": WorldConfig(floor=[1.0, 2.0, 3.0]), "renderer": "blender"}, "floor colour"),
         ({"recipe": "movi_a", "retrieval": COUNTERFACTUALS}, "retrieval.counterfactual"),
+        ({"recipe": "movi_a", "distractors": "balanced"}, "distractors=balanced"),
+        ({"simulator": "clevrer", "distractors": "balanced"}, "distractors=balanced"),
         ({"world": WorldConfig(physics=PhysicsConfig(fps=30))}, "world.physics.fps=30"),
         ({"world": WorldConfig(parts={"ramp": PartConfig(tilt=60.0)})}, "world.parts.ramp.tilt=60"),
         ({"world": WorldConfig(camera=CameraConfig([1.0, 0.0, -1.0]))}, "not above the floor"),
