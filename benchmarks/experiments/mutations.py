@@ -31,7 +31,14 @@ from data.records import COLORS, LETTERS
 from data.store import open_store
 from teacher.narrator import write_rationale
 from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.facts import COMPASS, REGIONS, SPEEDS, VERY_FAST, Predicates
+from teacher.predicates.facts import (
+    COMPASS,
+    REGIONS,
+    SPEEDS,
+    VERY_FAST,
+    Predicates,
+    RelationalPredicates,
+)
 from teacher.predicates.relations import Bounds
 from teacher.validation.claim_extraction import extract_claims
 
@@ -214,6 +221,13 @@ EXTREMES = {
     "leftmost": "rightmost", "rightmost": "leftmost", "topmost": "lowest", "lowest": "topmost"
 }  # fmt: skip
 
+# An object that is far off is also clearly off.
+FALSE_EXTENTS = {
+    "slightly": ["clearly", "far"],
+    "clearly": ["slightly", "far"],
+    "far": ["slightly"],
+}
+
 
 def replace_extremes(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
     for match in re.finditer(rf"(?<!not )\b(?:{'|'.join(EXTREMES)})\b", text):
@@ -244,6 +258,27 @@ def unbalance_distances(text: str, predicates: Predicates, rng: Random) -> Itera
 def replace_edges(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
     for match in re.finditer(rf"(?<=reaches the )({'|'.join(OPPOSITE_EDGES)})(?= edge)", text):
         yield replace_match(text, match, OPPOSITE_EDGES[match[0]])
+
+
+def replace_passed(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    """In "a moves past b" or "a crosses behind b", replace b by an object that a does not pass."""
+    if not isinstance(predicates, RelationalPredicates):
+        return
+    passed = {r.objects for r in predicates.target.statements if r.kind == "passing"}
+    verbs = "moves past|crosses in front of|crosses behind"
+    for match in re.finditer(rf"({OBJECT}) (?:{verbs}) (?=({OBJECT}))", text, re.IGNORECASE):
+        mover, other = (name[len("the ") :] for name in match.groups())
+        free = [n for n in predicates.paths if n not in (mover, other) and (mover, n) not in passed]
+        if free:
+            start, stop = match.span(2)
+            name = f"the {rng.choice(free)}"
+            yield text[:start] + name + text[stop:], (start, start + len(name))
+
+
+def replace_extents(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+    """Replace "slightly", "clearly" or "far" before "off" by a word that is false."""
+    for match in re.finditer(rf"\b(?:{'|'.join(FALSE_EXTENTS)})(?= off\b)", text):
+        yield replace_match(text, match, rng.choice(FALSE_EXTENTS[match[0]]))
 
 
 def show_unseen(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
@@ -290,6 +325,8 @@ RELATION_MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutat
     "as near": unbalance_distances,
     "extreme": replace_extremes,
     "edge": replace_edges,
+    "passing": replace_passed,
+    "distance": replace_extents,
     "sight": show_unseen,
 }
 """The same for words of relations, which only relational rationales have."""

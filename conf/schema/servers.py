@@ -125,16 +125,25 @@ class RelationBounds(Settings):
     edge: float = setting(0.06, above=0, below=0.5)
     """Distance from the image's edge, as a share of its width or height, below which an object has
     reached the edge."""
-    # Objects are clearly off from 40 of 336 px, which is just below 0.12.
-    far: float = setting(0.25, above=0.12, below=1)
+    # The paper's vocabulary has the same bounds: 12 and 40 pixels of an image of 336 pixels.
+    displaced: float = setting(12 / 336, above=0)
     """Distance of an object in a candidate from its place at the target, as a share of the image,
-    from which it is "far off" rather than "clearly off"."""
+    from which it is "slightly off"."""
+    clearly: float = setting(40 / 336, above=0)
+    """Distance, as above, from which it is "clearly off"."""
+    far: float = setting(0.25, above=0, below=1)
+    """Distance, as above, from which it is "far off"."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         if self.against >= self.near:
             yield (
                 f"{group}against={self.against:g} and {group}near={self.near:g}: objects against "
                 "each other are nearer than near ones, so against must be less"
+            )
+        if not self.displaced < self.clearly < self.far:
+            yield (
+                f"{group}displaced={self.displaced:g}, {group}clearly={self.clearly:g} and "
+                f"{group}far={self.far:g}: each must be greater than the one before"
             )
 
 

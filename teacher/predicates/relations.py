@@ -88,19 +88,23 @@ class Bounds(NamedTuple):
     edge: float = 0.06
     """Distance from the image's edge, as a share of its width or height, below which an object has
     reached the edge."""
-    far: float = 0.25
+    displaced: float = DISPLACED / IMAGE_SIZE
     """Distance of an object in a candidate from its place at the target, as a share of the image,
-    from which it is "far off" rather than "clearly off"."""
+    from which it is "slightly off"."""
+    clearly: float = CLEARLY / IMAGE_SIZE
+    """Distance, as above, from which it is "clearly off"."""
+    far: float = 0.25
+    """Distance, as above, from which it is "far off"."""
 
 
 def describe_distance(distance: float, bounds: Bounds) -> str | None:
     """Return how far an object is off if its place is at a distance (share of the image's width)
     from the expected place: slightly, clearly or far; None if it counts as being there."""
-    if distance < DISPLACED / IMAGE_SIZE:
+    if distance < bounds.displaced:
         return None
     if distance >= bounds.far:
         return "far"
-    return "clearly" if distance >= CLEARLY / IMAGE_SIZE else "slightly"
+    return "clearly" if distance >= bounds.clearly else "slightly"
 
 
 def flip_relation(relation: Relation) -> Relation:

@@ -152,7 +152,8 @@ def test_false_word_is_contradicted(rationales, source, kind):
 
 def add_rare_statements(text, predicates):
     """Add true statements that few rationales have: extremes, what is between what and what covers
-    what to the prediction, and which edges objects reach to the motion analysis."""
+    what to the prediction, and what objects pass and which edges they reach to the motion
+    analysis."""
     true = sorted(predicates.target.statements)
     extremes = [f" The {s.objects[0]} will be {s.value}." for s in true if s.kind == "extreme"]
     between = [
@@ -166,7 +167,10 @@ def add_rare_statements(text, predicates):
         if s.kind == "cover"
     ]
     edges = [f" The {s.objects[0]} {s.value}." for s in true if s.kind == "edge"]
-    text = text.replace("\nPrediction:", f"{''.join(edges)}\nPrediction:")
+    passed = [
+        f" The {s.objects[0]} {s.value} the {s.objects[1]}." for s in true if s.kind == "passing"
+    ]
+    text = text.replace("\nPrediction:", f"{''.join(edges + passed)}\nPrediction:")
     return text.replace(
         "\nCandidate analysis:", f"{''.join(extremes + between + covers)}\nCandidate analysis:"
     )

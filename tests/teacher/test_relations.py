@@ -396,6 +396,8 @@ def test_bounds_of_the_settings_are_those_of_the_predicates() -> None:
     assert Bounds(**asdict(RelationBounds())) == Bounds()
     [problem] = TeacherConfig(name="t", bounds=RelationBounds(against=2.0)).check("teacher.")
     assert "teacher.bounds.against=2" in problem
+    [problem] = TeacherConfig(name="t", bounds=RelationBounds(clearly=0.3)).check("teacher.")
+    assert "teacher.bounds.clearly=0.3 and teacher.bounds.far=0.25" in problem
 
 
 def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement() -> None:
@@ -438,6 +440,12 @@ def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement()
 )  # fmt: skip
 def test_distances_have_the_words_of_their_bounds(distance: float, extent: str | None) -> None:
     assert describe_distance(distance, BOUNDS) == extent
+
+
+def test_bounds_of_distances_are_settings() -> None:
+    near = BOUNDS._replace(displaced=0.01, clearly=0.02, far=0.03)
+    words = [describe_distance(distance, near) for distance in (0.005, 0.015, 0.025, 0.035)]
+    assert words == [None, "slightly", "clearly", "far"]
 
 
 def test_only_displaced_objects_are_off() -> None:
