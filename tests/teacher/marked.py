@@ -1,8 +1,12 @@
-"""Rationales whose claims were marked by hand, and the items that they are about."""
+"""Rationales whose claims were marked by hand, and the items that they are about.
+
+python -m tests.teacher.marked      # prints the reader's verdicts on true and on false claims
+"""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -12,6 +16,7 @@ from data.records import Scene, SelectionItem
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates
 from teacher.predicates.relations import Bounds
+from teacher.validation.claim_extraction import extract_claims
 from tests.data.simulated import simulate_scene
 from tests.teacher import synthetic
 
@@ -54,3 +59,30 @@ def read_marked() -> list[dict[str, Any]]:
     """Return the rationales, each with `item`, `text` and `claims`. A claim has the words that
     state it (`quote`), what it is about (`part`), and whether it is true (`truth`)."""
     return [json.loads(line) for line in FILE.read_text(encoding="utf-8").splitlines()]
+
+
+@cache
+def verdicts_by_truth() -> dict[bool, Counter[str]]:
+    """The verdicts of the reader on the marked claims that are true, and on those that are false.
+    A claim is "missed" if the reader finds no claim in its words."""
+    items = {item.item_id: predicates for item, predicates in marked_items()}
+    counts = {True: Counter(), False: Counter()}
+    for rationale in read_marked():
+        claims = extract_claims(rationale["text"], items[rationale["item"]])
+        for marked in rationale["claims"]:
+            start = rationale["text"].index(marked["quote"])
+            stop = start + len(marked["quote"])
+            inside = {
+                c.verdict
+                for c in claims
+                if start <= c.span[0] < stop and c.kind not in ("mention", "agrees")
+            }
+            worst = next((v for v in ("contradicted", "unknown", "supported") if v in inside), None)
+            counts[marked["truth"]][worst or "missed"] += 1
+    return counts
+
+
+if __name__ == "__main__":
+    for truth, verdicts in verdicts_by_truth().items():
+        found = ", ".join(f"{verdict} {count}" for verdict, count in verdicts.most_common())
+        print(f"{verdicts.total()} {'true' if truth else 'false'} claims: {found}")

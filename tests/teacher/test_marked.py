@@ -2,34 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from functools import cache
-
 import pytest
 
-from teacher.validation.claim_extraction import extract_claims
-from tests.teacher.marked import marked_items, read_marked
-
-
-@cache
-def verdicts_by_truth() -> dict[bool, Counter[str]]:
-    """The verdicts of the reader on the marked claims that are true, and on those that are false.
-    A claim is "missed" if the reader finds no claim in its words."""
-    items = {item.item_id: predicates for item, predicates in marked_items()}
-    counts = {True: Counter(), False: Counter()}
-    for rationale in read_marked():
-        claims = extract_claims(rationale["text"], items[rationale["item"]])
-        for marked in rationale["claims"]:
-            start = rationale["text"].index(marked["quote"])
-            stop = start + len(marked["quote"])
-            inside = {
-                c.verdict
-                for c in claims
-                if start <= c.span[0] < stop and c.kind not in ("mention", "agrees")
-            }
-            worst = next((v for v in ("contradicted", "unknown", "supported") if v in inside), None)
-            counts[marked["truth"]][worst or "missed"] += 1
-    return counts
+from tests.teacher.marked import marked_items, read_marked, verdicts_by_truth
 
 
 @pytest.mark.slow
