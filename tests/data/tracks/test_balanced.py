@@ -414,17 +414,23 @@ def test_logistic_model_finds_a_shortcut_and_nothing_without_one() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("world", ["ramp", "screen"])
-def test_alternatives_keep_the_laws_of_worlds_with_parts(tmp_path: Path, world: str) -> None:
+@pytest.mark.parametrize(
+    "world", ["dusk", "falling", "masses", "near", "ramp", "screen", "settling"]
+)
+def test_alternatives_keep_the_laws_of_every_world(tmp_path: Path, world: str) -> None:
     cfg = compose("data.build", BuildCommand, ["benchmark=tiny_balanced", f"world={world}"])
     few = settings("few")
     cfg = replace(cfg.benchmark, scenes=16, selection=few.selection, retrieval=few.retrieval)
     store = ensure_items(cfg, tmp_path, Workers(1))
     items = store.selection()
     assert {i.family for i in items} == {"event", "time", "window"}
+    assert {i.distractors for i in items} == {"alternative"}
     for item in items:
+        own = store.scene(item.scene_id)
         for candidate in item.candidates:
             scene = store.scene(candidate.scene_id)
+            past = slice(item.prefix_stop + 1)
+            np.testing.assert_array_equal(scene.positions[past], own.positions[past])
             assert scene.positions[..., 2].min() > 0.1
             for box in world_boxes(cfg.world):
                 local = (scene.positions - box.position) @ rotation_matrix(box.quaternion)
