@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import erf, hypot, sqrt
+from math import dist, erf, hypot, prod, sqrt
 
 import numpy as np
 
@@ -26,8 +26,8 @@ UNSEEN_DISTANCE = 0.3
 UNKNOWN_PATH = 1.0
 """Path that is assumed for an object that is not visible both at the cut and at the target."""
 CLEARER = 1.25
-"""A second statement is added to one that suffices if the right answer becomes at least this many
-times as likely."""
+"""A place that needs further statements is preferred to one that decides alone if a reader finds
+the target at least this many times as likely by it."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class Decision:
     """Statements that decide an item.
 
     Attributes:
-        statements: Statements that exclude as many distractors as possible.
+        statements: Statements that exclude as many distractors as possible. The first one says
+            where an object is if any object is in view both at the cut and at the target.
         rivals: Letters of the distractors of which all statements about the target's frame are
             true.
     """
@@ -43,18 +44,25 @@ class Decision:
     statements: tuple[Relation, ...]
     rivals: tuple[str, ...]
 
+    @property
+    def place(self) -> Relation | None:
+        """The statement that says where the object is by whose place a reader finds the target."""
+        first = self.statements[:1]
+        return first[0] if first and first[0].kind == "region" else None
+
 
 def choose_statements(predicates: RelationalPredicates) -> Decision:
-    """Choose a smallest set of statements that excludes as many distractors as possible, or two
-    statements instead of one if they are clearer.
+    """Choose the place of an object by which a reader most likely finds the target, and a smallest
+    set of further statements that excludes the other distractors.
 
-    Of the sets of a size, the one is chosen with which a reader most likely finds the target; of
-    equal ones, the first in alphabetical order. This reader sees the places of objects with
-    normally distributed errors, `SEEN_ERROR`, and predicts the target with further errors,
-    `PREDICTED_ERROR`. For relations, the errors count `RELATION_FACTOR` times. The reader finds the
-    target if it finds every statement true of the predicted state and of the target, and one
-    statement false of each distractor. The probabilities of these events are multiplied, as if they
-    were independent.
+    This reader sees the places of objects with normally distributed errors, `SEEN_ERROR`, and
+    predicts the target with further errors, `PREDICTED_ERROR`. It compares the places of one object
+    and chooses the candidate that shows it closest to where it is predicted. A place that excludes
+    all distractors alone is preferred, unless another one is `CLEARER`. Of the sets of further
+    statements of a size, the one is chosen with which the reader most likely finds every statement
+    true of the predicted state and of the target, and one statement false of each distractor. For
+    relations, the errors count `RELATION_FACTOR` times. The probabilities of these events are
+    multiplied, as if they were independent.
     """
     wrong = [view for view in predicates.views if view.letter != predicates.answer]
     statements = [
@@ -70,40 +78,45 @@ def choose_statements(predicates: RelationalPredicates) -> Decision:
     excludes = excludes.reshape(len(statements), len(wrong))
     possible = excludes.any(axis=0)
     rivals = tuple(v.letter for v, excluded in zip(wrong, possible, strict=True) if not excluded)
-    chosen = _choose_set(holds, excludes[:, possible]) if possible.any() else ()
-    return Decision(tuple(statements[k] for k in chosen), rivals)
+    place = _choose_place(predicates, [w for w in wrong if w.letter not in rivals])
+    left = possible & [place is None or place in view.statements for view in wrong]
+    chosen = _choose_set(holds, excludes[:, left]) if left.any() else ()
+    return Decision((*filter(None, [place]), *(statements[k] for k in chosen)), rivals)
 
 
-def list_compared(decision: Decision, predicates: RelationalPredicates) -> tuple[Relation, ...]:
-    """Return the statements with which a rationale compares the candidates: those that decide the
-    item and, before them, the widest place if none of them says where an object is."""
-    statements = decision.statements
-    if statements and not any(s.kind == "region" for s in statements):
-        place = find_widest_place(predicates)
-        return (place, *statements) if place else statements
-    return statements
-
-
-def find_widest_place(predicates: RelationalPredicates) -> Relation | None:
-    """Return where the target shows the object whose places in the candidates are furthest apart,
-    of the objects that are in view at the cut; None if there is no such object."""
+def _choose_place(predicates: RelationalPredicates, wrong: Sequence[View]) -> Relation | None:
+    """Return where the target shows the object by whose places a reader most likely finds the
+    target among these distractors; None if no object is in view both at the cut and at the
+    target."""
     seen = {o.object for o in predicates.objects if o.sight != OUT_OF_VIEW}
+    found = {
+        s: _probability_of_closest(s.objects[0], predicates, wrong)
+        for s in sorted(predicates.target.statements)
+        if s.kind == "region" and s.objects[0] in seen
+    }
+    alone = [s for s in found if not any(s in view.statements for view in wrong)]
+    best, best_alone = (max(some, key=found.__getitem__, default=None) for some in (found, alone))
+    if best_alone is not None and found[best_alone] * CLEARER >= found[best]:
+        return best_alone
+    return best
 
-    def spread(place: Relation) -> float:
-        found = [view.places.image.get(place.objects[0]) for view in predicates.views]
-        points = np.array([p for p in found if p is not None])
-        if not len(points):
-            return 0.0
-        distances = np.hypot(*(points - points.mean(axis=0)).T).tolist()
-        return sum(distances) + UNSEEN_DISTANCE * found.count(None)
 
-    statements = sorted(predicates.target.statements)
-    places = [s for s in statements if s.kind == "region" and s.objects[0] in seen]
-    return max(places, key=spread, default=None)
+def _probability_of_closest(
+    name: str, predicates: RelationalPredicates, wrong: Sequence[View]
+) -> float:
+    """Return the probability that a reader finds the object's place in the target closer to the
+    predicted place than those in these distractors."""
+    path = predicates.paths.get(name, UNKNOWN_PATH)
+    error = hypot(SEEN_ERROR + PREDICTED_ERROR * path, SEEN_ERROR)
+    target = predicates.target.places.image[name]
+    places = [view.places.image.get(name) for view in wrong]
+    distances = [UNSEEN_DISTANCE if p is None else dist(p, target) for p in places]
+    # A distractor is closer if the error along the line to it is above half its distance.
+    return prod(_normal_cdf(d / 2 / error) for d in distances)
 
 
 def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:
-    """Return the indices of the chosen statements.
+    """Return the indices of a smallest set of statements that excludes all distractors.
 
     Args:
         holds: (S,) probability that a reader finds each statement true of the target.
@@ -112,11 +125,11 @@ def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:
     """
     # (S,) and (S, S): probabilities of a right answer with one statement, and with two.
     with_one = holds * excludes.prod(axis=1)
+    if with_one.max():
+        return (int(with_one.argmax()),)
     missed = 1 - excludes
     with_two = np.outer(holds, holds) * (1 - missed[:, None] * missed[None]).prod(axis=2)
     np.fill_diagonal(with_two, 0)
-    if with_one.max() and with_one.max() * CLEARER >= with_two.max():
-        return (int(with_one.argmax()),)
     if with_two.max():
         first, second = divmod(int(with_two.argmax()), len(holds))
         return first, second

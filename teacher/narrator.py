@@ -14,7 +14,7 @@ from teacher.predicates.facts import Predicates, RelationalPredicates
 from teacher.writers.paper import Detail, Writer, join_sentences
 from teacher.writers.relational import RelationalWriter
 
-NARRATOR_VERSION = "11"
+NARRATOR_VERSION = "12"
 SHORT, LONG, RELATIONAL_LONG = 110, 250, 235
 """A rationale with more than LONG words, or RELATIONAL_LONG in the relational vocabulary, is
 written again with less detail, one of fewer than SHORT words with more. RELATIONAL_LONG keeps
@@ -22,9 +22,9 @@ relational rationales shorter on average than those of the paper's vocabulary. S
 the minimum, 80 words (paper, Rationale construction)."""
 BRIEF, SPARSE, FULL = Detail(3, 1, 1, 1), Detail(4, 1, 2, 1), Detail(6, 4, 6, 2)
 RELATIONAL_SPARSE, RELATIONAL_BRIEF = Detail(3, 2, 1, 1), Detail(1, 1, 0, 1, 0)
-RELATIONAL_BRIEFEST = RELATIONAL_BRIEF._replace(compared=False)
+RELATIONAL_BRIEFEST = tuple(RELATIONAL_BRIEF._replace(compared=k) for k in (1, 0))
 """Relational rationales state fewer facts besides those that decide the item. The briefest ones
-state only what is wrong with a candidate."""
+state less of each candidate."""
 
 
 def write_rationale(
@@ -38,7 +38,7 @@ def write_rationale(
     decision = _decide(predicates)
     details, longest = (SPARSE, BRIEF), LONG
     if decision is not None:
-        details = RELATIONAL_SPARSE, RELATIONAL_BRIEF, RELATIONAL_BRIEFEST
+        details = RELATIONAL_SPARSE, RELATIONAL_BRIEF, *RELATIONAL_BRIEFEST
         longest = RELATIONAL_LONG
     for detail in details:
         text = _make_writer(predicates, decision, detail, *keys).text()

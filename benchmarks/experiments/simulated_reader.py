@@ -11,17 +11,16 @@ three readers:
 
     statements   states the topics of the deciding statements as it predicts them, and guesses among
                  the candidates that it sees to agree with all of them
-    distances    says of the places among these statements how far off each candidate is, in the
-                 words of the candidate analysis, and guesses among the candidates that are least
-                 off and, of these, agree with most statements
-    nearest      chooses the candidate whose places differ least from the predicted ones, which
-                 needs no words
+    closest      chooses the candidate that shows the object of the first statement closest to
+                 where it predicts it, as the outcome of a rationale does
+    all places   chooses the candidate whose places of all objects differ least from the predicted
+                 ones
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from math import dist
 from pathlib import Path
 from typing import NamedTuple
@@ -32,14 +31,13 @@ from benchmarks.experiments.experiment import open_benchmark, print_header, prin
 from conf.failures import report_failures
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
-from teacher.deciding import UNKNOWN_PATH, UNSEEN_DISTANCE, choose_statements, list_compared
+from teacher.deciding import UNKNOWN_PATH, UNSEEN_DISTANCE, Decision, choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation
 from teacher.predicates.places import region_at
 from teacher.predicates.relations import (
     Bounds,
     Places,
-    describe_distance,
     find_relations,
     find_topic,
     normalize_relation,
@@ -48,16 +46,16 @@ from teacher.predicates.relations import (
 ERRORS = ((0.0, 0.0), (0.02, 0.0), (0.02, 0.15), (0.02, 0.3), (0.03, 0.4))
 """Standard deviations of the seen places, and of the predicted ones as shares of the paths. Those
 of the tiny base are about 0.02 and 0.3."""
-READERS = ("statements", "distances", "nearest")
+READERS = ("statements", "closest", "all places")
 BOUNDS = Bounds()
 
 
 class Case(NamedTuple):
-    """An item as the reader meets it: the statements that the candidate analysis compares with, the
-    places in its candidates, and the paths of its objects from the cut to the target."""
+    """An item as the reader meets it: the statements that decide it, the places in its candidates,
+    and the paths of its objects from the cut to the target."""
 
     item: SelectionItem
-    statements: tuple[Relation, ...]
+    decision: Decision
     candidates: list[Places]
     paths: dict[str, float]
 
@@ -88,11 +86,11 @@ def read_cases(store: Store) -> Iterator[Case]:
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene, BOUNDS)
         if predicates is None:
             continue
-        statements = list_compared(choose_statements(predicates), predicates)
-        if not statements:
+        decision = choose_statements(predicates)
+        if not decision.statements:
             continue
         candidates = [Places.of(store.scene(c.scene_id), c.frame) for c in item.candidates]
-        yield Case(item, statements, candidates, predicates.paths)
+        yield Case(item, decision, candidates, predicates.paths)
 
 
 def answer(
@@ -107,19 +105,21 @@ def answer(
         displace(places, dict.fromkeys(places.image, seen), ground, rng)
         for places in case.candidates
     ]
-    names = {name for statement in case.statements for name in statement.objects}
-    stated = state_topics(case.statements, find_statements(expected, names))
-    missed = [len(stated - find_statements(places, names)) for places in candidates]
-    placed = [s.objects[0] for s in case.statements if s.kind == "region"]
-    off = [
-        (sum(count_steps(expected, p, name) for name in placed), m)
-        for p, m in zip(candidates, missed, strict=True)
-    ]
-    distances = [distance(expected, places) for places in candidates]
+    statements, place = case.decision.statements, case.decision.place
+    names = {name for statement in statements for name in statement.objects}
+    stated = state_topics(statements, find_statements(expected, names))
+    agrees = [stated <= find_statements(places, names) for places in candidates]
+    if place is None:
+        closest = agrees
+    else:
+        off = [measure_distance(expected, places, place.objects) for places in candidates]
+        closest = [distance == min(off) for distance in off]
+    everything = expected.image.keys() | {n for places in candidates for n in places.image}
+    off = [measure_distance(expected, places, everything) for places in candidates]
     return (
-        probability_of([m == 0 for m in missed], case.item.answer),
-        probability_of([o == min(off) for o in off], case.item.answer),
-        float(np.argmin(distances) == case.item.answer),
+        probability_of(agrees, case.item.answer),
+        probability_of(closest, case.item.answer),
+        float(np.argmin(off) == case.item.answer),
     )
 
 
@@ -127,17 +127,6 @@ def probability_of(chosen: list[bool], answer: int) -> float:
     """Return the probability of an answer if one of the chosen candidates is guessed; of all
     candidates if none is chosen."""
     return chosen[answer] / sum(chosen) if any(chosen) else 1 / len(chosen)
-
-
-def count_steps(expected: Places, places: Places, name: str) -> int:
-    """Return how far off an object is: 0 if it is where it is expected, then 1 slightly, 2 clearly,
-    3 far, and 4 if only one of the frames shows it."""
-    if (name in expected.image) != (name in places.image):
-        return 4
-    if name not in expected.image:
-        return 0
-    extent = describe_distance(dist(expected.image[name], places.image[name]), BOUNDS)
-    return (None, "slightly", "clearly", "far").index(extent)
 
 
 def displace(
@@ -193,13 +182,13 @@ def state_topics(statements: tuple[Relation, ...], found: set[Relation]) -> set[
     return stated
 
 
-def distance(one: Places, other: Places) -> float:
-    """Return the sum of the distances between the places of each object in two frames. An object
-    that only one of them shows counts `UNSEEN_DISTANCE`."""
-    names = one.image.keys() | other.image.keys()
-    both = one.image.keys() & other.image.keys()
+def measure_distance(one: Places, other: Places, names: Collection[str]) -> float:
+    """Return the sum of the distances between the places of objects in two frames. An object that
+    only one of them shows counts `UNSEEN_DISTANCE`."""
+    both = one.image.keys() & other.image.keys() & {*names}
+    either = (one.image.keys() | other.image.keys()) & {*names}
     return sum(dist(one.image[name], other.image[name]) for name in both) + UNSEEN_DISTANCE * (
-        len(names) - len(both)
+        len(either) - len(both)
     )
 
 

@@ -218,11 +218,11 @@ def stage(steps: int, batch: int, lr: float) -> StageConfig:
 
 @dataclass
 class BaseTrainConfig(Settings):
-    eyes: StageConfig = stage(3000, 8, 2e-3)
+    eyes: StageConfig = stage(4000, 8, 2e-3)
     """The vision tower learns to see objects in single pictures."""
     motion: StageConfig = stage(2500, 8, 1e-3)
     """The whole model learns where objects are and where they go."""
-    words: StageConfig = stage(4000, 8, 1e-3)
+    words: StageConfig = stage(4000, 8, 8e-4)
     """The model learns to answer questions in words."""
     weight_decay: float = setting(0.05, least=0)
     """Weight decay of AdamW."""

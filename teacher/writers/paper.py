@@ -35,9 +35,10 @@ class Detail(NamedTuple):
     """Pairs of objects in each section."""
     relations: int = 1
     """Relations in the scene parse, and changes of relations in the motion analysis."""
-    compared: bool = True
-    """Whether the candidate analysis of a relational text states more of a candidate than what is
-    wrong: the true statements before it, and how far places are off."""
+    compared: int = 2
+    """What the candidate analysis of a relational text states of a candidate: all deciding
+    statements up to the first false one (2); of a distractor only the false one (1); and of the
+    target only the first (0)."""
 
 
 def most_discriminative_object(predicates: Predicates) -> ObjectFacts:

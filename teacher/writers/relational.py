@@ -9,7 +9,7 @@ from importlib.resources import files
 
 import yaml
 
-from teacher.deciding import Decision, list_compared
+from teacher.deciding import Decision
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
@@ -57,10 +57,10 @@ def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> Re
 class RelationalWriter(Writer):
     """Writes the sections of a rationale from relational predicates.
 
-    The prediction begins with the statements that decide the item (see `teacher.deciding`). If none
-    of them says where an object is, the place of the object whose places in the candidates differ
-    most comes first. The candidate analysis compares each candidate with these statements only, and
-    says how far off the places are. Other objects that are out of view at the cut are left out.
+    The prediction begins with the statements that decide the item (see `teacher.deciding`). The
+    candidate analysis says what each candidate shows in the respects of these statements only. The
+    outcome names the candidate that shows the object of the first statement closest to its place.
+    Other objects that are out of view at the cut are left out.
     """
 
     facts: RelationalPredicates
@@ -73,18 +73,17 @@ class RelationalWriter(Writer):
         *keys: int | str,
         padded: bool = False,
     ) -> None:
-        statements = list_compared(decision, facts)
-        named = {name for s in statements for name in s.objects}
+        named = {name for s in decision.statements for name in s.objects}
         super().__init__(leave_out_unseen(facts, named), detail, *keys, padded=padded)
         self.rank = {o.object: k for k, o in enumerate(self.ranked)}
         # Regions come first. "No red cube and the blue sphere near the top" would deny both, and in
         # "the red cube with the blue sphere left of it and near the top", either could be near the
         # top.
         self.statements = sorted(
-            (self.orient(s) for s in statements),
+            (self.orient(s) for s in decision.statements),
             key=lambda s: (s.kind == "sight", s.kind in SYMMETRIC, s.kind != "region"),
         )
-        self.deciding = set(decision.statements)
+        self.place_of_target = decision.place
         # The objects of the deciding statements come first in every section.
         self.ranked = sorted(self.ranked, key=lambda o: o.object not in named)
         self.view_of = {view.letter: view for view in facts.views}
@@ -138,7 +137,7 @@ class RelationalWriter(Writer):
         """Return a statement as the object of "shows"."""
         return f"the {relation.objects[0]} {self.attribute(relation)}"
 
-    def all_shown(self, statements: Sequence[Relation], view: View) -> str:
+    def all_shown(self, statements: Sequence[Relation]) -> str:
         """Return statements that are true of a candidate as the object of "shows"."""
         text, subject = "", None
         for s in statements:
@@ -149,22 +148,34 @@ class RelationalWriter(Writer):
                 # In "between the cube and the sphere and with the cylinder left of it", "it" would
                 # be the sphere.
                 subject = s.objects[0] if len(s.objects) == 1 or s.kind in SYMMETRIC else None
-            part += self.offset(s, view)
             separator = ", and " if "," in text + part else " and "
             text = f"{text}{separator}{part}" if text else part
         return text
 
-    def offset(self, s: Relation, view: View) -> str:
-        """Return how far a candidate shows an object from its place at the target, if the statement
-        says where it is."""
+    def offset(self, s: Relation, view: View) -> str | None:
+        """Return how far a candidate shows an object from its place at the target, such as
+        "slightly off"; None if the statement is not about a place, or if the object is there."""
         target, shown = self.facts.target.places.image, view.places.image
         name = s.objects[0]
-        if not self.detail.compared or s.kind != "region":
-            return ""
-        if name not in target or name not in shown:
-            return ""
+        if s.kind != "region" or name not in target or name not in shown:
+            return None
         extent = describe_distance(math.dist(shown[name], target[name]), self.facts.bounds)
-        return f", {extent} off" if extent else ""
+        return extent and f"{extent} off"
+
+    def find_closest(self, views: Sequence[View]) -> str | None:
+        """Return the letter of the candidate that shows the object of the first statement closest
+        to its place at the target; None if this statement is not about a place, or if another
+        candidate shows it about as close."""
+        if self.place_of_target is None:
+            return None
+        (name,) = self.place_of_target.objects
+        target = self.facts.target.places.image[name]
+        shown = {v.letter: v.places.image[name] for v in views if name in v.places.image}
+        distances = sorted((math.dist(place, target), letter) for letter, place in shown.items())
+        (nearest, letter), *others = distances or [(math.inf, None)]
+        if any(d - nearest < self.facts.bounds.displaced for d, _ in others):
+            return None
+        return letter
 
     # Sections.
 
@@ -205,47 +216,42 @@ class RelationalWriter(Writer):
         return parts
 
     def judgement(self, candidate: CandidateFacts) -> str:
-        """Compare a candidate with the deciding statements, in order up to the first false one."""
         if not self.statements:
             return super().judgement(candidate)
-        if (exclusion := self.exclusion(self.view_of[candidate.letter])) is not None:
-            return exclusion
-        text = f"shows {self.all_shown(self.statements, self.view_of[candidate.letter])}"
-        if candidate.agrees:
-            return f"{text}, and agrees"
-        return f"{text} but {self.difference(candidate.differences[0])}"
+        return self.comparison(self.view_of[candidate.letter])
 
-    def exclusion(self, view: View) -> str | None:
-        """State what a candidate shows, up to the first deciding statement that is false of it;
-        None if all are true and no place is off.
+    def comparison(self, view: View) -> str:
+        """State what a candidate shows in the respects of the deciding statements, in order up to
+        the first one that is false of it.
 
-        The true statements before it are included, so that a model that writes the text looks at
-        the objects in the same order in every candidate, and decides that a statement is false only
-        after it has written where its object is.
+        The text does not say whether the candidate agrees with the prediction. A model that writes
+        it does not decide this before it has described all candidates.
         """
         if (wrong := self.find_false(view)) is None:
-            is_off = any(self.offset(s, view) for s in self.statements)
-            return f"shows {self.all_shown(self.statements, view)}" if is_off else None
-        true = self.statements[: self.statements.index(wrong)] if self.detail.compared else []
+            stated = self.statements if self.detail.compared > 0 else self.statements[:1]
+            return f"shows {self.all_shown(stated)}"
+        true = self.statements[: self.statements.index(wrong)] if self.detail.compared > 1 else []
         if not true:
-            return f"shows {self.contrast(wrong, view)}"
+            return f"shows {self.instead(wrong, view)}"
         subject = true[-1].objects[0] if len(true[-1].objects) == 1 else ""
-        adverb = "also " if wrong.kind == "sight" else ""
-        contrast = self.contrast(wrong, view, subject)
-        return f"shows {self.all_shown(true, view)}, but {adverb}{contrast}"
+        return f"shows {self.all_shown(true)} and {self.instead(wrong, view, subject)}"
 
     def mismatch(self, view: View) -> str | None:
-        """State the first false statement only or, if all are true, what `exclusion` states."""
+        """Return the first deciding statement that is false of a candidate, with what it shows
+        instead, or how far off a place is; None if all statements are true and no place is off."""
         if (wrong := self.find_false(view)) is not None:
             return f"shows {self.contrast(wrong, view)}"
-        return self.exclusion(view)
+        for s in self.statements:
+            if (offset := self.offset(s, view)) is not None:
+                return f"shows {self.shown(s)}, {offset}"
+        return None
 
     def find_false(self, view: View) -> Relation | None:
         """Return the first deciding statement that is false of a candidate."""
         false = (s for s in self.statements if normalize_relation(s) not in view.statements)
         return next(false, None)
 
-    def contrast(self, s: Relation, view: View, subject: str = "") -> str:
+    def instead(self, s: Relation, view: View, subject: str = "") -> str:
         """Return what a candidate shows instead of a deciding statement that is false of it, as the
         object of "shows".
 
@@ -254,23 +260,29 @@ class RelationalWriter(Writer):
         """
         facts = {o.object: o for o in view.objects}
         if s.kind == "sight":
-            return f"the {s.objects[0]}, which should not be seen"
+            return f"the {s.objects[0]} {facts[s.objects[0]].target_region}"
         unseen = [name for name in s.objects if facts[name].target_sight != "shown"]
-        if s.kind == "region":
-            actual = "out of sight" if unseen else facts[s.objects[0]].target_region
-            return f"the {s.objects[0]} {actual}{self.offset(s, view)}, not {s.value}"
         if unseen:
             return f"the {unseen[0]} out of sight"
+        if s.kind == "region":
+            return f"the {s.objects[0]} {facts[s.objects[0]].target_region}"
         if actual := find_topic(s, view.relations):
-            shown = (self.attribute if actual.objects[0] == subject else self.shown)(actual)
-            if s.kind not in SYMMETRIC:
-                return shown
-            return f"{shown}, not {self.place(flip_relation(s), pronoun=True)}"
-        return (
-            f"not {self.place(s)}"
-            if s.objects[0] == subject
-            else f"the {s.objects[0]} not {self.place(s)}"
-        )
+            return (self.attribute if actual.objects[0] == subject else self.shown)(actual)
+        denied = f"not {self.place(s)}"
+        return denied if s.objects[0] == subject else f"the {s.objects[0]} {denied}"
+
+    def contrast(self, s: Relation, view: View) -> str:
+        """Return what a candidate shows instead of a deciding statement that is false of it, and
+        this statement, as the object of "shows"."""
+        if s.kind == "sight":
+            return f"the {s.objects[0]}, which should not be seen"
+        text = self.instead(s, view)
+        if s.kind == "region":
+            return f"{text}, not {s.value}"
+        seen = {o.object for o in view.objects if o.target_sight == "shown"}
+        if s.kind in SYMMETRIC and seen.issuperset(s.objects) and find_topic(s, view.relations):
+            return f"{text}, not {self.place(flip_relation(s), pronoun=True)}"
+        return text
 
     def match(self, candidate: CandidateFacts) -> str:
         if candidate.agrees or not self.statements:
@@ -282,10 +294,12 @@ class RelationalWriter(Writer):
     def outcome(self) -> list[str]:
         if not self.statements:
             return super().outcome()
-        return [self.statement(self.conclusion, "is"), self.say("answer", answer=self.facts.answer)]
+        return [self.conclusion(self.facts.views), self.say("answer", answer=self.facts.answer)]
 
-    @property
-    def conclusion(self) -> Relation:
-        """The shortest deciding statement."""
-        deciding = [s for s in self.statements if normalize_relation(s) in self.deciding]
-        return min(deciding, key=lambda s: len(s.objects))
+    def conclusion(self, views: Sequence[View]) -> str:
+        """Return which candidate shows the object of the first statement closest to its place or,
+        if several are about as close, the shortest deciding statement."""
+        if (letter := self.find_closest(views)) is not None:
+            name = self.statements[0].objects[0]
+            return f"the {name} is closest to its expected place in candidate {letter}"
+        return self.statement(min(self.statements, key=lambda s: len(s.objects)), "is")

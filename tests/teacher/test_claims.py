@@ -10,6 +10,7 @@ prose.jsonl: rationales written by a language model, with the predicates that it
 import json
 from dataclasses import replace
 from itertools import product
+from math import dist
 from pathlib import Path
 from random import Random
 
@@ -24,7 +25,7 @@ from benchmarks.experiments.mutations import (
 )
 from conf.schema import TeacherConfig
 from teacher.narrator import write_rationale
-from teacher.predicates.relations import Bounds
+from teacher.predicates.relations import Bounds, describe_distance
 from teacher.reading.phrases import VOCABULARY
 from teacher.sections import SECTIONS
 from teacher.validation.claim_extraction import extract_claims
@@ -152,8 +153,8 @@ def test_false_word_is_contradicted(rationales, source, kind):
 
 def add_rare_statements(text, predicates):
     """Add true statements that few rationales have: extremes, what is between what and what covers
-    what to the prediction, and what objects pass and which edges they reach to the motion
-    analysis."""
+    what to the prediction, what objects pass and which edges they reach to the motion analysis, and
+    how far off candidates show the objects to the candidate analysis."""
     true = sorted(predicates.target.statements)
     extremes = [f" The {s.objects[0]} will be {s.value}." for s in true if s.kind == "extreme"]
     between = [
@@ -170,6 +171,14 @@ def add_rare_statements(text, predicates):
     passed = [
         f" The {s.objects[0]} {s.value} the {s.objects[1]}." for s in true if s.kind == "passing"
     ]
+    target = predicates.target.places.image
+    off = [
+        f" Candidate {view.letter} has the {name} {extent} off."
+        for view in predicates.views
+        for name in target.keys() & view.places.image.keys()
+        if (extent := describe_distance(dist(view.places.image[name], target[name]), Bounds()))
+    ]
+    text = text.replace("\nOutcome:", f"{''.join(sorted(off))}\nOutcome:")
     text = text.replace("\nPrediction:", f"{''.join(edges + passed)}\nPrediction:")
     return text.replace(
         "\nCandidate analysis:", f"{''.join(extremes + between + covers)}\nCandidate analysis:"

@@ -139,23 +139,26 @@ def choose_with_margins(
 
 
 def test_clear_statements_are_chosen() -> None:
-    """A statement that alone decides an item is chosen if it is clear and the others are not, and
-    is replaced by another one if its own margins shrink."""
+    """A statement that excludes what the place does not exclude is chosen if it is clear and the
+    others are not, and is replaced by another one if its own margins shrink."""
     tried = 0
     for _, predicates in random_cases(150, BOUNDS):
-        wrong = [v for v in predicates.views if v.letter != predicates.answer]
+        place, *chosen = choose_statements(predicates).statements
+        left = [
+            v for v in predicates.views if v.letter != predicates.answer and place in v.statements
+        ]
         alone = [
             s
             for s in sorted(predicates.target.statements)
-            if s.kind not in CHANGES and not any(s in v.statements for v in wrong)
+            if s.kind not in CHANGES and not any(s in v.statements for v in left)
         ]
-        if len(alone) < 2:
+        if place.kind != "region" or not left or len(alone) < 2:
             continue
         tried += 1
         for statement in alone:
             if statement.kind != "sight" and set(statement.objects) <= predicates.paths.keys():
-                assert choose_with_margins(predicates, statement, 1e6, 0.01) == (statement,)
-        chosen = choose_statements(predicates).statements
+                clear = choose_with_margins(predicates, statement, 1e6, 0.01)
+                assert clear == (place, statement)
         if len(chosen) == 1:
             assert chosen[0] not in choose_with_margins(predicates, *chosen, 1e-6, 1)
     assert tried > 10

@@ -12,7 +12,7 @@ import pytest
 from conf.schema import TeacherConfig
 from conf.schema.servers import RelationBounds
 from data.records import Scene
-from teacher.deciding import choose_statements, find_widest_place, list_compared
+from teacher.deciding import choose_statements
 from teacher.narrator import FULL, write_match_lines, write_rationale
 from teacher.predicates.facts import Relation
 from teacher.predicates.relations import (
@@ -219,10 +219,10 @@ def test_bounds_of_words_are_settings() -> None:
 CFG = TeacherConfig(name="template")
 
 
-def test_deciding_statements_are_a_smallest_set_or_a_clearer_pair() -> None:
-    """No smaller set of statements excludes as many distractors, by exhaustive search, except that
-    two statements may replace one."""
-    sizes, smallest = [], []
+def test_deciding_statements_are_a_place_and_a_smallest_set() -> None:
+    """No smaller set of statements excludes what the place does not exclude, by exhaustive
+    search."""
+    sizes = []
     for _, predicates in random_cases(60, BOUNDS):
         decision = choose_statements(predicates)
         wrong = [v for v in predicates.views if v.letter != predicates.answer]
@@ -237,19 +237,57 @@ def test_deciding_statements_are_a_smallest_set_or_a_clearer_pair() -> None:
             frozenset(v.letter for v in wrong if s not in v.statements) for s in decision.statements
         ]
         assert frozenset().union(*chosen) == possible
+        by_place = chosen[0] if decision.place else frozenset()
         suffices = (
             size
             for size in range(len(chosen) + 1)
-            if any(frozenset().union(*some) == possible for some in combinations(excluded, size))
+            if any(by_place.union(*some) == possible for some in combinations(excluded, size))
         )
         assert len(set(decision.statements)) == len(chosen)
         sizes.append(len(chosen))
-        smallest.append(next(suffices))
-        assert (smallest[-1], sizes[-1]) == (1, 2) or smallest[-1] == sizes[-1]
+        assert next(suffices) == sizes[-1] - bool(decision.place)
         assert set(decision.statements) <= predicates.target.statements
     assert len(sizes) > 40
-    assert smallest.count(2) > 0
-    assert 0 < smallest.count(1) - sizes.count(1) < sizes.count(1)
+    assert sizes.count(1) > 0
+    assert sizes.count(2) > 0
+
+
+def test_the_place_is_that_of_an_object_seen_at_the_cut() -> None:
+    decides = set()
+    for _, predicates in random_cases(60, BOUNDS):
+        place = choose_statements(predicates).place
+        seen = {o.object for o in predicates.objects if o.sight != "out of view"}
+        places = {
+            s for s in predicates.target.statements if s.kind == "region" and s.objects[0] in seen
+        }
+        assert (place is None) == (not places)
+        if place is not None:
+            assert place in places
+            wrong = [v for v in predicates.views if v.letter != predicates.answer]
+            decides.add(not any(place in v.statements for v in wrong))
+    assert decides == {False, True}
+
+
+def test_outcomes_name_the_closest_candidate() -> None:
+    named = 0
+    for item, predicates in random_cases(250, BOUNDS):
+        outcome = write_rationale(predicates, item, 0).partition("Outcome: ")[2].split(". ")[0]
+        place = choose_statements(predicates).place
+        if place is None or "closest" not in outcome:
+            continue
+        named += 1
+        (name,) = place.objects
+        words = f"The {name} is closest to its expected place in candidate "
+        assert outcome == words + predicates.answer
+        shown = {v.letter: v.places.image.get(name, (9, 9)) for v in predicates.views}
+        target = predicates.target.places.image[name]
+        for letter, there in shown.items():
+            text = f"Outcome: {words}{letter}."
+            verdicts = {c.verdict for c in extract_claims(text, predicates) if c.candidate}
+            right = letter == predicates.answer
+            assert verdicts == {"supported" if right else "contradicted"}
+            assert right or dist(there, target) >= BOUNDS.displaced
+    assert named > 40
 
 
 def test_every_relational_rationale_is_accepted_and_sufficient() -> None:
@@ -270,7 +308,9 @@ def test_wrong_candidates_are_compared_with_the_chosen_statements_only() -> None
     for item, predicates in random_cases(60, BOUNDS):
         text = write_rationale(predicates, item, seed=0)
         decision = choose_statements(predicates)
-        compared = {(s.kind, *sorted(s.objects)) for s in list_compared(decision, predicates)}
+        compared = {(s.kind, *sorted(s.objects)) for s in decision.statements}
+        # Of an object that the target does not show, the analysis says where a candidate shows it.
+        compared |= {("region", *s.objects) for s in decision.statements if s.kind == "sight"}
         claims = extract_claims(text, predicates)
         for view in predicates.views:
             about = [c for c in claims if c.candidate == view.letter and c.kind != "agrees"]
@@ -407,9 +447,11 @@ def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement()
         for view in predicates.views:
             false = [s for s in writer.statements if normalize_relation(s) not in view.statements]
             is_off = any(writer.offset(s, view) for s in writer.statements)
-            text = writer.exclusion(view)
-            assert (text is None) == (not false and not is_off)
+            text = writer.comparison(view)
+            assert " not " not in text or "not " in writer.instead(false[0], view)
+            assert (writer.mismatch(view) is None) == (not false and not is_off)
             if not false:
+                assert text == f"shows {writer.all_shown(writer.statements)}"
                 continue
             first, *after = writer.statements[writer.statements.index(false[0]) :]
             before = writer.statements[: -1 - len(after)]
@@ -419,15 +461,14 @@ def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement()
             assert not [n for n in unsaid if n in text]
             if [s.kind for s in before] == ["region"]:
                 (one,) = before[0].objects
-                shown = f"the {one} {before[0].value}{writer.offset(before[0], view)}"
-                assert text.startswith(f"shows {shown}, but ")
+                assert text.startswith(f"shows the {one} {before[0].value} and ")
                 walked += 1
             facts = {o.object: o for o in view.objects}
             if not before and first.kind == "region":
                 (one,) = first.objects
                 if facts[one].target_sight == "shown":
-                    shown = f"the {one} {facts[one].target_region}{writer.offset(first, view)}"
-                    assert text == f"shows {shown}, not {first.value}"
+                    assert text == f"shows the {one} {facts[one].target_region}"
+                    assert writer.mismatch(view) == f"{text}, not {first.value}"
     assert walked
 
 
@@ -458,51 +499,34 @@ def test_only_displaced_objects_are_off() -> None:
                 (name,) = s.objects
                 text = writer.offset(s, view)
                 shown = view.places.image.get(name)
-                if shown is None or dist(shown, target[name]) < 12 / 336:
-                    assert text == ""
-                else:
-                    assert text.endswith(" off")
+                is_off = shown is not None and dist(shown, target[name]) >= 12 / 336
+                assert (text is not None) == is_off
                 found.add(text)
-    assert found == {"", ", slightly off", ", clearly off", ", far off"}
+    assert found == {None, "slightly off", "clearly off", "far off"}
 
 
 def test_the_oracle_checks_how_far_off_an_object_is() -> None:
     extents = ("slightly", "clearly", "far")
     checked = set()
-    for item, predicates in random_cases(30, BOUNDS):
-        writer = RelationalWriter(predicates, choose_statements(predicates), FULL, item.item_id)
+    for _, predicates in random_cases(30, BOUNDS):
+        target = predicates.target.places.image
         for view in predicates.views:
             if view.letter == predicates.answer:
                 continue
             for s in (s for s in predicates.target.statements if s.kind == "region"):
-                offset = writer.offset(s, view).strip(", ")
-                region = f"Candidate {view.letter} shows the {s.objects[0]} {s.value}"
-                for extent in extents if offset else ():
+                (name,) = s.objects
+                shown = view.places.image.get(name)
+                actual = shown and describe_distance(dist(shown, target[name]), BOUNDS)
+                region = f"Candidate {view.letter} shows the {name} {s.value}"
+                for extent in extents if actual else ():
                     text = f"Candidate analysis: {region}, {extent} off."
                     claims = [c for c in extract_claims(text, predicates) if c.kind == "displaced"]
                     verdicts = {c.value: c.verdict for c in claims}
-                    true = {offset.split()[0]} | ({"clearly"} if offset == "far off" else set())
+                    true = {actual} | ({"clearly"} if actual == "far" else set())
                     expected = "supported" if extent in true else "contradicted"
                     assert verdicts == {extent: expected, "": "supported"}
                     checked.add((extent, expected))
     assert len(checked) == 6
-
-
-def test_the_widest_place_is_that_of_an_object_seen_at_the_cut() -> None:
-    for _, predicates in random_cases(60, BOUNDS):
-        place = find_widest_place(predicates)
-        seen = {o.object for o in predicates.objects if o.sight != "out of view"}
-        if place is None:
-            assert not [
-                s
-                for s in predicates.target.statements
-                if s.kind == "region" and s.objects[0] in seen
-            ]
-            continue
-        assert place in predicates.target.statements
-        assert place.objects[0] in seen
-        compared = list_compared(choose_statements(predicates), predicates)
-        assert not compared or any(s.kind == "region" for s in compared)
 
 
 def test_a_rationale_that_does_not_decide_a_decidable_item_is_insufficient() -> None:

@@ -20,6 +20,8 @@ from train.tiny_base.samples import OracleSample, make_sample
 
 NO_QUESTION = Question("", "")
 """The question of the stages without words."""
+CYCLE = (*KINDS, "compare", "explain")
+"""The kinds of questions of successive steps. Comparing candidates is harder than the rest."""
 CORPUS_ITEMS = 800
 """Number of items whose texts the tokenizer is trained on."""
 
@@ -57,7 +59,7 @@ class ItemSampler:
         """Return this rank's samples of a step with `size` samples over all ranks. All ask the same
         kind of question, so that they show the same number of pictures."""
         samples = []
-        kind = [*KINDS][step % len(KINDS)] if stage == "words" else None
+        kind = CYCLE[step % len(CYCLE)] if stage == "words" else None
         for position in range(step * size + rank(), (step + 1) * size, world_size()):
             epoch, index = divmod(position, len(self.items))
             order = seeded_rng(self.seed, stage, epoch).permutation(len(self.items))

@@ -17,8 +17,10 @@ they predict. They read
                far apart the candidates show it
     "spoken"   tokens from the end of a name until the text names another object, candidate or
                section, or the sentence ends, after the layer `SPEAKING`: place and velocity of the
-               named object in the picture that the text describes there, and, if the text says
-               that another object has it beside it, its displacement from this object
+               named object in the picture that the text describes there; if the text says that
+               another object has it beside it, its displacement from this object; and, in a
+               candidate, its displacement and distance from the place where it is expected, and the
+               candidate's letter
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
 at the tower's output and motion in the middle layers. Attention heads are trained too (see
@@ -28,7 +30,7 @@ at the tower's output and motion in the middle layers. Attention heads are train
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -62,13 +64,20 @@ class OracleHeads(nn.Module):
         embedding: The embedding of the language model's tokens. The vision tower's output has the
             same width.
         word_ids: Tokens of the words of each kind of `oracle_targets.WORDS`.
+        letter_ids: Tokens of the letters of candidates.
     """
 
-    def __init__(self, embedding: nn.Embedding, word_ids: Mapping[str, list[int]]) -> None:
+    def __init__(
+        self,
+        embedding: nn.Embedding,
+        word_ids: Mapping[str, list[int]],
+        letter_ids: Sequence[int],
+    ) -> None:
         super().__init__()
         # In a tuple, the embedding is no submodule: the heads do not own it.
         self._embedding = (embedding,)
         self._word_ids = {kind: torch.tensor(ids) for kind, ids in word_ids.items()}
+        self._letter_ids = torch.tensor(letter_ids)
         hidden = embedding.embedding_dim
 
         def heads(widths: Mapping[str, int]) -> nn.ModuleDict:
@@ -78,7 +87,7 @@ class OracleHeads(nn.Module):
         self.known = heads({"place": 2, "moving": 1, "apart": 1} | dict.fromkeys(DISPLACEMENTS, 2))
         self.named = heads({"visible": PICTURES, "places": 2 * PICTURES, "future": 2})
         self.spoken = heads({"place": 2, "velocity": 2, "offset": 2, "off": 2})
-        self.spread = nn.Linear(hidden, 1)
+        self.spread, self.distance = nn.Linear(hidden, 1), nn.Linear(hidden, 1)
         self.norms = nn.ModuleDict(
             {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled", "spoken")}
         )
@@ -204,10 +213,18 @@ class OracleHeads(nn.Module):
         row, at = targets.description_tokens.T
         spoken = self.norms["spoken"](hidden[row, at])
         truth = dict(zip(self.spoken, targets.description_states.split(2, dim=1), strict=True))
-        return {
+        losses = {
             name: regression_loss(head(spoken), truth[name], SCALES[name])
             for name, head in self.spoken.items()
         }
+        distance = truth["off"].norm(dim=1, keepdim=True)
+        losses["distance"] = regression_loss(self.distance(spoken), distance, SCALES["off"])
+        letters = targets.description_letters
+        if (letters >= 0).any():
+            # A head that attends to the closest candidate thus finds the letter there.
+            logits = spoken[letters >= 0] @ self._embedding[0].weight[self._letter_ids].T
+            losses["letter"] = cross_entropy(logits, letters[letters >= 0])
+        return losses
 
     def spoken_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return `spoken_place_error`, the error of the place that the heads read at the tokens

@@ -31,6 +31,10 @@ OUTCOME = re.compile(
     re.MULTILINE,
 )
 """Matches where a text names the candidates that agree."""
+CLOSEST = re.compile(
+    rf"[Tt]he (?P<name>{NAME.pattern}) is closest to its expected place in candidate (?P<letter>\w)"
+)
+"""Matches where a text names the candidate that shows an object closest to its place."""
 PREDICTED = re.compile(
     rf"[Tt]he (?P<name>{NAME.pattern}) (?:will (?:be|have)|should be|remains|stays) "
     r"(?P<place>[^.]+)\."
@@ -44,7 +48,7 @@ CLAIMED = re.compile(
     r"| not |,? not |,? and not |\.)"
 )
 """Matches what a text says that a candidate shows of an object, and how far off it is. The group
-`agrees` matches if the text does not say next that this is not what was predicted."""
+`agrees` matches if the text continues as if this is what was predicted."""
 SHOWN = re.compile(r"(?:[Cc]andidate \w|\bit) shows\b")
 """Matches the beginning of what a candidate shows."""
 POSSESSES = re.compile(r"\b(?:with|has|have) the $")
@@ -124,18 +128,31 @@ class TokenizedText:
 
     def verdicts(self) -> Iterator[tuple[int, int]]:
         """Yield the index of each letter's token in an outcome or answer, and that of the word
-        "agrees" in the sentence of this candidate."""
+        "agrees" in the sentence of this candidate, or of its letter after "closest"."""
         agreeing: dict[str, int] = {}
-        for event in self._find(PREDICTION, AGREES, OUTCOME):
+        for event in self._find(PREDICTION, AGREES, CLOSEST, OUTCOME):
             if event.re is PREDICTION:
                 agreeing.clear()
-            elif event.re is AGREES:
-                agreeing[event["letter"]] = self.token_at(event.start("word"))
+            elif event.re in (AGREES, CLOSEST):
+                word = "word" if event.re is AGREES else "letter"
+                agreeing[event["letter"]] = self.token_at(event.start(word))
             else:
                 for letter in re.finditer(r"[A-Z]", event["letters"]):
-                    if letter.group() in agreeing:
-                        at = event.start("letters") + letter.start()
-                        yield self.token_at(at), agreeing[letter.group()]
+                    at = self.token_at(event.start("letters") + letter.start())
+                    # The letter after "closest" may itself end a sentence.
+                    if agreeing.get(letter.group(), at) < at:
+                        yield at, agreeing[letter.group()]
+
+    def choices(self) -> Iterator[tuple[int, int]]:
+        """Yield the index of the token of each letter after "closest", and that of the last token
+        at which the text speaks of the object in this candidate."""
+        described: dict[tuple[str, str], int] = {}
+        mentions = [m for m in self.mentions() if m.section == "Candidate analysis" and m.letter]
+        for event in CLOSEST.finditer(self.text):
+            start = self.token_at(event.start())
+            described |= {(m.letter, m.name): m.stop - 1 for m in mentions if m.first < start}
+            if (key := described.get((event["letter"], event["name"]))) is not None:
+                yield self.token_at(event.start("letter")), key
 
     def comparisons(self) -> Iterator[tuple[int, int]]:
         """Yield the index of the last token of each place that a candidate is said to show, also of
@@ -145,21 +162,23 @@ class TokenizedText:
         the same. A region is compared with a predicted region, and a relation with a relation; if
         an object has several of them, they are left out.
         """
-        predicted: dict[tuple[str, bool], list[int]] = {}
+        predicted: dict[tuple[str, bool], list[tuple[int, str]]] = {}
         for event in self._find(PREDICTION, PREDICTED, CLAIMED):
             if event.re is PREDICTION:
                 predicted.clear()
                 continue
             last = self.token_at(event.end("place") - 1)
-            kind = event["name"], event["place"].startswith(("near the ", "out of "))
+            place = event["place"].removeprefix("with ")
+            kind = event["name"], place.startswith(("near the ", "out of "))
             if event.re is PREDICTED:
-                predicted.setdefault(kind, []).append(last)
+                predicted.setdefault(kind, []).append((last, place))
                 continue
             sentence = max(self.text.rfind(end, 0, event.start()) for end in (". ", "\n"))
             places = predicted.get(kind, [])
             if len(places) == 1 and SHOWN.search(self.text, max(sentence, 0), event.end("verb")):
                 before = self.token_at(event.start("verb"))
-                key = before if event["agrees"] is None else places[0]
+                (expected, words), *_ = places
+                key = before if event["agrees"] is None and place != words else expected
                 yield last, key
                 if event["comma"]:
                     yield self.token_at(event.start("comma")), key

@@ -115,6 +115,8 @@ class OracleTargets:
             the end of its name on.
         description_states: (S, 8) place and velocity of the object there, its displacement from its
             owner, and that from the place where it is expected, or NaN.
+        description_letters: (S,) index of the letter of the candidate in which the text, before its
+            outcome, describes the object there; -1 for the clip.
         subjects: (_, 3) row, position after a name, and position of the name.
         owners: (_, 3) row, position of a token that describes the sphere in "the cube has the
             sphere left of it", and position of the cube's name.
@@ -130,7 +132,10 @@ class OracleTargets:
         spatial_words: (_, 2) row and position of the tokens of words for places, motion and
             relations in texts.
         verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
-            of the word that says that the candidate agrees.
+            of the word that says that the candidate agrees, or of its letter after "closest".
+        choices: (_, 3) row, position before the letter of the candidate that is said to show an
+            object closest to its place, and position of the last token at which the text speaks of
+            the object in this candidate.
         comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
             and position of the end of the predicted place of the same object if both are the same,
             otherwise of the word before the object: shows, and, but.
@@ -157,6 +162,7 @@ class OracleTargets:
     name_displacements: Tensor
     description_tokens: Tensor
     description_states: Tensor
+    description_letters: Tensor
     subjects: Tensor
     owners: Tensor
     text_letters: Tensor
@@ -166,6 +172,7 @@ class OracleTargets:
     object_words: Tensor
     spatial_words: Tensor
     verdicts: Tensor
+    choices: Tensor
     comparisons: Tensor
     next_in_clip: Tensor
     next_in_candidates: Tensor

@@ -7,7 +7,15 @@ from torch import Tensor
 
 from data.records import LETTERS
 from train.tiny_base.oracle_targets import PICTURES, OracleTargets
-from train.tiny_base.trace import NAMING, PRECEDING, RECALLING, SPEAKING, TRACKING, Trace
+from train.tiny_base.trace import (
+    CHOOSING,
+    NAMING,
+    PRECEDING,
+    RECALLING,
+    SPEAKING,
+    TRACKING,
+    Trace,
+)
 
 
 def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
@@ -36,11 +44,13 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     owner               RECALLING 3    token that describes the sphere in "the cube has the sphere
                                        left of it" -> the cube's name
     verdict             SPEAKING 0     token before a letter in an outcome -> "agrees" of this
-                                       candidate
+                                       candidate, or its letter after "closest"
     next in clip        SPEAKING 1     token before a new name in a scene parse -> the object at the
                                        end of the clip
     next in candidates  SPEAKING 2     token before a name that is new in a text, or in its
                                        predictions -> the object in the last candidate that shows it
+    choice              CHOOSING 0     token before a letter after "closest" -> the last
+                                       token about the object in this candidate
 
     The two preceding tokens allow later layers to find what followed an earlier use of the same
     words. The letters allow a text about a candidate to find the candidate's visual tokens.
@@ -83,6 +93,7 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         ("comparison", RECALLING, 2, targets.comparisons),
         ("owner", RECALLING, 3, targets.owners),
         ("verdict", SPEAKING, 0, targets.verdicts),
+        ("choice", CHOOSING, 0, targets.choices),
         ("next in clip", SPEAKING, 1, next_in_clip),
         ("next in candidates", SPEAKING, 2, next_in_candidates),
     ):

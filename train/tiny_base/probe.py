@@ -73,8 +73,9 @@ class Probe:
         return average(found)
 
     def _measure_predicted_words(self) -> dict[str, float]:
-        """Return the accuracy of the first token of each kind of word, given the correct words
-        before it, and the errors of what the heads read at names and after them."""
+        """Return the accuracy of the first token of each kind of word, and of the letters after
+        "closest", given the correct words before it, and the errors of what the heads read at names
+        and after them."""
         found: dict[str, list[Tensor]] = defaultdict(list)
         for kind, samples in self.worded.items():
             for k in range(0, len(samples), BATCH):
@@ -87,6 +88,10 @@ class Probe:
                 for words, ids in self.word_ids.items():
                     of_kind = torch.isin(labels, ids)
                     found[f"words_{words}/{kind}"].append((predicted == labels)[of_kind].float())
+                row, before, _ = targets.choices.T
+                before = before - (mask.shape[1] - labels.shape[1] - 1)
+                chosen = predicted[row, before] == labels[row, before]
+                found[f"words_choice/{kind}"].append(chosen.float())
                 measures = self.heads.named_measures(trace.outputs[NAMING], targets)
                 measures |= self.heads.spoken_measures(trace.outputs[SPEAKING], targets)
                 for name, values in measures.items():

@@ -6,10 +6,9 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     parse      the objects at the end of a clip, and their motion
     predict    where each object will be at the target, and how the objects will lie to each other
     describe   where each candidate shows each object, and how they lie to each other
-    compare    for each of two candidates, the statements that tell it apart from the others, and
-               which candidates agree with them
+    compare    for each of two candidates, the statements that tell it apart from the others, what
+               the candidates show instead, and which other candidate is closest to it
     explain    the steps of a rationale about candidates that do not include the target
-    match      as `compare`, without any picture
     narrate    a whole rationale with its answer, without any picture
 
 None of them is the selection task: no answer about pictures depends on which candidate is the
@@ -17,11 +16,10 @@ target, except through what it predicts.
 `compare` supposes that a candidate, sampled at random, is the target. Its statements are chosen as
 those that decide an item, so that the model learns to find the objects that tell candidates apart,
 and how far apart their places are. In `explain`, the prediction is true of the target, but another
-candidate is shown instead of it, so that the model has to derive the prediction from the clip.
-Candidates that agree with a prediction occur in `compare` only. `match`
-teaches to compare what a text says of a candidate with what it has predicted. `narrate` teaches the
-language of rationales, in both vocabularies, and how an answer follows from what a text says of the
-candidates.
+candidate is shown instead of it, so that the model has to derive the prediction from the clip. The
+outcome of both names the candidate that shows an object closest to a place that no candidate, or
+only another one, shows. `narrate` teaches the language of rationales, in both vocabularies, and how
+an answer follows from what a text says of the candidates.
 """
 
 from __future__ import annotations
@@ -52,11 +50,10 @@ DESCRIBE = "Describe the candidates."
 COMPARE = "Suppose that a candidate is the target, and compare the candidates."
 EXPLAIN = (
     "Check a prediction step by step: scene parse, motion analysis, prediction, candidate analysis "
-    "and outcome. Then say of each candidate, in a line of its own, whether it matches and why."
+    "and outcome."
 )
-MATCH = "Write examples of candidates that are compared with predictions."
 NARRATE = "Write an example of a rationale."
-QUESTIONS = (PARSE, PREDICT, DESCRIBE, COMPARE, EXPLAIN, MATCH, NARRATE)
+QUESTIONS = (PARSE, PREDICT, DESCRIBE, COMPARE, EXPLAIN, NARRATE)
 FULL = Detail(parsed=6, analysed=4, predicted=6, pairs=2, relations=2)
 SPARSE = Detail(parsed=3, analysed=2, predicted=1, pairs=1)
 PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
@@ -142,8 +139,8 @@ def ask_describe(
 
 
 def ask_compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
-    """Ask for the statements that would decide the item if a candidate were the target, and which
-    candidates agree with them, for two candidates."""
+    """Ask for the statements that would decide the item if a candidate were the target, what the
+    candidates show instead, and which other candidate is closest to it, for two candidates."""
     blocks = []
     for k in rng.permutation(len(p.views))[:COMPARED]:
         supposed = suppose_target(p, p.views[k].letter)
@@ -153,12 +150,12 @@ def ask_compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Gen
         writer = make_statement_writer(supposed, item, rng, statements)
         predicted = [writer.statement(s, "will be") for s in writer.statements]
         views = supposed.views
-        analysed = [f"candidate {view.letter} {state_verdict(writer, view)}" for view in views]
+        analysed = [f"candidate {view.letter} {writer.comparison(view)}" for view in views]
         blocks.append(
             f"Supposition: candidate {supposed.answer} is the target.\n"
             f"Prediction: {join_sentences(predicted)}\n"
             f"Candidate analysis: {join_sentences(analysed)}\n"
-            f"Outcome: {join_sentences([name_agreeing(writer, views)])}"
+            f"Outcome: {join_sentences([state_closest_other(writer, supposed)])}"
         )
     return Question(COMPARE, "\n".join(blocks), predicts_target=False)
 
@@ -172,29 +169,23 @@ def ask_explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Gen
     statements = choose_statements(p).statements
     if not statements:
         return replace(ask_parse(p, item, rng), text=EXPLAIN, candidates=True)
+    writer = make_statement_writer(p, item, rng, statements, SPARSE)
     order = list(range(len(p.views)))
     others = [k for k in order if k != item.answer]
+    # If the closest candidate were shown twice, the outcome could not name it.
+    closest = writer.find_closest([p.views[k] for k in others])
+    others = [k for k in others if p.views[k].letter != closest]
     order[item.answer] = others[rng.integers(len(others))]
     views = [replace(p.views[k], letter=letter) for letter, k in zip(LETTERS, order, strict=True)]
-    writer = make_statement_writer(p, item, rng, statements, SPARSE)
     sections = {
         "Scene parse": writer.scene_parse(),
         "Motion analysis": writer.motion_analysis(),
         "Prediction": writer.prediction(),
-        "Candidate analysis": [f"candidate {v.letter} {state_verdict(writer, v)}" for v in views],
-        "Outcome": [writer.statement(writer.conclusion, "is"), name_agreeing(writer, views)],
+        "Candidate analysis": [f"candidate {v.letter} {writer.comparison(v)}" for v in views],
+        "Outcome": [writer.conclusion(views)],
     }
     lines = [f"{title}: {join_sentences(parts)}" for title, parts in sections.items()]
-    for view in views:
-        mismatch = writer.mismatch(view)
-        match = f"does not match: it {mismatch}" if mismatch else "matches"
-        lines.append(f"Candidate {view.letter} {match}.")
     return Question(EXPLAIN, "\n".join(lines), order=tuple(order))
-
-
-def ask_match(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
-    """Ask for comparisons as in `compare`. No picture is shown."""
-    return replace(ask_compare(p, item, rng), text=MATCH, clip=False, candidates=False)
 
 
 def ask_narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
@@ -209,7 +200,7 @@ def ask_narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Gen
 MakeQuestion = Callable[[RelationalPredicates, SelectionItem, np.random.Generator], Question]
 KINDS: dict[str, MakeQuestion] = {
     "parse": ask_parse, "predict": ask_predict, "describe": ask_describe,
-    "compare": ask_compare, "explain": ask_explain, "match": ask_match, "narrate": ask_narrate,
+    "compare": ask_compare, "explain": ask_explain, "narrate": ask_narrate,
 }  # fmt: skip
 
 
@@ -238,22 +229,15 @@ def suppose_target(p: RelationalPredicates, letter: str) -> RelationalPredicates
     return replace(p, candidates=candidates, views=views, paths=paths)
 
 
-def state_verdict(writer: RelationalWriter, view: View) -> str:
-    """Return a clause that compares a candidate with the writer's statements, up to the first one
-    that is false of it."""
-    shown = writer.all_shown(writer.statements, view)
-    return writer.exclusion(view) or f"shows {shown}, and agrees"
-
-
-def name_agreeing(writer: RelationalWriter, views: Sequence[View]) -> str:
-    """Return the clause that names the candidates that agree with the writer's statements."""
-    agreeing = [view.letter for view in views if writer.exclusion(view) is None]
-    if not agreeing:
-        return "no candidate agrees"
-    *letters, last = agreeing
-    if not letters:
-        return f"candidate {last} agrees"
-    return f"candidates {', '.join(letters)} and {last} agree"
+def state_closest_other(writer: RelationalWriter, p: RelationalPredicates) -> str:
+    """Return the clause that names the candidate which, apart from the supposed target, shows the
+    object of the first statement closest to its place there, if one does, or a statement that is
+    true of the supposed target."""
+    others = [view for view in p.views if view.letter != p.answer]
+    conclusion = writer.conclusion(others)
+    if writer.find_closest(others) is None:
+        return conclusion
+    return f"apart from candidate {p.answer}, {conclusion}"
 
 
 def sample_statements(

@@ -116,7 +116,7 @@ class OracleCollator:
         pairs: dict[str, list[tuple[int, ...]]] = {
             "prompt_letters": [*self._find_letters(ids, visual, samples, grid)],
             "text_tokens": [], "object_words": [], "spatial_words": [], "verdicts": [],
-            "comparisons": [],
+            "choices": [], "comparisons": [],
         }  # fmt: skip
         for row, (sample, text) in enumerate(zip(samples, texts, strict=True)):
             # The token that ends the turn follows the response.
@@ -129,6 +129,9 @@ class OracleCollator:
             pairs["verdicts"] += [
                 (row, start + letter - 1, start + agrees) for letter, agrees in text.verdicts()
             ]
+            pairs["choices"] += [
+                (row, start + letter - 1, start + shown) for letter, shown in text.choices()
+            ]
             pairs["comparisons"] += [
                 (row, start + shown, start + predicted) for shown, predicted in text.comparisons()
             ]
@@ -140,13 +143,17 @@ class OracleCollator:
     ) -> Iterator[tuple[int, int, int]]:
         """Yield the row and the position of each visual token of a candidate, and the position of
         the letter before the candidate."""
-        encode = self._processor.tokenizer.encode
-        letters = [encode(f" {letter}", add_special_tokens=False)[0] for letter in LETTERS]
+        letters = letter_token_ids(self._processor.tokenizer)
         for row, sample in enumerate(samples if grid else ()):
             tokens = visual[row].reshape(-1, grid**2)
             for letter, picture in zip(letters, tokens[sample.last + 1 :], strict=False):
                 before = (ids[row, : picture[0]] == letter).nonzero()
                 yield from ((row, int(token), int(before[-1])) for token in picture)
+
+
+def letter_token_ids(tokenizer: PreTrainedTokenizerBase) -> list[int]:
+    """Return the tokens of the letters of candidates."""
+    return [tokenizer.encode(f" {letter}", add_special_tokens=False)[0] for letter in LETTERS]
 
 
 def object_token_ids(tokenizer: PreTrainedTokenizerBase) -> set[int]:
@@ -294,6 +301,10 @@ def stack_samples(
         description_states=torch.tensor(
             [(*m.state, *m.offset, *m.off) for m in mentions for _ in m.spoken]
         ).reshape(-1, 8),
+        description_letters=torch.tensor(
+            [-1 if m.section == "Outcome" else m.picture - 1 for m in mentions for _ in m.spoken],
+            dtype=torch.long,
+        ),
         subjects=integers([(m.row, k, m.position) for m in mentions for k in m.spoken[1:]], 3),
         owners=integers(
             [(m.row, k, m.owner) for m in mentions if m.owner is not None for k in m.spoken], 3
@@ -307,6 +318,7 @@ def stack_samples(
         object_words=integers(pairs["object_words"], 2),
         spatial_words=integers(pairs["spatial_words"], 2),
         verdicts=integers(pairs["verdicts"], 3),
+        choices=integers(pairs["choices"], 3),
         comparisons=integers(pairs["comparisons"], 3),
         next_in_clip=integers([*find_next_in_clip(mentions)], 3),
         next_in_candidates=integers([*find_next_in_candidates(mentions)], 3),

@@ -15,7 +15,7 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import apply_rotary_pos_emb
 
 from models.student.collator import MEDIA
 
-PRECEDING, TRACKING, MIDDLE, NAMING, RECALLING, SPEAKING = 0, 1, 2, 3, 4, 5
+PRECEDING, TRACKING, MIDDLE, NAMING, RECALLING, SPEAKING, CHOOSING = 0, 1, 2, 3, 4, 5, 6
 """Indices of the language layers that the heads (`train.tiny_base.heads`) and the attention losses
 (`train.tiny_base.pointing`) refer to."""
 
@@ -91,7 +91,7 @@ def trace_forward(language_model: nn.Module, mask: Tensor) -> Iterator[Trace]:
         layers[k].register_forward_hook(keeper(trace.outputs, k))
         for k in (MIDDLE, NAMING, SPEAKING)
     ]
-    for k in (PRECEDING, TRACKING, NAMING, RECALLING, SPEAKING):
+    for k in (PRECEDING, TRACKING, NAMING, RECALLING, SPEAKING, CHOOSING):
         attention = layers[k].self_attn
         hooks.append(attention.q_norm.register_forward_hook(keeper(trace.queries, k)))
         hooks.append(attention.k_norm.register_forward_hook(keeper(trace.keys, k)))

@@ -43,7 +43,7 @@ from train.tiny_base.oracle_targets import SPATIAL_WORDS, WORDS, OracleTargets
 from train.tiny_base.pointing import pointing_losses
 from train.tiny_base.probe import Probe
 from train.tiny_base.questions import KINDS
-from train.tiny_base.samples import OracleCollator
+from train.tiny_base.samples import OracleCollator, letter_token_ids
 from train.tiny_base.trace import (
     MIDDLE,
     NAMING,
@@ -68,10 +68,11 @@ POINTING = 0.5
 NAMED = 2.0
 """Weight of the losses of places and motion in texts."""
 WORD_LOSSES = 3.0
-"""Weight of the losses of words: of all words, of those for colours, materials and shapes, and of
-those for places, motion and relations. The last two are a third and a tenth of all words, and
-harder to predict than the others. With a weight of 1, the gradient of these losses was a tenth of
-that of the losses of places and attention heads, and the base named objects that do not exist."""
+"""Weight of the losses of words: of all words, of those for colours, materials and shapes, of those
+for places, motion and relations, and of the letters after "closest". The second and third are a
+third and a tenth of all words, and harder to predict than the others. With a weight of 1, the
+gradient of these losses was a tenth of that of the losses of places and attention heads, and the
+base named objects that do not exist."""
 
 
 def eyes_losses(
@@ -112,7 +113,11 @@ def words_losses(
     losses["words"] = WORD_LOSSES * cross_entropy(predicted, following, ignore_index=IGNORED)
     # The logits and labels are those of the last tokens.
     start = batch["input_ids"].shape[1] - labels.shape[1]
-    groups = {"object words": targets.object_words, "spatial words": targets.spatial_words}
+    groups = {
+        "object words": targets.object_words,
+        "spatial words": targets.spatial_words,
+        "choices": targets.choices[:, :2] + torch.tensor([0, 1]),
+    }
     for name, tokens in groups.items():
         row, at = tokens.T
         if len(row):
@@ -294,7 +299,8 @@ def build_trainer(
     """
     words = first_token_ids(processor)
     objects = {kind: words[kind] for kind in WORDS}
-    heads = OracleHeads(model.get_input_embeddings(), objects)
+    letters = letter_token_ids(processor.tokenizer)
+    heads = OracleHeads(model.get_input_embeddings(), objects, letters)
     collate = OracleCollator(processor, cfg.student.max_length)
     samples = [sampler.make_sample(item, None, "held out") for item in held_out]
     worded = {

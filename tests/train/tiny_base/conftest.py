@@ -13,8 +13,8 @@ from teacher.predicates.motion import find_cut
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import OracleHeads
 from train.tiny_base.oracle_targets import PICTURES
-from train.tiny_base.samples import OracleCollator, OracleSample
-from train.tiny_base.trace import SPEAKING
+from train.tiny_base.samples import OracleCollator, OracleSample, letter_token_ids
+from train.tiny_base.trace import CHOOSING
 from train.tiny_base.training import first_token_ids
 
 
@@ -49,7 +49,7 @@ def deep_model(model, request: pytest.FixtureRequest):
     from tests.tiny_models import SMALL
 
     model = build_model(
-        replace(SMALL, layers=SPEAKING + 1, heads=PICTURES + 1, kv_heads=request.param),
+        replace(SMALL, layers=CHOOSING + 1, heads=PICTURES + 1, kv_heads=request.param),
         model.config.text_config.vocab_size,
     )
     return model.eval()
@@ -59,4 +59,5 @@ def deep_model(model, request: pytest.FixtureRequest):
 def heads(deep_model, processor) -> OracleHeads:
     words = first_token_ids(processor)
     kinds = {kind: words[kind] for kind in ("color", "material", "shape")}
-    return OracleHeads(deep_model.get_input_embeddings(), kinds)
+    letters = letter_token_ids(processor.tokenizer)
+    return OracleHeads(deep_model.get_input_embeddings(), kinds, letters)

@@ -68,7 +68,7 @@ def test_losses_train_the_layers_that_they_refer_to(samples, collate, deep_model
     losses["place"].backward(retain_graph=True)
     layers = deep_model.model.language_model.layers
     weights = [layer.mlp.down_proj.weight.grad for layer in layers]
-    assert [w is not None for w in weights] == [True] * 3 + [False] * 3
+    assert [w is not None for w in weights] == [True] * 3 + [False] * 4
     deep_model.zero_grad(set_to_none=True)
     losses["color"].backward()
     assert layers[0].mlp.down_proj.weight.grad is None
@@ -78,7 +78,7 @@ def test_losses_train_the_layers_that_they_refer_to(samples, collate, deep_model
 def test_measures_of_what_is_right_and_of_staying_put(samples, collate, deep_model) -> None:
     # The small tokenizer splits words, and some have the same first token.
     tokens = {"color": [*range(20, 28)], "material": [28, 29], "shape": [30, 31, 32]}
-    heads = OracleHeads(deep_model.get_input_embeddings(), tokens)
+    heads = OracleHeads(deep_model.get_input_embeddings(), tokens, [33, 34, 35, 36])
     _, targets = collate(samples)
     truth, (row, token) = targets.truth, targets.objects.T
     hidden = heads.known["place"].in_features
@@ -128,8 +128,8 @@ def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, hea
     for _ in range(8):
         losses = words_losses(deep_model, heads, batch, targets)
         assert {"words", "track clip", "find 0", "named places", "color", "since"} <= losses.keys()
-        assert {"subject", "letter", "repeat", "verdict"} <= losses.keys()
-        assert {"spoken place", "spelled color"} <= losses.keys()
+        assert {"subject", "letter", "repeat", "choice", "choices"} <= losses.keys()
+        assert {"spoken place", "spoken letter", "spelled color"} <= losses.keys()
         total = sum(losses.values())
         optimizer.zero_grad()
         total.backward()
@@ -147,7 +147,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(sampler, collate
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
         "before", "second before", "track clip", *(f"find {k}" for k in range(PICTURES)), "subject",
-        "find shown", "label", "letter", "repeat", "verdict", "comparison", "owner",
+        "find shown", "label", "letter", "repeat", "choice", "comparison", "owner",
         "next in candidates",
         *(f"track {k}" for k in range(len(LETTERS) - 1)),
     }  # fmt: skip

@@ -49,13 +49,30 @@ def test_outcomes_refer_to_the_candidates_that_agree(processor) -> None:
         assert before[before.rindex("Candidate ") :].startswith(f"Candidate {letter} shows")
 
 
+def test_the_closest_candidate_refers_to_what_it_shows(processor) -> None:
+    text = TokenizedText(
+        "Prediction: The red metal cube will be near the top.\n"
+        "Candidate analysis: Candidate A shows the red metal cube near the left, far off, not near "
+        "the top. Candidate B shows the red metal cube near the top and the gray metal cube near "
+        "the left.\n"
+        "Outcome: The red metal cube is closest to its expected place in candidate B.\nAnswer: B",
+        processor.tokenizer,
+    )
+    closest = text.token_at(text.text.index("B.\nAnswer"))
+    described = text.token_at(text.text.index("gray")) - 1
+    assert [*text.choices()] == [(closest, described)]
+    answer = text.token_at(len(text.text) - 1)
+    assert [*text.verdicts()] == [(answer, closest)]
+
+
 def test_places_in_candidates_are_compared_with_the_predicted_ones(processor) -> None:
     text = TokenizedText(
         "Prediction: At the end, the red metal cube will be near the top-left. The gray metal cube "
         "should be near the top. The gray metal cube will be left of the red metal cube.\n"
         "Candidate analysis: Candidate A shows the red metal cube near the top, not near the "
         "top-left. Candidate B shows the gray metal cube near the top, and agrees. Candidate C "
-        "shows the red metal cube near the top-left and agrees with the prediction.\n"
+        "shows the red metal cube near the top-left and agrees with the prediction. Candidate D "
+        "shows the gray metal cube near the top.\n"
         "Candidate A does not match: it shows the red metal cube near the center, not near the "
         "top.",
         processor.tokenizer,
@@ -68,7 +85,8 @@ def test_places_in_candidates_are_compared_with_the_predicted_ones(processor) ->
         (ends[2], shows[0]), (commas[0], shows[0]),
         (ends[4], ends[1]), (commas[1], ends[1]),
         (ends[5], ends[0]),
-        (ends[6], shows[3]), (commas[2], shows[3]),
+        (ends[6], ends[1]),
+        (ends[7], shows[4]), (commas[2], shows[4]),
     ]  # fmt: skip
 
 

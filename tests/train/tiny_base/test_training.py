@@ -27,7 +27,7 @@ from train.tiny_base.training import CHECKPOINT, BaseTrainer, build_trainer, lea
 
 pytestmark = pytest.mark.slow
 
-SIZES = replace(SMALL, layers=6, heads=6, kv_heads=6)
+SIZES = replace(SMALL, layers=7, heads=6, kv_heads=6)
 STAGE = StageConfig(steps=4, batch=2, lr=1e-3)
 
 
@@ -135,8 +135,8 @@ def test_no_held_out_scene_is_trained_on(micro_store: Store, frames: FrameReader
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("student.architecture.layers=5", "needs 6 layers with 6 heads or more"),
-        ("student.architecture.heads=5", "needs 6 layers with 6 heads or more"),
+        ("student.architecture.layers=6", "needs 7 layers with 6 heads or more"),
+        ("student.architecture.heads=5", "needs 7 layers with 6 heads or more"),
         ("student.architecture=null", "a base is trained from random weights"),
     ],
 )
