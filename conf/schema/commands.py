@@ -23,7 +23,7 @@ from conf.schema.training import (
 PARALLEL_BACKENDS = ("loky", "ray")
 BASE_LAYERS, BASE_HEADS = 7, 6
 """Minimum numbers of language layers and of attention heads of a base that `train.base` trains: its
-targets refer to the first six layers, and to one head for the clip and one for each candidate."""
+targets refer to the first seven layers, and to one head for the clip and one for each candidate."""
 
 
 @dataclass
