@@ -58,8 +58,8 @@ class RelationalWriter(Writer):
     """Writes the sections of a rationale from relational predicates.
 
     The prediction begins with the statements that decide the item (see `teacher.deciding`). The
-    candidate analysis says what each candidate shows in the respects of these statements only. The
-    outcome names the candidate that shows the object of the first statement closest to its place.
+    candidate analysis describes each candidate by the topics of these statements only. The outcome
+    names the candidate that shows the object of the first statement closest to its place.
     Other objects that are out of view at the cut are left out.
     """
 
@@ -221,8 +221,8 @@ class RelationalWriter(Writer):
         return self.comparison(self.view_of[candidate.letter])
 
     def comparison(self, view: View) -> str:
-        """State what a candidate shows in the respects of the deciding statements, in order up to
-        the first one that is false of it.
+        """Describe a candidate by the topics of the deciding statements, in order up to the first
+        statement that is false of it.
 
         The text does not say whether the candidate agrees with the prediction. A model that writes
         it does not decide this before it has described all candidates.
@@ -299,7 +299,7 @@ class RelationalWriter(Writer):
     def conclusion(self, views: Sequence[View]) -> str:
         """Return which candidate shows the object of the first statement closest to its place or,
         if several are about as close, the shortest deciding statement."""
-        if (letter := self.find_closest(views)) is not None:
-            name = self.statements[0].objects[0]
+        if self.place_of_target and (letter := self.find_closest(views)) is not None:
+            (name,) = self.place_of_target.objects
             return f"the {name} is closest to its expected place in candidate {letter}"
         return self.statement(min(self.statements, key=lambda s: len(s.objects)), "is")
