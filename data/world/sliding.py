@@ -17,6 +17,7 @@ from data.world.starts import (
     Sample,
     SizedObject,
     is_on_screen,
+    length,
     unit_vector,
 )
 
@@ -86,7 +87,7 @@ class _Slide:
         bearing = rng.uniform(0, 2 * np.pi)
         begin = middle + rng.uniform(*start.distance) * unit_vector(bearing)
         goal = middle + rng.uniform(-start.spread, start.spread, 2)
-        direction = (goal - begin) / np.linalg.norm(goal - begin)
+        direction = (goal - begin) / length(goal - begin)
         return self._body(added, begin, rng.uniform(*start.speed) * direction)
 
     def _try_body(
@@ -145,7 +146,7 @@ class _Slide:
         if not self._is_on_screen(place, added):
             return None
         if rng.random() < start.at_rest:
-            is_slow = np.linalg.norm(motion.velocities[frame, other]) < SLOW
+            is_slow = length(motion.velocities[frame, other]) < SLOW
             return None if is_slow else self._body(added, place)
         seconds, deceleration = frame / physics.fps, physics.friction_deceleration
         speed = rng.uniform(*start.speed)

@@ -87,7 +87,7 @@ def throw(
         if is_resting:
             continue
         toward = _near_middle(world, rng) - place
-        velocity = rng.uniform(*start.speed) * toward / np.linalg.norm(toward)
+        velocity = rng.uniform(*start.speed) * toward / length(toward)
         bodies.append(Body(each.object, place, rng.uniform(0, np.pi), velocity, height, each.scale))
     return Sample(bodies, shared_simulator().simulate(bodies, world))
 
@@ -115,7 +115,7 @@ def strike(
         scenario, height = "Collide", None
         begin = first - rng.uniform(*start.distance) * unit_vector(bearing + rng.normal(0, 0.05))
         velocity = first - begin
-        velocity *= rng.uniform(*start.speed) / np.linalg.norm(velocity)
+        velocity *= rng.uniform(*start.speed) / length(velocity)
     else:
         scenario = "Drop"
         begin = first + rng.normal(0, 0.25, 2)
@@ -141,6 +141,13 @@ def is_on_screen(place: np.ndarray, height: float, camera: Camera) -> bool:
         and margin < pixel[0] < camera.width - margin
         and margin < pixel[1] < camera.height - margin
     )
+
+
+def length(vector: np.ndarray) -> float:
+    """Return the length of a vector, with the same bits on every processor."""
+    # Without an axis, numpy calls a BLAS function whose rounding depends on the processor, and a
+    # difference of one bit in a starting velocity changes the scene after a few collisions.
+    return float(np.linalg.norm(vector, axis=-1))
 
 
 def unit_vector(angle: float) -> np.ndarray:
