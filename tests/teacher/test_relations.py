@@ -1,22 +1,17 @@
-"""Relations, the statements that decide an item, and rationales that rest on them."""
+"""Relations between objects follow their bounds, and the symmetries of the image."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, replace
 from itertools import combinations, permutations
-from math import dist
 
 import numpy as np
 import pytest
 
 from conf.schema import TeacherConfig
 from conf.schema.servers import RelationBounds
-from data.records import Scene
-from teacher.deciding import choose_statements
-from teacher.narrator import FULL, write_match_lines, write_rationale
 from teacher.predicates.facts import Relation
 from teacher.predicates.relations import (
-    CHANGES,
     KINDS,
     OPPOSITES,
     SYMMETRIC,
@@ -28,17 +23,10 @@ from teacher.predicates.relations import (
     flip_relation,
     normalize_relation,
 )
-from teacher.servers.responses import Response
-from teacher.sufficiency import find_predicted, measure_sufficiency
-from teacher.validation.claim_extraction import extract_claims
-from teacher.validation.grader import RationaleGrader
-from teacher.validation.validator import validate_rationale
-from teacher.vocabulary import choose_vocabulary
-from teacher.writers.relational import RelationalWriter
 from tests.teacher import synthetic
-from tests.teacher.test_predicates import random_cases
 
 BOUNDS = Bounds()
+
 A, B, C = "blue metal cube", "green metal sphere", "red rubber cylinder"
 
 
@@ -216,212 +204,6 @@ def test_bounds_of_words_are_settings() -> None:
     assert values(find_relations(near, wide), "side") == {((A, B), "aligned with")}
 
 
-CFG = TeacherConfig(name="template")
-
-
-def test_deciding_statements_are_a_place_and_a_smallest_set() -> None:
-    """No smaller set of statements excludes what the place does not exclude, by exhaustive
-    search."""
-    sizes = []
-    for _, predicates in random_cases(60, BOUNDS):
-        decision = choose_statements(predicates)
-        wrong = [v for v in predicates.views if v.letter != predicates.answer]
-        excluded = {
-            frozenset(v.letter for v in wrong if s not in v.statements)
-            for s in predicates.target.statements
-            if s.kind not in CHANGES
-        }
-        possible = frozenset().union(*excluded)
-        assert set(decision.rivals) == {v.letter for v in wrong} - possible
-        chosen = [
-            frozenset(v.letter for v in wrong if s not in v.statements) for s in decision.statements
-        ]
-        assert frozenset().union(*chosen) == possible
-        by_place = chosen[0] if decision.place else frozenset()
-        suffices = (
-            size
-            for size in range(len(chosen) + 1)
-            if any(by_place.union(*some) == possible for some in combinations(excluded, size))
-        )
-        assert len(set(decision.statements)) == len(chosen)
-        sizes.append(len(chosen))
-        assert next(suffices) == sizes[-1] - bool(decision.place)
-        assert set(decision.statements) <= predicates.target.statements
-    assert len(sizes) > 40
-    assert sizes.count(1) > 0
-    assert sizes.count(2) > 0
-
-
-def test_the_place_is_that_of_an_object_seen_at_the_cut() -> None:
-    decides = set()
-    for _, predicates in random_cases(60, BOUNDS):
-        place = choose_statements(predicates).place
-        seen = {o.object for o in predicates.objects if o.sight != "out of view"}
-        places = {
-            s for s in predicates.target.statements if s.kind == "region" and s.objects[0] in seen
-        }
-        assert (place is None) == (not places)
-        if place is not None:
-            assert place in places
-            wrong = [v for v in predicates.views if v.letter != predicates.answer]
-            decides.add(not any(place in v.statements for v in wrong))
-    assert decides == {False, True}
-
-
-def test_outcomes_name_the_closest_candidate() -> None:
-    named = 0
-    for item, predicates in random_cases(250, BOUNDS):
-        outcome = write_rationale(predicates, item, 0).partition("Outcome: ")[2].split(". ")[0]
-        place = choose_statements(predicates).place
-        if place is None or "closest" not in outcome:
-            continue
-        named += 1
-        (name,) = place.objects
-        words = f"The {name} is closest to its expected place in candidate "
-        assert outcome == words + predicates.answer
-        shown = {v.letter: v.places.image.get(name, (9, 9)) for v in predicates.views}
-        target = predicates.target.places.image[name]
-        for letter, there in shown.items():
-            text = f"Outcome: {words}{letter}."
-            verdicts = {c.verdict for c in extract_claims(text, predicates) if c.candidate}
-            right = letter == predicates.answer
-            assert verdicts == {"supported" if right else "contradicted"}
-            assert right or dist(there, target) >= BOUNDS.displaced
-    assert named > 40
-
-
-def test_every_relational_rationale_is_accepted_and_sufficient() -> None:
-    lengths = {"paper": [], "relational": []}
-    for item, predicates in random_cases(250, BOUNDS):
-        text = write_rationale(predicates, item, seed=3)
-        validation = validate_rationale(text, predicates, item, CFG)
-        assert validation.reasons == (), text
-        rivals = choose_statements(predicates).rivals
-        sufficiency = measure_sufficiency(text, validation.claims, predicates)
-        assert sufficiency >= 1 / (1 + len(rivals)), text
-        lengths["relational"].append(len(text.split()))
-    paper = [len(write_rationale(p, i, seed=3).split()) for i, p in random_cases(250)]
-    assert np.mean(lengths["relational"]) < np.mean(paper)
-
-
-def test_wrong_candidates_are_compared_with_the_chosen_statements_only() -> None:
-    for item, predicates in random_cases(60, BOUNDS):
-        text = write_rationale(predicates, item, seed=0)
-        decision = choose_statements(predicates)
-        compared = {(s.kind, *sorted(s.objects)) for s in decision.statements}
-        # Of an object that the target does not show, the analysis says where a candidate shows it.
-        compared |= {("region", *s.objects) for s in decision.statements if s.kind == "sight"}
-        claims = extract_claims(text, predicates)
-        for view in predicates.views:
-            about = [c for c in claims if c.candidate == view.letter and c.kind != "agrees"]
-            if view.letter not in (predicates.answer, *decision.rivals):
-                kinds = {(c.kind, *sorted(c.subjects)) for c in about}
-                kinds = {k for k in kinds if k[0] not in ("lacks", "extra", "sight", "displaced")}
-                assert kinds <= compared, text
-            assert all(c.verdict != "contradicted" for c in about)
-
-
-def test_objects_out_of_view_at_the_cut_are_named_only_if_they_decide() -> None:
-    unseen = 0
-    for item, predicates in random_cases(250, BOUNDS):
-        decision = choose_statements(predicates)
-        deciding = {name for s in decision.statements for name in s.objects}
-        names = {o.object for o in predicates.objects if o.sight == "out of view"} - deciding
-        # A course with an unseen object is stated if it is the only one, rather than denied.
-        names -= {name for course in predicates.courses for name in course.objects}
-        if len(names) == len(predicates.objects):
-            continue
-        unseen += len(names)
-        text = write_rationale(predicates, item, 0).split("Candidate analysis:")[0]
-        assert not [name for name in names if name in text]
-    assert unseen
-
-
-def test_scene_parses_name_objects_from_left_to_right() -> None:
-    counts = []
-    for item, predicates in random_cases(60, BOUNDS):
-        parse = write_rationale(predicates, item, 0).split("Motion analysis:")[0]
-        named = [[n for n in predicates.left_to_right if n in s] for s in parse.split(". ")]
-        # Sentences about two objects name the more relevant one first.
-        found = dict.fromkeys(names[0] for names in named if len(names) == 1)
-        assert [*found] == [n for n in predicates.left_to_right if n in found]
-        counts.append(len(found))
-    assert max(counts) > 2
-
-
-def test_match_lines_rest_on_the_statements_of_the_rationale() -> None:
-    item, predicates = next(
-        (i, p) for i, p in random_cases(60, BOUNDS) if not choose_statements(p).rivals
-    )
-    lines = write_match_lines(predicates, item)
-    analysis = next(
-        line for line in write_rationale(predicates, item, 0).splitlines() if "analysis: C" in line
-    )
-    for line, view in zip(lines, predicates.views, strict=True):
-        if view.letter == predicates.answer:
-            assert "does not match" not in line
-        else:
-            named = [o.object for o in view.objects if o.object in line]
-            assert named
-            assert named[0] in analysis
-
-
-SUFFICIENT = "Prediction: At the target moment, the {a} will be {place}."
-
-
-def sufficiency_of(prediction: str, pixels: list[tuple[float, float]]) -> float:
-    """The sufficiency of a prediction about a cube that the candidates show at these pixels; the
-    first is the target."""
-    steps = np.array([synthetic.on_ground(pixel)[:2] for pixel in pixels])
-    still = synthetic.scene([(0.0, 0.0), steps[0]], [(0, 0), (0, 0)])
-    positions, image = still.positions.copy(), still.image_positions.copy()
-    for frame, pixel in zip((60, 70, 80, 90), pixels, strict=True):
-        positions[frame, 1, :2], image[frame, 1] = synthetic.on_ground(pixel)[:2], pixel
-    scene = replace(still, positions=positions, image_positions=image, collisions=())
-    return _sufficiency(prediction, scene)
-
-
-def _sufficiency(prediction: str, scene: Scene) -> float:
-    from teacher.predicates.extraction import extract_predicates
-
-    item = synthetic.item((60, 70, 80, 90))
-    predicates = extract_predicates(item, scene, None, BOUNDS)
-    first, second = (o.noun_phrase for o in scene.objects)
-    text = f"Prediction: {prediction.format(b=first, a=second)}\nOutcome: none."
-    return measure_sufficiency(text, extract_claims(text, predicates), predicates)
-
-
-PIXELS = [(100, 60), (100, 160), (400, 60), (120, 250)]
-
-
-@pytest.mark.parametrize(
-    ("prediction", "expected"),
-    [
-        ("The {a} will be near the top-left.", 1.0),
-        ("The {a} will be left of the {b}.", 1 / 3),
-        ("The {a} will be left of the {b}. The {a} will be above the {b}.", 1.0),
-        ("The {a} will not be left of the {b}.", 0.0),
-        ("The {a} will be right of the {b}.", 0.0),
-        ("The {b} will be near the center.", 1 / 4),
-        ("Nothing is known.", 1 / 4),
-        ("The {a} will be near the right.", 1 / 4),
-    ],
-)  # fmt: skip
-def test_sufficiency_is_the_chance_of_a_reader_who_knows_only_the_prediction(
-    prediction: str, expected: float
-) -> None:
-    assert sufficiency_of(prediction, PIXELS) == pytest.approx(expected)
-
-
-def test_only_the_prediction_counts() -> None:
-    for item, predicates in random_cases(20, BOUNDS):
-        text = write_rationale(predicates, item, 0)
-        claims = extract_claims(text, predicates)
-        without = "\n".join(x for x in text.splitlines() if not x.startswith("Prediction"))
-        assert find_predicted(text, claims)
-        assert measure_sufficiency(without, extract_claims(without, predicates), predicates) == 0.25
-
-
 @pytest.mark.parametrize("order", list(permutations(range(2))))
 def test_interchangeable_objects_state_the_same(order: tuple[int, int]) -> None:
     found = places(a=(0.3, 0.5), b=(0.6, 0.5))
@@ -440,40 +222,6 @@ def test_bounds_of_the_settings_are_those_of_the_predicates() -> None:
     assert "teacher.bounds.clearly=0.3 and teacher.bounds.far=0.25" in problem
 
 
-def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement() -> None:
-    walked = 0
-    for item, predicates in random_cases(60, BOUNDS):
-        writer = RelationalWriter(predicates, choose_statements(predicates), FULL, item.item_id)
-        for view in predicates.views:
-            false = [s for s in writer.statements if normalize_relation(s) not in view.statements]
-            is_off = any(writer.offset(s, view) for s in writer.statements)
-            text = writer.comparison(view)
-            # Only a relation that has no opposite, such as "between", is denied.
-            denied = [writer.instead(s, view) for s in false[:1]]
-            assert " not " not in text or "not " in denied[0]
-            assert (writer.mismatch(view) is None) == (not false and not is_off)
-            if not false:
-                assert text == f"shows {writer.all_shown(writer.statements)}"
-                continue
-            first, *after = writer.statements[writer.statements.index(false[0]) :]
-            before = writer.statements[: -1 - len(after)]
-            assert {*first.objects} & {n for n in predicates.left_to_right if n in text}
-            unsaid = {n for s in after for n in s.objects}
-            unsaid -= {n for s in (*before, first) for n in s.objects}
-            assert not [n for n in unsaid if n in text]
-            if [s.kind for s in before] == ["region"]:
-                (one,) = before[0].objects
-                assert text.startswith(f"shows the {one} {before[0].value} and ")
-                walked += 1
-            facts = {o.object: o for o in view.objects}
-            if not before and first.kind == "region":
-                (one,) = first.objects
-                if facts[one].target_sight == "shown":
-                    assert text == f"shows the {one} {facts[one].target_region}"
-                    assert writer.mismatch(view) == f"{text}, not {first.value}"
-    assert walked
-
-
 @pytest.mark.parametrize(
     ("distance", "extent"),
     [
@@ -489,59 +237,3 @@ def test_bounds_of_distances_are_settings() -> None:
     near = BOUNDS._replace(displaced=0.01, clearly=0.02, far=0.03)
     words = [describe_distance(distance, near) for distance in (0.005, 0.015, 0.025, 0.035)]
     assert words == [None, "slightly", "clearly", "far"]
-
-
-def test_only_displaced_objects_are_off() -> None:
-    found = set()
-    for item, predicates in random_cases(30, BOUNDS):
-        writer = RelationalWriter(predicates, choose_statements(predicates), FULL, item.item_id)
-        target = predicates.target.places.image
-        for view in predicates.views:
-            for s in (s for s in predicates.target.statements if s.kind == "region"):
-                (name,) = s.objects
-                text = writer.offset(s, view)
-                shown = view.places.image.get(name)
-                is_off = shown is not None and dist(shown, target[name]) >= 12 / 336
-                assert (text is not None) == is_off
-                found.add(text)
-    assert found == {None, "slightly off", "clearly off", "far off"}
-
-
-def test_the_oracle_checks_how_far_off_an_object_is() -> None:
-    extents = ("slightly", "clearly", "far")
-    checked = set()
-    for _, predicates in random_cases(30, BOUNDS):
-        target = predicates.target.places.image
-        for view in predicates.views:
-            if view.letter == predicates.answer:
-                continue
-            for s in (s for s in predicates.target.statements if s.kind == "region"):
-                (name,) = s.objects
-                shown = view.places.image.get(name)
-                actual = shown and describe_distance(dist(shown, target[name]), BOUNDS)
-                region = f"Candidate {view.letter} shows the {name} {s.value}"
-                for extent in extents if actual else ():
-                    text = f"Candidate analysis: {region}, {extent} off."
-                    claims = [c for c in extract_claims(text, predicates) if c.kind == "displaced"]
-                    verdicts = {c.value: c.verdict for c in claims}
-                    true = {actual} | ({"clearly"} if actual == "far" else set())
-                    expected = "supported" if extent in true else "contradicted"
-                    assert verdicts == {extent: expected, "": "supported"}
-                    checked.add((extent, expected))
-    assert len(checked) == 6
-
-
-def test_a_rationale_that_does_not_decide_a_decidable_item_is_insufficient() -> None:
-    """The paper's words decide fewer items than relations."""
-    reasons = {"paper": set(), "relational": set()}
-    for item, predicates in random_cases(60, BOUNDS):
-        for vocabulary, found in reasons.items():
-            cfg = TeacherConfig(name="t", predicates=vocabulary, sufficient=True)
-            text = write_rationale(choose_vocabulary(predicates, cfg), item, 0)
-            graded = RationaleGrader(cfg).grade(Response(text), predicates, item, 0)
-            assert graded.accepted == (graded.sufficiency == 1)
-            assert graded.undecided == ("undecided" in graded.reasons)
-            found |= {(item.item_id, reason) for reason in graded.reasons}
-    insufficient = {i for i, reason in reasons["paper"] if reason == "insufficient"}
-    assert insufficient
-    assert not {i for i, reason in reasons["relational"] if reason == "insufficient"}
