@@ -62,7 +62,8 @@ def write_facts(predicates: Predicates, item: SelectionItem) -> str:
 
 
 def write_match_lines(predicates: Predicates, item: SelectionItem) -> tuple[str, ...]:
-    """Return a line for each candidate: whether it matches the prediction, and if not, why.
+    """Return a line for each candidate: whether it matches the prediction and, in the paper's
+    vocabulary, why not.
 
     The same arguments give the same lines.
     """

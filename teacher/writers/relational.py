@@ -21,7 +21,6 @@ from teacher.predicates.facts import (
 from teacher.predicates.relations import (
     CHANGES,
     SYMMETRIC,
-    describe_distance,
     find_topic,
     flip_relation,
     normalize_relation,
@@ -152,16 +151,6 @@ class RelationalWriter(Writer):
             text = f"{text}{separator}{part}" if text else part
         return text
 
-    def offset(self, s: Relation, view: View) -> str | None:
-        """Return how far a candidate shows an object from its place at the target, such as
-        "slightly off"; None if the statement is not about a place, or if the object is there."""
-        target, shown = self.facts.target.places.image, view.places.image
-        name = s.objects[0]
-        if s.kind != "region" or name not in target or name not in shown:
-            return None
-        extent = describe_distance(math.dist(shown[name], target[name]), self.facts.bounds)
-        return extent and f"{extent} off"
-
     def find_closest(self, views: Sequence[View]) -> str | None:
         """Return the letter of the candidate that shows the object of the first statement closest
         to its place at the target; None if this statement is not about a place, or if another
@@ -236,16 +225,6 @@ class RelationalWriter(Writer):
         subject = true[-1].objects[0] if len(true[-1].objects) == 1 else ""
         return f"shows {self.all_shown(true)} and {self.instead(wrong, view, subject)}"
 
-    def mismatch(self, view: View) -> str | None:
-        """Return the first deciding statement that is false of a candidate, with what it shows
-        instead, or how far off a place is; None if all statements are true and no place is off."""
-        if (wrong := self.find_false(view)) is not None:
-            return f"shows {self.contrast(wrong, view)}"
-        for s in self.statements:
-            if (offset := self.offset(s, view)) is not None:
-                return f"shows {self.shown(s)}, {offset}"
-        return None
-
     def find_false(self, view: View) -> Relation | None:
         """Return the first deciding statement that is false of a candidate."""
         false = (s for s in self.statements if normalize_relation(s) not in view.statements)
@@ -271,25 +250,11 @@ class RelationalWriter(Writer):
         denied = f"not {self.place(s)}"
         return denied if s.objects[0] == subject else f"the {s.objects[0]} {denied}"
 
-    def contrast(self, s: Relation, view: View) -> str:
-        """Return what a candidate shows instead of a deciding statement that is false of it, and
-        this statement, as the object of "shows"."""
-        if s.kind == "sight":
-            return f"the {s.objects[0]}, which should not be seen"
-        text = self.instead(s, view)
-        if s.kind == "region":
-            return f"{text}, not {s.value}"
-        seen = {o.object for o in view.objects if o.target_sight == "shown"}
-        if s.kind in SYMMETRIC and seen.issuperset(s.objects) and find_topic(s, view.relations):
-            return f"{text}, not {self.place(flip_relation(s), pronoun=True)}"
-        return text
-
     def match(self, candidate: CandidateFacts) -> str:
-        if candidate.agrees or not self.statements:
-            return super().match(candidate)
-        if (mismatch := self.mismatch(self.view_of[candidate.letter])) is not None:
-            return f"Candidate {candidate.letter} does not match: it {mismatch}."
-        return super().match(candidate)
+        # No reason is given: a model that describes the candidate a second time may contradict its
+        # analysis and its outcome.
+        verb = "matches" if candidate.agrees else "does not match"
+        return f"Candidate {candidate.letter} {verb}."
 
     def outcome(self) -> list[str]:
         if not self.statements:

@@ -152,21 +152,14 @@ def test_scene_parses_name_objects_from_left_to_right() -> None:
     assert max(counts) > 2
 
 
-def test_match_lines_rest_on_the_statements_of_the_rationale() -> None:
-    item, predicates = next(
-        (i, p) for i, p in random_cases(60, BOUNDS) if not choose_statements(p).rivals
-    )
-    lines = write_match_lines(predicates, item)
-    analysis = next(
-        line for line in write_rationale(predicates, item, 0).splitlines() if "analysis: C" in line
-    )
-    for line, view in zip(lines, predicates.views, strict=True):
-        if view.letter == predicates.answer:
-            assert "does not match" not in line
-        else:
-            named = [o.object for o in view.objects if o.object in line]
-            assert named
-            assert named[0] in analysis
+def test_match_lines_give_the_verdict_only() -> None:
+    for item, predicates in random_cases(20, BOUNDS):
+        lines = write_match_lines(predicates, item)
+        for line, view in zip(lines, predicates.views, strict=True):
+            if choose_statements(predicates).rivals:
+                continue
+            verb = "matches" if view.letter == predicates.answer else "does not match"
+            assert line == f"Candidate {view.letter} {verb}."
 
 
 def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement() -> None:
@@ -175,12 +168,10 @@ def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement()
         writer = RelationalWriter(predicates, choose_statements(predicates), FULL, item.item_id)
         for view in predicates.views:
             false = [s for s in writer.statements if normalize_relation(s) not in view.statements]
-            is_off = any(writer.offset(s, view) for s in writer.statements)
             text = writer.comparison(view)
             # Only a relation that has no opposite, such as "between", is denied.
             denied = [writer.instead(s, view) for s in false[:1]]
             assert " not " not in text or "not " in denied[0]
-            assert (writer.mismatch(view) is None) == (not false and not is_off)
             if not false:
                 assert text == f"shows {writer.all_shown(writer.statements)}"
                 continue
@@ -199,24 +190,7 @@ def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement()
                 (one,) = first.objects
                 if facts[one].target_sight == "shown":
                     assert text == f"shows the {one} {facts[one].target_region}"
-                    assert writer.mismatch(view) == f"{text}, not {first.value}"
     assert walked
-
-
-def test_only_displaced_objects_are_off() -> None:
-    found = set()
-    for item, predicates in random_cases(30, BOUNDS):
-        writer = RelationalWriter(predicates, choose_statements(predicates), FULL, item.item_id)
-        target = predicates.target.places.image
-        for view in predicates.views:
-            for s in (s for s in predicates.target.statements if s.kind == "region"):
-                (name,) = s.objects
-                text = writer.offset(s, view)
-                shown = view.places.image.get(name)
-                is_off = shown is not None and dist(shown, target[name]) >= 12 / 336
-                assert (text is not None) == is_off
-                found.add(text)
-    assert found == {None, "slightly off", "clearly off", "far off"}
 
 
 def test_the_oracle_checks_how_far_off_an_object_is() -> None:
