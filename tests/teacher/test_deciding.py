@@ -18,7 +18,6 @@ from teacher.writers.relational import RelationalWriter
 from tests.teacher.test_predicates import random_cases
 
 BOUNDS = Bounds()
-
 CFG = TeacherConfig(name="template")
 
 
@@ -156,8 +155,6 @@ def test_match_lines_give_the_verdict_only() -> None:
     for item, predicates in random_cases(20, BOUNDS):
         lines = write_match_lines(predicates, item)
         for line, view in zip(lines, predicates.views, strict=True):
-            if choose_statements(predicates).rivals:
-                continue
             verb = "matches" if view.letter == predicates.answer else "does not match"
             assert line == f"Candidate {view.letter} {verb}."
 

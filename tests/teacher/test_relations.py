@@ -26,7 +26,6 @@ from teacher.predicates.relations import (
 from tests.teacher import synthetic
 
 BOUNDS = Bounds()
-
 A, B, C = "blue metal cube", "green metal sphere", "red rubber cylinder"
 
 
