@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import dist, erf, hypot, prod, sqrt
+from itertools import combinations
+from math import dist, erf, hypot, sqrt
 
 import numpy as np
 
@@ -25,9 +26,6 @@ UNSEEN_DISTANCE = 0.3
 """Distance that counts for an object that only some candidates show, as a share of the image."""
 UNKNOWN_PATH = 1.0
 """Path that is assumed for an object that is not visible both at the cut and at the target."""
-CLEARER = 1.25
-"""A place that needs further statements is preferred to one that decides alone if a reader finds
-the target at least this many times as likely by it."""
 
 
 @dataclass(frozen=True)
@@ -51,23 +49,34 @@ class Decision:
         return first[0] if first and first[0].kind == "region" else None
 
 
-def choose_statements(predicates: RelationalPredicates) -> Decision:
-    """Choose the place of an object by which a reader most likely finds the target, and a smallest
-    set of further statements that excludes the other distractors.
+def choose_statements(
+    predicates: RelationalPredicates, shown: Sequence[View] | None = None
+) -> Decision:
+    """Choose the place of an object by which a reader finds the target, and a smallest set of
+    further statements that excludes the other distractors.
 
-    This reader sees the places of objects with normally distributed errors, `SEEN_ERROR`, and
-    predicts the target with further errors, `PREDICTED_ERROR`. It compares the places of one object
-    and chooses the candidate that shows it closest to where it is predicted. A place that excludes
-    all distractors alone is preferred, unless another one is `CLEARER`. Of the sets of further
-    statements of a size, the one is chosen with which the reader most likely finds every statement
-    true of the predicted state and of the target, and one statement false of each distractor. For
-    relations, the errors count `RELATION_FACTOR` times. The probabilities of these events are
-    multiplied, as if they were independent.
+    The object is the one whose places distinguish the candidates best: the two closest of its
+    places are the farthest apart. A reader compares these places with the one that it predicts, and
+    chooses the closest. This choice depends only on what the candidates show, not on which of them
+    is the target, so that a student can learn it.
+
+    Of the sets of further statements of a size, the one is chosen with which a reader most likely
+    finds every statement true of the predicted state and of the target, and one statement false of
+    each distractor. This reader sees the places of objects with normally distributed errors,
+    `SEEN_ERROR`, and predicts the target with further errors, `PREDICTED_ERROR`. For relations, the
+    errors count `RELATION_FACTOR` times. The probabilities of these events are multiplied, as if
+    they were independent.
+
+    Args:
+        shown: The frames that the reader sees, if they are not the item's candidates. The target is
+            not one of them.
     """
-    wrong = [view for view in predicates.views if view.letter != predicates.answer]
+    target = predicates.target
+    shown = predicates.views if shown is None else shown
+    wrong = [view for view in shown if view is not target]
     statements = [
         s
-        for s in sorted(predicates.target.statements)
+        for s in sorted(target.statements)
         if s.kind not in CHANGES and not all(s in view.statements for view in wrong)
     ]
     holds = np.array([_probability_of_truth(s, predicates) for s in statements])
@@ -78,41 +87,38 @@ def choose_statements(predicates: RelationalPredicates) -> Decision:
     excludes = excludes.reshape(len(statements), len(wrong))
     possible = excludes.any(axis=0)
     rivals = tuple(v.letter for v, excluded in zip(wrong, possible, strict=True) if not excluded)
-    place = _choose_place(predicates, [w for w in wrong if w.letter not in rivals])
+    place = _choose_place(predicates, shown)
     left = possible & [place is None or place in view.statements for view in wrong]
     chosen = _choose_set(holds, excludes[:, left]) if left.any() else ()
     return Decision((*filter(None, [place]), *(statements[k] for k in chosen)), rivals)
 
 
-def _choose_place(predicates: RelationalPredicates, wrong: Sequence[View]) -> Relation | None:
-    """Return where the target shows the object by whose places a reader most likely finds the
-    target among these distractors; None if no object is in view both at the cut and at the
+def _choose_place(predicates: RelationalPredicates, shown: Sequence[View]) -> Relation | None:
+    """Return where the target shows the object whose places distinguish the shown frames best; of
+    several, the one with the shortest path. None if no object is in view both at the cut and at the
     target."""
     seen = {o.object for o in predicates.objects if o.sight != OUT_OF_VIEW}
-    found = {
-        s: _probability_of_closest(s.objects[0], predicates, wrong)
+    places = [
+        s
         for s in sorted(predicates.target.statements)
         if s.kind == "region" and s.objects[0] in seen
-    }
-    alone = [s for s in found if not any(s in view.statements for view in wrong)]
-    best, best_alone = (max(some, key=found.__getitem__, default=None) for some in (found, alone))
-    if best_alone is not None and found[best_alone] * CLEARER >= found[best]:
-        return best_alone
-    return best
+    ]
+
+    def rank(place: Relation) -> tuple[float, float]:
+        (name,) = place.objects
+        path = predicates.paths.get(name, UNKNOWN_PATH)
+        return measure_separation([v.places.image.get(name) for v in shown]), -path
+
+    return max(places, key=rank, default=None)
 
 
-def _probability_of_closest(
-    name: str, predicates: RelationalPredicates, wrong: Sequence[View]
-) -> float:
-    """Return the probability that a reader finds the object's place in the target closer to the
-    predicted place than those in these distractors."""
-    path = predicates.paths.get(name, UNKNOWN_PATH)
-    error = hypot(SEEN_ERROR + PREDICTED_ERROR * path, SEEN_ERROR)
-    target = predicates.target.places.image[name]
-    places = [view.places.image.get(name) for view in wrong]
-    distances = [UNSEEN_DISTANCE if p is None else dist(p, target) for p in places]
-    # A distractor is closer if the error along the line to it is above half its distance.
-    return prod(_normal_cdf(d / 2 / error) for d in distances)
+def measure_separation(places: Sequence[tuple[float, float] | None]) -> float:
+    """Return the smallest distance between the places of an object in two frames, as a share of the
+    image. If one of two frames does not show the object (None), it counts `UNSEEN_DISTANCE`; if
+    neither does, they are not compared. The separation is 0 if no frames can be compared."""
+    pairs = [pair for pair in combinations(places, 2) if pair != (None, None)]
+    distances = (UNSEEN_DISTANCE if None in pair else dist(*pair) for pair in pairs)
+    return min(distances, default=0.0)
 
 
 def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:

@@ -211,9 +211,8 @@ HEIGHTS = {
 }
 GAPS = {
     "right against": ["near", "well apart from"],
-    "in touch with": ["near", "well apart from"],
     "near": ["right against", "well apart from"],
-    "well apart from": ["near", "in touch with"],
+    "well apart from": ["near", "right against"],
 }
 COVERS = {"in front of": ["behind"], "behind": ["in front of"]}
 OPPOSITE_EDGES = {"left": "right", "right": "left", "top": "bottom", "bottom": "top"}

@@ -220,7 +220,7 @@ def stage(steps: int, batch: int, lr: float) -> StageConfig:
 class BaseTrainConfig(Settings):
     eyes: StageConfig = stage(4000, 8, 2e-3)
     """The vision tower learns to see objects in single pictures."""
-    motion: StageConfig = stage(2500, 8, 1e-3)
+    motion: StageConfig = stage(4000, 8, 1e-3)
     """The whole model learns where objects are and where they go."""
     words: StageConfig = stage(4000, 8, 8e-4)
     """The model learns to answer questions in words."""

@@ -161,8 +161,6 @@ class Writer:
             parts.append("the objects remain where they are")
         elif any(o.extent == "stays" for o in ranked) and len(movers) <= self.detail.analysed:
             parts.append(self.say("others_stay"))
-        elif any(o.extent == "stays" and o.speed == "stationary" for o in ranked):
-            parts.append("the stationary objects remain where they are unless struck")
         if self.padded:
             parts.append("an object keeps its heading until contact turns it or it comes to rest")
         return parts

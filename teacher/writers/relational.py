@@ -184,6 +184,9 @@ class RelationalWriter(Writer):
     def motion_analysis(self) -> list[str]:
         parts = super().motion_analysis()
         named = {name for s in self.statements for name in s.objects}
+        if any(o.extent not in ("stays", "unseen") for o in self.ranked):
+            still = [o for o in self.ranked if o.object in named and o.extent == "stays"]
+            parts[-1:-1] = [f"the {o.object} remains where it is" for o in still]
         changes = [
             r
             for r in self.facts.target.relations

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
-from math import dist
+from math import dist, hypot
 
 import numpy as np
+import pytest
 
 from conf.schema import TeacherConfig
-from teacher.deciding import choose_statements
+from teacher.deciding import UNSEEN_DISTANCE, choose_statements, measure_separation
 from teacher.narrator import FULL, write_match_lines, write_rationale
 from teacher.predicates.relations import CHANGES, Bounds, describe_distance, normalize_relation
 from teacher.sufficiency import measure_sufficiency
@@ -68,6 +70,37 @@ def test_the_place_is_that_of_an_object_seen_at_the_cut() -> None:
             wrong = [v for v in predicates.views if v.letter != predicates.answer]
             decides.add(not any(place in v.statements for v in wrong))
     assert decides == {False, True}
+
+
+def test_the_object_does_not_depend_on_which_candidate_is_the_target() -> None:
+    """So a student, which sees the candidates only, can learn to choose it."""
+    compared = chosen_in_many = 0
+    for _, predicates in random_cases(60, BOUNDS):
+        names = {o.object for o in predicates.objects if o.sight == "shown"}
+        everywhere = [names <= v.places.image.keys() for v in predicates.views]
+        if not all(everywhere):
+            continue
+        objects = []
+        for view in predicates.views:
+            candidates = tuple(
+                replace(c, agrees=c.letter == view.letter) for c in predicates.candidates
+            )
+            supposed = replace(predicates, candidates=candidates)
+            objects += choose_statements(supposed).statements[0].objects[:1]
+        compared += 1
+        chosen_in_many += len(set(objects)) == 1
+    assert compared > 3
+    assert chosen_in_many == compared
+
+
+def test_separation() -> None:
+    """The two closest places count; what both frames do not show is not compared."""
+    assert measure_separation([(0.1, 0.2), (0.4, 0.6), (0.9, 0.2), (0.4, 0.1)]) == (
+        pytest.approx(hypot(0.3, 0.1))
+    )
+    assert measure_separation([(0.1, 0.2), None, None, None]) == UNSEEN_DISTANCE
+    assert measure_separation([(0.1, 0.2), (0.1, 0.3), None, None]) == pytest.approx(0.1)
+    assert measure_separation([(0.5, 0.5)] * 2) == measure_separation([None] * 4) == 0
 
 
 def test_outcomes_name_the_closest_candidate() -> None:

@@ -11,11 +11,10 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from teacher.candidate_letters import reorder_candidates
 from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.relations import Bounds
 from train.common.held_out import check_not_empty, held_out_scenes
 from train.student.dataset import prompt_corpus, uses_only
 from train.student.lazy_samples import seeded_rng
-from train.tiny_base.questions import KINDS, QUESTIONS, Question
+from train.tiny_base.questions import KINDS, QUESTIONS, Question, make_question
 from train.tiny_base.samples import OracleSample, make_sample
 
 NO_QUESTION = Question("", "")
@@ -83,9 +82,7 @@ class ItemSampler:
         item = reorder_candidates(item, rng.permutation(len(LETTERS)).tolist())
         if kind is None:
             return item, NO_QUESTION
-        scene = self.frames.scene(item.scene_id)
-        predicates = extract_predicates(item, scene, self.frames.scene, Bounds())
-        return item, KINDS[kind](predicates, item, rng)
+        return item, make_question(kind, item, self.frames.scene, rng)
 
     def show_question(self, item: SelectionItem, question: Question) -> OracleSample:
         """Return the sample of a question about an item."""

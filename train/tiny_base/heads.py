@@ -9,7 +9,8 @@ they predict. They read
                displacement between the two frames of the picture
     "known"    visual tokens after the layer `MIDDLE`: place, whether the object moves, velocity,
                displacements ahead, and, in a candidate, displacement since the end of the clip
-               and distance from the object's places in the earlier candidates
+               and the smallest distance between two of the object's places in this and the earlier
+               candidates
     "spelled"  names of objects in a text after the layer `MIDDLE`: colour, material and shape, as
                in "seen", so that attention can compare a name with visual tokens
     "named"    names of objects in a text after the layer `NAMING`: in which pictures the object is
@@ -42,7 +43,7 @@ from train.tiny_base.oracle_targets import AHEAD, PICTURES, OracleTargets
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
 DISPLACEMENTS = ("velocity", *AHEADS, "since")
 SCALES = {"place": 6.0, "offset": 3.0, "off": 6.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
-    (*DISPLACEMENTS, "apart"), 5.0
+    (*DISPLACEMENTS, "separation"), 5.0
 )
 """Factors on places and displacements, so that their losses are of similar size."""
 SMOOTH_L1_BETA = 0.1
@@ -84,10 +85,12 @@ class OracleHeads(nn.Module):
             return nn.ModuleDict({name: nn.Linear(hidden, n) for name, n in widths.items()})
 
         self.seen = heads({"presence": 1, "inside": 2, "shift": 2, "place": 2})
-        self.known = heads({"place": 2, "moving": 1, "apart": 1} | dict.fromkeys(DISPLACEMENTS, 2))
+        self.known = heads(
+            {"place": 2, "moving": 1, "separation": 1} | dict.fromkeys(DISPLACEMENTS, 2)
+        )
         self.named = heads({"visible": PICTURES, "places": 2 * PICTURES, "future": 2})
         self.spoken = heads({"place": 2, "velocity": 2, "offset": 2, "off": 2})
-        self.spread, self.distance = nn.Linear(hidden, 1), nn.Linear(hidden, 1)
+        self.separation, self.distance = nn.Linear(hidden, 1), nn.Linear(hidden, 1)
         self.norms = nn.ModuleDict(
             {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled", "spoken")}
         )
@@ -119,7 +122,7 @@ class OracleHeads(nn.Module):
         truth = targets.truth
         losses = {
             name: regression_loss(self.known[name](known), truth[name], SCALES[name])
-            for name in ("place", "apart", *DISPLACEMENTS)
+            for name in ("place", "separation", *DISPLACEMENTS)
         }
         observed = ~truth["velocity"][:, 0].isnan()
         if observed.any():
@@ -140,8 +143,8 @@ class OracleHeads(nn.Module):
             `color`, `material` and `shape` (N,), whether the word is right; `moving` and, for
             moving objects, `heading` (one of eight), likewise; and errors as shares of the image:
             `place_error`, and `<displacement>_error` beside `<displacement>_still`, the error of
-            staying put, of objects that are displaced, and `apart_error` beside `apart_constant`,
-            the error of the median.
+            staying put, of objects that are displaced, and `separation_error` beside
+            `separation_constant`, the error of the median.
         """
         truth = targets.truth
         row, token = targets.objects.T
@@ -172,10 +175,10 @@ class OracleHeads(nn.Module):
                 displaced = moves & ~distances.isnan()
             found[f"{name}_error"] = (read[name] - truth[name]).norm(dim=1)[displaced]
             found[f"{name}_still"] = distances[displaced]
-        apart = truth["apart"][:, 0]
-        compared = ~apart.isnan()
-        found["apart_error"] = (read["apart"][:, 0] - apart)[compared].abs()
-        found["apart_constant"] = (apart - apart.nanmedian())[compared].abs()
+        separation = truth["separation"][:, 0]
+        compared = ~separation.isnan()
+        found["separation_error"] = (read["separation"][:, 0] - separation)[compared].abs()
+        found["separation_constant"] = (separation - separation.nanmedian())[compared].abs()
         return found
 
     def spelled_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
@@ -193,7 +196,7 @@ class OracleHeads(nn.Module):
         named = self.norms["named"](hidden[row, at])
         pictures = targets.has_picture[row]
         visible = (targets.name_tokens >= 0).float()[pictures]
-        spread = measure_spread(targets.name_places)[:, None]
+        separations = measure_separations(targets.name_places)[:, None]
         return {
             "visible": binary_cross_entropy_with_logits(
                 self.named["visible"](named)[pictures], visible
@@ -204,7 +207,9 @@ class OracleHeads(nn.Module):
             "future": regression_loss(
                 self.named["future"](named), targets.name_displacements, SCALES["since"]
             ),
-            "spread": regression_loss(self.spread(named), spread, SCALES["since"]),
+            "separation": regression_loss(
+                self.separation(named), separations, SCALES["separation"]
+            ),
         }
 
     def spoken_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
@@ -266,19 +271,21 @@ def regression_loss(predicted: Tensor, true: Tensor, scale: float) -> Tensor:
     return 2 * smooth_l1_loss(predicted[known], true[known] * scale, beta=SMOOTH_L1_BETA)
 
 
-def measure_spread(places: Tensor) -> Tensor:
-    """Return the mean distance (M,) of an object's places in the candidates from their mean; NaN if
-    no candidate shows the object. A prediction about objects with a large spread tells the
-    candidates apart.
+def measure_separations(places: Tensor) -> Tensor:
+    """Return the separation (M,) of the places of objects in the candidates (see
+    `teacher.deciding.measure_separation`); NaN if no candidate shows the object.
 
     Args:
         places: (M, 2 * PICTURES) places in the clip and in the candidates, NaN where the object is
-            not visible, which counts as `UNSEEN_DISTANCE`.
+            not visible.
     """
     candidates = places.unflatten(1, (-1, 2))[:, 1:]
-    distances = (candidates - candidates.nanmean(dim=1, keepdim=True)).norm(dim=2)
-    spread = distances.nan_to_num(UNSEEN_DISTANCE).mean(dim=1)
-    return spread.where((~distances.isnan()).any(dim=1), torch.nan)
+    first, second = torch.combinations(torch.arange(candidates.shape[1])).T
+    distances = (candidates[:, first] - candidates[:, second]).norm(dim=2)
+    unseen = candidates.isnan().any(dim=2)
+    neither = unseen[:, first] & unseen[:, second]
+    distances = distances.nan_to_num(UNSEEN_DISTANCE).masked_fill(neither, torch.inf)
+    return distances.amin(dim=1).masked_fill(unseen.all(dim=1), torch.nan)
 
 
 def heading_octant(vectors: Tensor) -> Tensor:

@@ -35,6 +35,8 @@ CLOSEST = re.compile(
     rf"[Tt]he (?P<name>{NAME.pattern}) is closest to its expected place in candidate (?P<letter>\w)"
 )
 """Matches where a text names the candidate that shows an object closest to its place."""
+MATCH = re.compile(r"^Candidate (?P<letter>\w) (?:matches|does not match)", re.MULTILINE)
+"""Matches where a line says whether a candidate matches the prediction."""
 PREDICTED = re.compile(
     rf"[Tt]he (?P<name>{NAME.pattern}) (?:will (?:be|have)|should be|remains|stays) "
     r"(?P<place>[^.]+)\."
@@ -153,6 +155,16 @@ class TokenizedText:
             described |= {(m.letter, m.name): m.stop - 1 for m in mentions if m.first < start}
             if (key := described.get((event["letter"], event["name"]))) is not None:
                 yield self.token_at(event.start("letter")), key
+
+    def matches(self) -> Iterator[tuple[int, int]]:
+        """Yield the index of the token of the letter in each line that says whether a candidate
+        matches, and that of the last letter before these lines, in the outcome."""
+        outcome = None
+        for event in self._find(OUTCOME, MATCH):
+            if event.re is OUTCOME:
+                outcome = self.token_at(event.end("letters") - 1)
+            elif outcome is not None:
+                yield self.token_at(event.start("letter")), outcome
 
     def comparisons(self) -> Iterator[tuple[int, int]]:
         """Yield the index of the last token of each place that a candidate is said to show, also of

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from data.records import COLORS, LETTERS, MATERIALS, SHAPES, Scene
-from teacher.deciding import UNSEEN_DISTANCE
+from teacher.deciding import measure_separation
 from teacher.predicates.facts import COMPASS
 from teacher.predicates.motion import motion_start
 from teacher.predicates.relations import EXTENTS
@@ -60,8 +60,8 @@ class ObjectTarget:
         ahead: Displacement during each number of frames of `AHEAD`; NaN in images.
         since: Displacement from the object's place at the end of the clip; NaN in the clip and in
             images of other scenes.
-        apart: Mean distance from the object's places in the earlier candidates; NaN in the clip and
-            in the first candidate.
+        separation: Smallest distance between two of the object's places in this and the earlier
+            candidates (see `measure_separation`); NaN in the clip and in the first candidate.
     """
 
     name: str
@@ -72,7 +72,7 @@ class ObjectTarget:
     velocity: tuple[float, float] = UNKNOWN
     ahead: tuple[tuple[float, float], ...] = (UNKNOWN,) * len(AHEAD)
     since: tuple[float, float] = UNKNOWN
-    apart: float = float("nan")
+    separation: float = float("nan")
 
     def cell(self, grid: int) -> int:
         """Return the index of the object's token in its picture, which has grid x grid tokens."""
@@ -139,6 +139,10 @@ class OracleTargets:
         comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
             and position of the end of the predicted place of the same object if both are the same,
             otherwise of the word before the object: shows, and, but.
+        mentioned: (_, 3) row, position before a name in a section about the scene, and position of
+            another name that the section has mentioned before.
+        matches: (_, 3) row, position of the letter in a line that says whether a candidate matches,
+            and position of the last letter in the outcome.
         next_in_clip: (_, 3) row, position before the first mention of an object in a scene parse,
             and token of the object at the end of the clip.
         next_in_candidates: (_, 3) row, position before the first mention of an object in a text and
@@ -174,6 +178,8 @@ class OracleTargets:
     verdicts: Tensor
     choices: Tensor
     comparisons: Tensor
+    mentioned: Tensor
+    matches: Tensor
     next_in_clip: Tensor
     next_in_candidates: Tensor
 
@@ -214,17 +220,12 @@ def image_targets(
 
 
 def compare_images(images: Sequence[Sequence[ObjectTarget]]) -> Iterator[ObjectTarget]:
-    """Yield the targets of candidates, each with its distance from the earlier candidates."""
+    """Yield the targets of candidates, each with its separation."""
+    places = [{t.name: t.place for t in targets} for targets in images]
     for k, image in enumerate(images):
-        earlier = [{t.name: t.place for t in targets} for targets in images[:k]]
         for target in image:
-            distances = [
-                float(np.hypot(*np.subtract(target.place, places[target.name])))
-                if target.name in places
-                else UNSEEN_DISTANCE
-                for places in earlier
-            ]
-            yield replace(target, apart=float(np.mean(distances)) if distances else UNKNOWN[0])
+            so_far = [shown.get(target.name) for shown in places[: k + 1]]
+            yield replace(target, separation=measure_separation(so_far)) if k else target
 
 
 def future_displacements(scene: Scene, frame: int, later: int) -> dict[str, tuple[float, float]]:
@@ -303,7 +304,7 @@ def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, Tensor]:
 
     Returns:
         `color`, `material` and `shape` (N,) indices; `place`, `shift`, `velocity`, `since` and
-        `ahead_<h>` (N, 2) for each h of `AHEAD`; `apart` (N, 1).
+        `ahead_<h>` (N, 2) for each h of `AHEAD`; `separation` (N, 1).
     """
     stacked = name_words([t.name for t in targets])
 
@@ -314,5 +315,5 @@ def stack_targets(targets: Sequence[ObjectTarget]) -> dict[str, Tensor]:
         stacked[name] = pairs([getattr(t, name) for t in targets])
     for k, h in enumerate(AHEAD):
         stacked[f"ahead_{h}"] = pairs([t.ahead[k] for t in targets])
-    stacked["apart"] = torch.tensor([t.apart for t in targets]).reshape(-1, 1)
+    stacked["separation"] = torch.tensor([t.separation for t in targets]).reshape(-1, 1)
     return stacked

@@ -43,12 +43,16 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
                                        the object: shows, and, but
     owner               RECALLING 3    token that describes the sphere in "the cube has the sphere
                                        left of it" -> the cube's name
+    mentioned           RECALLING 4    token before a name in a section about the scene -> the
+                                       other names that the section has mentioned before
     verdict             SPEAKING 0     token before a letter in an outcome -> "agrees" of this
                                        candidate, or its letter after "closest"
     next in clip        SPEAKING 1     token before a new name in a scene parse -> the object at the
                                        end of the clip
     next in candidates  SPEAKING 2     token before a name that is new in a text, or in its
                                        predictions -> the object in the last candidate that shows it
+    match               SPEAKING 3     letter in a line that says whether a candidate matches ->
+                                       the last letter in the outcome
     choice              CHOOSING 0     token before a letter after "closest" -> the last
                                        token about the object in this candidate
 
@@ -92,10 +96,12 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         ("repeat", RECALLING, 1, targets.repeats),
         ("comparison", RECALLING, 2, targets.comparisons),
         ("owner", RECALLING, 3, targets.owners),
+        ("mentioned", RECALLING, 4, targets.mentioned),
         ("verdict", SPEAKING, 0, targets.verdicts),
         ("choice", CHOOSING, 0, targets.choices),
         ("next in clip", SPEAKING, 1, next_in_clip),
         ("next in candidates", SPEAKING, 2, next_in_candidates),
+        ("match", SPEAKING, 3, targets.matches),
     ):
         row, query, key = pairs.T
         if len(row):

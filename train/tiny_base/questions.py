@@ -8,7 +8,7 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     describe   where each candidate shows each object, and how they lie to each other
     compare    for each of two candidates, the statements that tell it apart from the others, what
                the candidates show instead, and which other candidate is closest to it
-    explain    the steps of a rationale about candidates that do not include the target
+    explain    the steps of a rationale, with another frame of the scene instead of the target
     narrate    a whole rationale with its answer, without any picture
 
 None of them is the selection task: no answer about pictures depends on which candidate is the
@@ -16,7 +16,7 @@ target, except through what it predicts.
 `compare` supposes that a candidate, sampled at random, is the target. Its statements are chosen as
 those that decide an item, so that the model learns to find the objects that tell candidates apart,
 and how far apart their places are. In `explain`, the prediction is true of the target, but another
-candidate is shown instead of it, so that the model has to derive the prediction from the clip. The
+frame is shown instead of it, so that the model has to derive the prediction from the clip. The
 outcome of both names the candidate that shows an object closest to a place that no candidate, or
 only another one, shows. `narrate` teaches the language of rationales, in both vocabularies, and how
 an answer follows from what a text says of the candidates.
@@ -29,14 +29,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data.records import LETTERS, SelectionItem
+from data.records import Candidate, Scene, SelectionItem
 from models.student.prompts import response
 from teacher.deciding import Decision, choose_statements
 from teacher.narrator import write_match_lines, write_rationale
+from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation, RelationalPredicates, View
 from teacher.predicates.relations import (
     CHANGES,
     SYMMETRIC,
+    Bounds,
     find_topic,
     flip_relation,
     normalize_relation,
@@ -61,6 +63,9 @@ PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
 to `describe`, and of candidates that `compare` supposes to be the target."""
 SUPPOSED_PATH = 0.2
 """Path of objects to a supposed target, as a share of the image; a typical path to the target."""
+SUBSTITUTE_FRAMES, SUBSTITUTE_DISPLACEMENT = 40, 0.1
+"""A frame that is shown instead of the target is at most this many frames from it, and shows an
+object at least this share of the image elsewhere, as distractors of the tiny benchmarks do."""
 
 WEIGHTS = {
     "region": 10, "gap": 2, "side": 2, "height": 2, "nearer": 1, "sight": 1, "between": 1,
@@ -78,7 +83,7 @@ class Question:
     Attributes:
         clip, candidates: Whether the prompt shows the clip, and the candidates.
         predicts_target: Whether the answer's predictions are true of the target.
-        order: For each letter, the index of the item's candidate that is shown.
+        instead: The frame that is shown instead of the target, if any.
     """
 
     text: str
@@ -86,7 +91,7 @@ class Question:
     clip: bool = True
     candidates: bool = True
     predicts_target: bool = True
-    order: tuple[int, ...] = (0, 1, 2, 3)
+    instead: Candidate | None = None
 
 
 def ask_parse(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
@@ -160,32 +165,33 @@ def ask_compare(p: RelationalPredicates, item: SelectionItem, rng: np.random.Gen
     return Question(COMPARE, "\n".join(blocks), predicts_target=False)
 
 
-def ask_explain(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
+def ask_explain(
+    p: RelationalPredicates,
+    shown: Sequence[View],
+    item: SelectionItem,
+    rng: np.random.Generator,
+) -> Question:
     """Ask for the steps of a rationale; for the first two steps if no statement decides the item.
 
-    The prediction is that of a rationale, but no picture shows the target: another candidate takes
-    its place. So the answer does not say which candidate is the target.
+    The prediction is that of a rationale, but no picture shows the target. So the answer does not
+    say which candidate is the target.
+
+    Args:
+        shown: What the prompt shows: the distractors, and another frame instead of the target.
     """
-    statements = choose_statements(p).statements
+    statements = choose_statements(p, shown).statements
     if not statements:
         return replace(ask_parse(p, item, rng), text=EXPLAIN, candidates=True)
     writer = make_statement_writer(p, item, rng, statements, SPARSE)
-    order = list(range(len(p.views)))
-    others = [k for k in order if k != item.answer]
-    # If the closest candidate were shown twice, the outcome could not name it.
-    closest = writer.find_closest([p.views[k] for k in others])
-    others = [k for k in others if p.views[k].letter != closest]
-    order[item.answer] = others[rng.integers(len(others))]
-    views = [replace(p.views[k], letter=letter) for letter, k in zip(LETTERS, order, strict=True)]
     sections = {
         "Scene parse": writer.scene_parse(),
         "Motion analysis": writer.motion_analysis(),
         "Prediction": writer.prediction(),
-        "Candidate analysis": [f"candidate {v.letter} {writer.comparison(v)}" for v in views],
-        "Outcome": [writer.conclusion(views)],
+        "Candidate analysis": [f"candidate {v.letter} {writer.comparison(v)}" for v in shown],
+        "Outcome": [writer.conclusion(shown)],
     }
     lines = [f"{title}: {join_sentences(parts)}" for title, parts in sections.items()]
-    return Question(EXPLAIN, "\n".join(lines), order=tuple(order))
+    return Question(EXPLAIN, "\n".join(lines))
 
 
 def ask_narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
@@ -197,11 +203,47 @@ def ask_narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Gen
     return Question(NARRATE, answer, clip=False, candidates=False)
 
 
-MakeQuestion = Callable[[RelationalPredicates, SelectionItem, np.random.Generator], Question]
-KINDS: dict[str, MakeQuestion] = {
+ASK: dict[
+    str, Callable[[RelationalPredicates, SelectionItem, np.random.Generator], Question]
+] = {
     "parse": ask_parse, "predict": ask_predict, "describe": ask_describe,
-    "compare": ask_compare, "explain": ask_explain, "narrate": ask_narrate,
+    "compare": ask_compare, "narrate": ask_narrate,
 }  # fmt: skip
+KINDS = ("parse", "predict", "describe", "compare", "explain", "narrate")
+
+
+def make_question(
+    kind: str, item: SelectionItem, scene_of: Callable[[str], Scene], rng: np.random.Generator
+) -> Question:
+    """Return a question of a kind about an item.
+
+    Args:
+        scene_of: Returns a scene by its id.
+    """
+    scene = scene_of(item.scene_id)
+    predicates = extract_predicates(item, scene, scene_of, Bounds())
+    if kind != "explain":
+        return ASK[kind](predicates, item, rng)
+    other = replace_target(item, scene, rng)
+    shown = extract_predicates(other, scene, scene_of, Bounds()).views
+    question = ask_explain(predicates, shown, item, rng)
+    return replace(question, instead=other.candidates[item.answer])
+
+
+def replace_target(item: SelectionItem, scene: Scene, rng: np.random.Generator) -> SelectionItem:
+    """Return an item with another frame of the scene, sampled at random, as its target."""
+    taken = {c.frame for c in item.candidates if c.scene_id == item.scene_id}
+    first = max(item.prefix_stop + 1, item.target_frame - SUBSTITUTE_FRAMES)
+    last = min(scene.frames - 1, item.target_frame + SUBSTITUTE_FRAMES)
+    frames = [frame for frame in range(first, last + 1) if frame not in taken]
+    places = scene.image_positions / scene.image_size
+    shifts = np.linalg.norm(places[frames] - places[item.target_frame], axis=-1).max(axis=1)
+    clear = [f for f, shift in zip(frames, shifts, strict=True) if shift >= SUBSTITUTE_DISPLACEMENT]
+    # In a scene that comes to rest, no frame differs as much.
+    frame = int(rng.choice(clear)) if clear else frames[int(shifts.argmax())]
+    candidates = list(item.candidates)
+    candidates[item.answer] = Candidate(item.scene_id, frame)
+    return replace(item, target_frame=frame, candidates=tuple(candidates))
 
 
 def make_statement_writer(

@@ -82,7 +82,9 @@ def make_sample(
         future = future_displacements(scene, item.prefix_stop, item.target_frame)
     if question.candidates:
         images = []
-        shown = [item.candidates[k] for k in question.order]
+        shown = [*item.candidates]
+        if question.instead is not None:
+            shown[item.answer] = question.instead
         for picture, (letter, c) in enumerate(zip(LETTERS, shown, strict=True), last + 1):
             follows = original_scene_id(c.scene_id) == original_scene_id(item.scene_id)
             before = (scene, item.prefix_stop) if follows and clip else None
@@ -116,7 +118,7 @@ class OracleCollator:
         pairs: dict[str, list[tuple[int, ...]]] = {
             "prompt_letters": [*self._find_letters(ids, visual, samples, grid)],
             "text_tokens": [], "object_words": [], "spatial_words": [], "verdicts": [],
-            "choices": [], "comparisons": [],
+            "choices": [], "comparisons": [], "matches": [],
         }  # fmt: skip
         for row, (sample, text) in enumerate(zip(samples, texts, strict=True)):
             # The token that ends the turn follows the response.
@@ -131,6 +133,9 @@ class OracleCollator:
             ]
             pairs["choices"] += [
                 (row, start + letter - 1, start + shown) for letter, shown in text.choices()
+            ]
+            pairs["matches"] += [
+                (row, start + letter, start + outcome) for letter, outcome in text.matches()
             ]
             pairs["comparisons"] += [
                 (row, start + shown, start + predicted) for shown, predicted in text.comparisons()
@@ -320,6 +325,8 @@ def stack_samples(
         verdicts=integers(pairs["verdicts"], 3),
         choices=integers(pairs["choices"], 3),
         comparisons=integers(pairs["comparisons"], 3),
+        mentioned=integers([*find_mentioned(mentions)], 3),
+        matches=integers(pairs["matches"], 3),
         next_in_clip=integers([*find_next_in_clip(mentions)], 3),
         next_in_candidates=integers([*find_next_in_candidates(mentions)], 3),
     )
@@ -333,6 +340,18 @@ def find_repeats(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int,
         if (m.row, m.name) in mentioned:
             yield m.row, m.first - 1, mentioned[m.row, m.name]
         mentioned[m.row, m.name] = m.first
+
+
+def find_mentioned(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
+    """Yield the row, the position before a name in a section about the scene, and the position of
+    each other name that the section has mentioned before, where it was last mentioned."""
+    by_section: dict[tuple[int, str | None], dict[str, int]] = {}
+    for m in mentions:
+        if m.letter_at is not None:
+            continue
+        mentioned = by_section.setdefault((m.row, m.section), {})
+        yield from ((m.row, m.first - 1, at) for name, at in mentioned.items() if name != m.name)
+        mentioned[m.name] = m.position
 
 
 def find_next_in_clip(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:

@@ -3,7 +3,8 @@
     eyes     the vision tower, and the embeddings of the words for colours, materials and shapes,
              learn to see the objects of single pictures
     motion   the whole model learns from clips and candidates where objects are and where they go
-    words    the model learns to answer questions in words; the targets of both other stages remain
+    words    the model, but not the vision tower, learns to answer questions in words; the targets
+             of both other stages remain
 
 Several ranks share each batch: every rank computes the losses of its samples, and the gradients are
 averaged. Only the main rank evaluates and writes.
@@ -60,7 +61,7 @@ log = logging.getLogger(__name__)
 STAGES = ("eyes", "motion", "words")
 CHECKPOINT = "state.pt"
 WARMUP_STEPS, LEAST_RATE = 40, 0.05
-DENSE = 0.5
+DENSE = 1.0
 """Weight, in the stage of words, of the losses at visual tokens and of the colours, materials and
 shapes at names."""
 POINTING = 0.5
@@ -69,10 +70,10 @@ NAMED = 2.0
 """Weight of the losses of places and motion in texts."""
 WORD_LOSSES = 3.0
 """Weight of the losses of words: of all words, of those for colours, materials and shapes, of those
-for places, motion and relations, and of the letters after "closest". The second and third are a
-third and a tenth of all words, and harder to predict than the others. With a weight of 1, the
-gradient of these losses was a tenth of that of the losses of places and attention heads, and the
-base named objects that do not exist."""
+for places, motion and relations, of the letters after "closest", and of the verdicts in the match
+layout. The second and third are a third and a tenth of all words, and harder to predict than the
+others. With a weight of 1, the gradient of these losses was a tenth of that of the losses of places
+and attention heads, and the base named objects that do not exist."""
 
 
 def eyes_losses(
@@ -117,6 +118,7 @@ def words_losses(
         "object words": targets.object_words,
         "spatial words": targets.spatial_words,
         "choices": targets.choices[:, :2] + torch.tensor([0, 1]),
+        "matches": targets.matches[:, :2] + torch.tensor([0, 1]),
     }
     for name, tokens in groups.items():
         row, at = tokens.T
@@ -185,6 +187,8 @@ class BaseTrainer:
         return torch.optim.AdamW(groups, betas=betas, weight_decay=self.cfg.weight_decay)
 
     def _run_stage(self, name: str, stage: StageConfig) -> None:
+        # Words would make the vision tower worse at what it has learnt from dense targets.
+        self.model.model.visual.requires_grad_(name != "words")
         interval = max(1, math.ceil(stage.steps / self.cfg.evaluations))
         bar = tqdm(total=stage.steps, initial=self.step, desc=name, unit="step", disable=rank() > 0)
         with bar:

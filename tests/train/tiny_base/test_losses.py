@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch.nn.functional import one_hot
 
 from data.records import LETTERS
+from teacher.deciding import measure_separation
 from train.tiny_base.heads import (
     SCALES,
     OracleHeads,
     heading_octant,
-    measure_spread,
+    measure_separations,
     regression_loss,
 )
-from train.tiny_base.oracle_targets import AHEAD, PICTURES, UNSEEN_DISTANCE
+from train.tiny_base.oracle_targets import AHEAD, PICTURES
 from train.tiny_base.pointing import pointing_losses
 from train.tiny_base.trace import (
     NAMING,
@@ -32,7 +34,7 @@ from train.tiny_base.training import motion_losses, words_losses
 def test_texts_without_pictures_have_losses(sampler, collate, deep_model, heads) -> None:
     batch, targets = collate([sampler.make_sample(i, "narrate", "test") for i in sampler.items[:3]])
     losses = words_losses(deep_model, heads, batch, targets)
-    assert {"words", "spelled color", "verdict", "repeat"} <= losses.keys()
+    assert {"words", "spelled color", "verdict", "repeat", "match", "matches"} <= losses.keys()
     assert not {"color", "place", "named places", "find 0", "label", "find shown"} & losses.keys()
     assert sum(losses.values()).isfinite()
 
@@ -116,9 +118,10 @@ def test_measures_of_what_is_right_and_of_staying_put(samples, collate, deep_mod
     for name in errors[1:-1]:
         unmoved = still[name.replace("_error", "_still")]
         torch.testing.assert_close(still[name], unmoved)
-    apart = truth["apart"][~truth["apart"].isnan()]
-    torch.testing.assert_close(still["apart_error"], apart)
-    torch.testing.assert_close(still["apart_constant"], (apart - apart.median()).abs())
+    separation = truth["separation"][~truth["separation"].isnan()]
+    torch.testing.assert_close(still["separation_error"], separation)
+    constant = (separation - separation.median()).abs()
+    torch.testing.assert_close(still["separation_constant"], constant)
 
 
 def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, heads) -> None:
@@ -148,7 +151,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(sampler, collate
     assert losses.keys() == {
         "before", "second before", "track clip", *(f"find {k}" for k in range(PICTURES)), "subject",
         "find shown", "label", "letter", "repeat", "choice", "comparison", "owner",
-        "next in candidates",
+        "next in candidates", "mentioned",
         *(f"track {k}" for k in range(len(LETTERS) - 1)),
     }  # fmt: skip
     assert not any(loss.item() for loss in losses.values())
@@ -169,15 +172,16 @@ def test_headings_are_eighths_of_the_circle() -> None:
     assert heading_octant(vectors * 3 + 0.01).equal(heading_octant(vectors))
 
 
-def test_spread_is_the_mean_distance_from_the_mean_place() -> None:
-    unseen = float("nan")
-    places = torch.tensor(
-        [
-            [9, 9, 0.1, 0.2, 0.1, 0.2, 0.1, 0.2, 0.1, 0.2],
-            [9, 9, 0.0, 0.0, 0.4, 0.0, 0.4, 0.0, 0.0, 0.0],
-            [9, 9, 0.3, 0.0, 0.3, 0.0, 0.3, 0.0, unseen, unseen],
-            [0.5, 0.5, *[unseen] * 8],
-        ]
-    )
-    expected = torch.tensor([0, 0.2, UNSEEN_DISTANCE / 4, unseen])
-    assert torch.allclose(measure_spread(places), expected, equal_nan=True)
+def test_separations_are_those_by_which_rationales_choose_objects() -> None:
+    rng = np.random.default_rng(0)
+    places = rng.random((40, PICTURES, 2))
+    places[rng.random((40, PICTURES)) < 0.7] = np.nan
+    expected = [
+        measure_separation([None if np.isnan(p).any() else tuple(p) for p in row[1:]])
+        if not np.isnan(row[1:]).all()
+        else np.nan
+        for row in places
+    ]
+    found = measure_separations(torch.tensor(places, dtype=torch.float32).flatten(1))
+    assert torch.allclose(found, torch.tensor(expected), equal_nan=True)
+    assert 0 < found.isnan().sum() < 20

@@ -65,6 +65,21 @@ def test_the_closest_candidate_refers_to_what_it_shows(processor) -> None:
     assert [*text.verdicts()] == [(answer, closest)]
 
 
+def test_the_match_layout_refers_to_the_last_letter_of_the_outcome(processor) -> None:
+    text = TokenizedText(
+        "Candidate analysis: Candidate A shows the red metal cube near the left. Candidate B shows "
+        "the red metal cube near the top.\n"
+        "Outcome: The red metal cube is closest to its expected place in candidate B. This layout "
+        "is that of candidate B.\n"
+        "Candidate A does not match.\nCandidate B matches: all is there.\nAnswer: B",
+        processor.tokenizer,
+    )
+    lines = [text.token_at(m.end() - 1) for m in re.finditer("^Candidate .", text.text, re.M)][1:]
+    outcome = text.token_at(text.text.index("B.\nCandidate A"))
+    assert len(lines) == 2
+    assert [*text.matches()] == [(line, outcome) for line in lines]
+
+
 def test_places_in_candidates_are_compared_with_the_predicted_ones(processor) -> None:
     text = TokenizedText(
         "Prediction: At the end, the red metal cube will be near the top-left. The gray metal cube "

@@ -17,7 +17,14 @@ from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates, View
 from teacher.predicates.relations import Bounds, normalize_relation
 from teacher.validation.claim_extraction import extract_claims
-from train.tiny_base.questions import KINDS, Question, sample_statements, suppose_target
+from train.tiny_base.questions import (
+    ASK,
+    KINDS,
+    Question,
+    make_question,
+    sample_statements,
+    suppose_target,
+)
 
 RELATIVE = ("agrees", "extra", "displaced")
 """Kinds of claims about a candidate that refer to what was predicted."""
@@ -37,7 +44,7 @@ def described(micro_store: Store) -> Described:
 
 
 def ask(kind: str, item: SelectionItem, p: RelationalPredicates, seed: int = 0) -> Question:
-    return KINDS[kind](p, item, np.random.default_rng(seed))
+    return ASK[kind](p, item, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("kind", ["parse", "predict"])
@@ -97,28 +104,33 @@ def find_closest(name: str, p: RelationalPredicates, views: Sequence[View]) -> s
     return distances[0][1]
 
 
-def test_explained_candidates_do_not_include_the_target(described: Described) -> None:
+def test_explained_candidates_do_not_include_the_target(
+    described: Described, micro_store: Store
+) -> None:
     explained = named = 0
     for item, p in described:
-        question = ask("explain", item, p)
-        # The outcome is about the shown candidates, not about those of the item.
+        question = make_question("explain", item, micro_store.scene, np.random.default_rng(0))
         before, _, outcome = question.answer.partition("Outcome:")
         claims = extract_claims(before, p)
         claims = [c for c in claims if c.kind not in RELATIVE and c.candidate != p.answer]
         assert [c for c in claims if c.verdict == "contradicted"] == []
+        assert question.instead.scene_id == item.scene_id
+        shown = {(c.scene_id, c.frame) for c in item.candidates}
+        assert (item.scene_id, question.instead.frame) not in shown
         if not outcome:
             continue
         explained += 1
-        assert item.answer not in question.order
-        judged = dict(re.findall(r"Candidate ([A-D]) (shows[^.]+)\.", before))
-        assert judged[p.answer] == judged[LETTERS[question.order[item.answer]]]
+        candidates = list(item.candidates)
+        candidates[item.answer] = question.instead
+        other = replace(item, candidates=tuple(candidates), target_frame=question.instead.frame)
+        scene = micro_store.scene(item.scene_id)
+        shown = extract_predicates(other, scene, micro_store.scene, Bounds())
+        claims = extract_claims(before, shown)
+        claims = [c for c in claims if c.kind not in RELATIVE and c.candidate is not None]
+        assert [c for c in claims if c.verdict == "contradicted"] == []
         if found := re.search(r"closest to its expected place in candidate ([A-D])\.", outcome):
-            views = [
-                replace(p.views[k], letter=letter)
-                for letter, k in zip(LETTERS, question.order, strict=True)
-            ]
-            place = choose_statements(p).place
-            assert found[1] == find_closest(place.objects[0], p, views)
+            place = choose_statements(p, shown.views).place
+            assert found[1] == find_closest(place.objects[0], p, shown.views)
             named += 1
     assert explained > 0.9 * len(described)
     assert named > 0.5 * explained
@@ -143,8 +155,10 @@ def test_answers_about_candidates_do_not_depend_on_the_target(
         assert ask(kind, item, p) == ask(kind, item, moved)
 
 
-def test_questions_show_what_they_ask_about(described: Described) -> None:
-    shown = {k: (q.clip, q.candidates) for k in KINDS for q in [ask(k, *described[0])]}
+def test_questions_show_what_they_ask_about(described: Described, micro_store: Store) -> None:
+    rng = np.random.default_rng(0)
+    questions = {k: make_question(k, described[0][0], micro_store.scene, rng) for k in KINDS}
+    shown = {k: (q.clip, q.candidates) for k, q in questions.items()}
     assert shown == {
         "parse": (True, False),
         "predict": (True, False),

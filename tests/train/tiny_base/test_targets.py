@@ -12,6 +12,7 @@ from transformers import AutoTokenizer
 
 from data.records import LETTERS, sample_prefix_frames
 from data.store import Store
+from teacher.deciding import UNSEEN_DISTANCE
 from teacher.predicates.motion import find_cut, motion_start
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.mentions import TokenizedText
@@ -20,7 +21,6 @@ from train.tiny_base.oracle_targets import (
     RATE,
     SPATIAL_WORDS,
     UNKNOWN,
-    UNSEEN_DISTANCE,
     WORDS,
     ObjectTarget,
     OracleTargets,
@@ -144,9 +144,9 @@ def test_candidates_are_compared_with_the_earlier_ones() -> None:
     found = [*compare_images(images)]
     assert [t.name for t in found] == ["a", "b", "a", "a", "b"]
     assert [t.place for t in found] == [t.place for image in images for t in image]
-    apart = [t.apart for t in found]
-    assert np.isnan(apart[:2]).all()
-    assert apart[2:] == pytest.approx([0.5, 0.25, (0.5**0.5 + UNSEEN_DISTANCE) / 2])
+    separations = [t.separation for t in found]
+    assert np.isnan(separations[:2]).all()
+    assert separations[2:] == pytest.approx([0.5, 0, UNSEEN_DISTANCE])
 
 
 def test_objects_are_recognised_in_the_earlier_candidates(sampler, collate) -> None:
@@ -188,6 +188,26 @@ def test_scene_parses_refer_to_the_object_that_they_name_next(sampler, collate) 
     assert len(targets.next_in_clip) > 10
     for token, found in next_names(targets, targets.next_in_clip):
         assert token == found[0]
+
+
+def test_sections_refer_to_the_other_names_that_they_have_mentioned(
+    sampler, collate, processor
+) -> None:
+    samples = [sampler.make_sample(item, "explain", "test") for item in sampler.items[:6]]
+    batch, targets = collate(samples)
+    mentioned: dict[tuple[int, int], list[int]] = {}
+    for row, before, at in targets.mentioned.tolist():
+        mentioned.setdefault((row, before), []).append(at)
+    assert len(mentioned) > 20
+    for (row, before), places in mentioned.items():
+        ids = batch["input_ids"][row]
+        text = processor.decode(ids[: before + 1])
+        names = [" ".join(processor.decode(ids[: at + 1]).split()[-3:]) for at in places]
+        following = processor.decode(ids[before + 1 :]).split()[:3]
+        assert len({*names, " ".join(following)}) == len(names) + 1
+        section = text.rpartition("\n")[2]
+        assert section.startswith(("Scene parse", "Motion analysis", "Prediction", "Outcome"))
+        assert all(name.lower() in section.lower() for name in names)
 
 
 def test_pictures_refer_to_the_letters_of_their_candidates(sampler, collate, processor) -> None:
