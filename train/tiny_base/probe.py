@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from transformers import PreTrainedModel
 
+from train.tiny_base.collator import OracleCollator
 from train.tiny_base.heads import OracleHeads
-from train.tiny_base.samples import OracleCollator, OracleSample
+from train.tiny_base.samples import OracleSample
 from train.tiny_base.trace import (
     MIDDLE,
     NAMING,

@@ -14,7 +14,9 @@ from data.records import LETTERS, sample_prefix_frames
 from data.store import Store
 from teacher.deciding import UNSEEN_DISTANCE
 from teacher.predicates.motion import find_cut, motion_start
+from train.tiny_base.collator import object_token_ids, spatial_token_ids
 from train.tiny_base.data import ItemSampler
+from train.tiny_base.located_mentions import measure_error, spoken_state
 from train.tiny_base.mentions import TokenizedText
 from train.tiny_base.oracle_targets import (
     AHEAD,
@@ -33,13 +35,7 @@ from train.tiny_base.oracle_targets import (
 )
 from train.tiny_base.pointing import locate_objects
 from train.tiny_base.questions import KINDS
-from train.tiny_base.samples import (
-    measure_error,
-    object_token_ids,
-    shown_objects,
-    spatial_token_ids,
-    spoken_state,
-)
+from train.tiny_base.samples import shown_objects
 
 GRID = 3
 """Visual tokens along the side of an image of 96 px."""
