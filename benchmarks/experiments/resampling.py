@@ -1,0 +1,73 @@
+"""Accuracies of recorded letters, with intervals over scenes and seeds.
+
+A record has a row per test item, variant, seed and mode, with the columns family, scene_id,
+item_id, answer and letter.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+import pandas as pd
+
+from data.records import FAMILIES
+
+DRAWS = 4000
+"""Number of bootstrap samples."""
+
+
+def credit_matrix(table: pd.DataFrame, variant: str, mode: str) -> pd.DataFrame:
+    """Return 1 for each right answer and 0 for each wrong one, (items, seeds)."""
+    rows = table[(table.variant == variant) & (table["mode"] == mode)]
+    credits = (rows.letter == rows.answer).astype(float)
+    return credits.groupby([rows.family, rows.scene_id, rows.item_id, rows.seed]).sum().unstack()
+
+
+class Resampling:
+    """A bootstrap over scenes and seeds of the accuracy in each family and their mean, the macro.
+
+    All results share the resampled scenes, and those of the same trained students the resampled
+    seeds. The seeds of different variants are resampled independently, since runs of two variants
+    with the same seed have nothing in common but its number.
+    """
+
+    def __init__(self, items: pd.MultiIndex) -> None:
+        families = items.get_level_values("family")
+        self._scene, scenes = pd.factorize(items.get_level_values("scene_id"))
+        self._members = [families == family for family in FAMILIES]
+        share = np.full(len(scenes), 1 / len(scenes))
+        # (draws, scenes) how often each draw contains each scene.
+        weights = np.random.default_rng(0).multinomial(len(scenes), share, size=DRAWS)
+        self._weights = weights.astype(float)
+
+    def means(self, credits: pd.DataFrame) -> np.ndarray:
+        """Return (families + 1,) means over all items and seeds: of each family, and the macro."""
+        means = [credits[members].to_numpy().mean() for members in self._members]
+        return np.array([*means, np.mean(means)])
+
+    def intervals(
+        self, first: tuple[str, pd.DataFrame], second: tuple[str, pd.DataFrame] | None = None
+    ) -> list[tuple[float, float, float]]:
+        """Return the mean and the bounds of its interval, in percent, for each family and the macro
+        of `first`, or of the difference `first` minus `second`. Both are a variant and its credits.
+        """
+        means, draws = self.means(first[1]), self._draws(*first)
+        if second is not None:
+            means, draws = means - self.means(second[1]), draws - self._draws(*second)
+        low, high = np.percentile(draws, [2.5, 97.5], axis=0)
+        return [tuple(100 * np.array(t)) for t in zip(means, low, high, strict=True)]
+
+    def _draws(self, variant: str, credits: pd.DataFrame) -> np.ndarray:
+        """Return the means of each draw, (draws, families + 1)."""
+        seeds = credits.shape[1]
+        rng = np.random.default_rng([0, zlib.crc32(variant.encode())])
+        seed_shares = rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=DRAWS) / seeds
+        means = []
+        for members in self._members:
+            sums = np.zeros((self._weights.shape[1], seeds))
+            np.add.at(sums, self._scene[members], credits[members].to_numpy())
+            counts = np.bincount(self._scene[members], minlength=len(sums))
+            totals = ((self._weights @ sums) * seed_shares).sum(axis=1)
+            means.append(totals / (self._weights @ counts))
+        return np.column_stack([*means, np.mean(means, axis=0)])
