@@ -110,11 +110,13 @@ def train_and_save(
     """Train a student, save it in the run's folder, and return the run's metrics.
 
     Args:
+        trainer: A trainer with a sampler, `responses`.
         memory_settings: The settings that the error for running out of memory advises to lower.
     """
     model = trainer.model
     best_step = run_training(trainer, run, checkpoint, memory_settings)
     if rank() == 0:
         loading.save_student(model, processor, run.folder / "student", precision)
+    trainer.responses.close()
     log.info("the student is in %s", run.folder / "student")
     return run_metrics(run.folder, best_step)

@@ -75,7 +75,7 @@ class DistillationTrainer(StudentTrainer):
         **settings: Any,
     ) -> None:
         super().__init__(*args, compute_loss_func=self._mean_divergence, **settings)
-        self._teacher, self._responses = teacher, responses
+        self._teacher, self.responses = teacher, responses
         self._student_collator = student_collator
         self._read: Any = None
         self._sampled: list[tuple[bool, bool, int]] = []
@@ -99,14 +99,14 @@ class DistillationTrainer(StudentTrainer):
         texts = []
         if prompts:
             samples, seeds = [p.student for p in prompts], [p.seed for p in prompts]
-            texts = self._responses.sample(self.model, samples, seeds)
+            texts = self.responses.sample(self.model, samples, seeds)
         letters = [parse_choice(t.text, cut=t.cut).letter for t in texts]
         counted = [k for k, prompt in enumerate(prompts) if prompt.supervised]
         self._sampled += [
             (letters[k] == prompts[k].letter, letters[k] is not None, len(texts[k].ids))
             for k in counted
         ]
-        self._responses.check_parsed([letters[k] for k in counted], self.accelerator)
+        self.responses.check_parsed([letters[k] for k in counted], self.accelerator)
         return texts
 
     def compute_loss(

@@ -138,7 +138,7 @@ class MediaGRPOTrainer(GRPOTrainer):
             super().__init__(model, *args, rollout_func=self._respond, **settings)
         for parameter, data in trained.items():
             parameter.data = data
-        self._items, self._responses, self._collator = items, responses, collator
+        self._items, self.responses, self._collator = items, responses, collator
         self._judged: list[JudgedItem] = []
         self._prompts: list[Sample] = []
         self._inputs: list[Sample] = []
@@ -189,14 +189,14 @@ class MediaGRPOTrainer(GRPOTrainer):
             key = (self.args.seed, mode, step, name, seen[name], self.accelerator.process_index)
             seeds.append(int(seeded_rng(*key).integers(2**31)))
             seen[name] += 1
-        texts = self._responses.sample(self.model, self._prompts, seeds)
+        texts = self.responses.sample(self.model, self._prompts, seeds)
         self.model.train(training)
         judged = [
             judge_response(t.text, t.cut, j.item, j.predicates)
             for t, j in zip(texts, self._judged, strict=True)
         ]
         if training:
-            self._responses.check_parsed([j.letter for j in judged], self.accelerator)
+            self.responses.check_parsed([j.letter for j in judged], self.accelerator)
         batch = self._collator(self._prompts)
         prompt_ids = [
             ids[mask.bool()].tolist()

@@ -62,6 +62,9 @@ class ResponseSampler:
             limit = self._sampling.max_new_tokens
             return generate(model, self._processor, inputs, limit, self._precision, steps)
 
+    def close(self) -> None:
+        """Release what the sampler uses besides the model."""
+
     def check_parsed(self, letters: Sequence[str | None], accelerator: Accelerator) -> None:
         """Raise UserError on all ranks if `MAX_UNPARSED` responses in a row had no answer.
 

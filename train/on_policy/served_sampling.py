@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import shutil
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,11 +73,21 @@ class ServedSampler(ResponseSampler):
         """
         return asyncio.run(self._sample(model, prompts, seeds))
 
+    def close(self) -> None:
+        """Remove the adapters from the servers and from the run's folder.
+
+        Raises:
+            UserError: The servers do not respond.
+        """
+        if rank() == 0 and self._folder.exists():
+            with explain_no_response():
+                asyncio.run(self._remove_adapters())
+
     async def _sample(
         self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]
     ) -> list[GeneratedText]:
         texts = [GeneratedText("") for _ in prompts]
-        try:
+        with explain_no_response():
             # The other ranks wait until the main rank has given the adapters to the servers.
             with main_first():
                 if rank() == 0:
@@ -88,12 +99,6 @@ class ServedSampler(ResponseSampler):
                     texts[index] = await self._request(pool, prompts[index], seeds[index])
 
                 await run_limited(range(len(prompts)), self._servers.concurrency, respond)
-        except NoResponseError as error:
-            raise UserError(
-                f"the servers of sampling_server.url sample no responses ({error}): correct the "
-                "cause and run the same command again, which resumes",
-                code="no-response",
-            ) from error
         return texts
 
     def _connect(self, name: str) -> ServerPool:
@@ -117,9 +122,19 @@ class ServedSampler(ResponseSampler):
         model.save_pretrained(folder, save_embedding_layers=False)
         async with self._connect(folder.name) as pool:
             await pool.load_adapter(folder)
-            for path in earlier:
-                await pool.unload_adapter(path.name)
-                shutil.rmtree(path)
+            await self._unload(pool, earlier)
+
+    async def _remove_adapters(self) -> None:
+        remaining = self._list_adapters()
+        if remaining:
+            async with self._connect(remaining[0].name) as pool:
+                await self._unload(pool, remaining)
+        self._folder.rmdir()
+
+    async def _unload(self, pool: ServerPool, folders: Sequence[Path]) -> None:
+        for folder in folders:
+            await pool.unload_adapter(folder.name)
+            shutil.rmtree(folder)
 
     async def _request(self, pool: ServerPool, prompt: Sample, seed: int) -> GeneratedText:
         fields = sampling_fields(self._sampling, self._sampling.max_new_tokens, prompt.clip)
@@ -140,6 +155,19 @@ class ServedSampler(ResponseSampler):
             )
         text = self._processor.tokenizer.decode(ids, skip_special_tokens=True)
         return GeneratedText(text, response.flaw == TRUNCATED, ids)
+
+
+@contextmanager
+def explain_no_response() -> Iterator[None]:
+    """Say what to do if the servers do not respond."""
+    try:
+        yield
+    except NoResponseError as error:
+        raise UserError(
+            f"the servers of sampling_server.url sample no responses ({error}): correct the cause "
+            "and run the same command again, which resumes",
+            code="no-response",
+        ) from error
 
 
 def build_sampler(

@@ -158,6 +158,10 @@ def test_vllm_samples_from_the_current_adapters(
     assert len(list((tmp_path / "sampled_adapters").iterdir())) == 1
     models = {m.id for m in openai.OpenAI(base_url=vllm.url, api_key="none").models.list()}
     assert len([name for name in models if name.startswith("student-")]) == 1
+    sampler.close()
+    models = {m.id for m in openai.OpenAI(base_url=vllm.url, api_key="none").models.list()}
+    assert not any(name.startswith("student-") for name in models)
+    assert not (tmp_path / "sampled_adapters").exists()
 
     larger = replace(cfg, lora=LoraConfig(rank=16))
     model, _ = loading.load_student(larger, "fp32", list)
@@ -174,6 +178,7 @@ def test_a_student_is_distilled_from_responses_of_a_server(vllm, settings, tmp_p
     losses = [r for r in read_journal(run.folder) if "loss" in r]
     assert len(losses) == 2
     assert all(r["loss"] > 0 and r["sampled_length"] == 8 for r in losses)
+    assert not (run.folder / "sampled_adapters").exists()
 
 
 class FaultyHandler(JsonHandler):
