@@ -44,44 +44,60 @@ class Workers:
     engine: str = "loky"
 
     def run(
-        self, jobs: Mapping[str, Job], title: str, unit: str, done: int = 0
+        self,
+        jobs: Mapping[str, Job],
+        title: str,
+        unit: str,
+        done: int = 0,
+        sizes: Mapping[str, int] | None = None,
     ) -> Iterator[tuple[str, Any]]:
         """Run jobs and yield their names and results in order of completion.
 
         Args:
             jobs: Functions without arguments, by name.
             title: Title of the progress bar.
-            unit: What a job processes, in the singular.
-            done: Number of completed jobs, besides `jobs`, for the progress bar.
+            unit: What the progress bar counts, in the singular.
+            done: What has been done besides `jobs`, in units.
+            sizes: Units of each job, by name; one each by default.
 
         Raises:
             UserError: workers die repeatedly without finishing a job.
         """
         remaining = dict(jobs)
-        total = done + len(remaining)
+        sizes = sizes or dict.fromkeys(jobs, 1)
+        total = done + sum(sizes[name] for name in jobs)
         with tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=1.0) as bar:
             deaths = 0
             while remaining:
                 try:
                     for name, result in self._results(remaining):
                         del remaining[name]
-                        bar.update()
+                        bar.update(sizes[name])
                         deaths = 0
                         yield name, result
                 except _death_errors(self.engine) as error:
                     deaths += 1
                     if deaths > MAX_DEATHS:
                         raise UserError(
-                            f"{title}: workers die before they finish a {unit}, probably because "
+                            f"{title}: workers die before they finish a job, probably because "
                             f"memory is short; try workers={max(self.count // 2, 1)}",
                             code="dying-workers",
                         ) from error
                     log.warning("a worker died; retrying its jobs")
 
-    def write_files(self, jobs: Mapping[Path, Job], title: str, unit: str) -> None:
+    def write_files(
+        self,
+        jobs: Mapping[Path, Job],
+        title: str,
+        unit: str,
+        sizes: Mapping[Path, int] | None = None,
+    ) -> None:
         """Run the jobs whose files do not exist; see `run`. Each job must write this file last."""
+        sizes = sizes or dict.fromkeys(jobs, 1)
         missing = {str(path): job for path, job in jobs.items() if not path.exists()}
-        for _ in self.run(missing, title, unit, done=len(jobs) - len(missing)):
+        sizes_of_missing = {str(path): sizes[path] for path in jobs if str(path) in missing}
+        done = sum(sizes.values()) - sum(sizes_of_missing.values())
+        for _ in self.run(missing, title, unit, done, sizes_of_missing):
             pass
 
     def _results(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Any]]:

@@ -72,13 +72,14 @@ def make_items_and_queries(
         name: part_path(folder, [*inputs, name, asdict(quota)]) for name, quota in quotas.items()
     }
     # Largest quotas first, so that no single worker is left with a large job at the end.
-    jobs = {}
+    jobs, sizes = {}, {}
     for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train):
         cell = CellInputs(scene_ids, partial(_load, folder), quota, *settings)
         jobs[paths[name]] = partial(_run_job, cfg, name, cell, paths[name])
+        sizes[paths[name]] = quota.train + quota.test
     if cfg.distractors == "balanced":
         remove_other_parts(folder, paths.values())
-    workers.write_files(jobs, "making items and queries", "cell")
+    workers.write_files(jobs, "making items and queries", "item", sizes)
     items: list[SelectionItem] = []
     scores: dict[str, list[list[list[float]]]] = {}
     queries: list[RetrievalQuery] = []
