@@ -139,6 +139,21 @@ def test_every_relational_rationale_is_accepted_and_sufficient() -> None:
     assert np.mean(lengths["relational"]) < np.mean(paper)
 
 
+def test_motion_analyses_mention_the_deciding_objects_that_stay() -> None:
+    mentioned = 0
+    for item, predicates in random_cases(120, BOUNDS):
+        text = write_rationale(predicates, item, seed=0)
+        motion = text.partition("Motion analysis: ")[2].partition("\nPrediction")[0]
+        if "The objects remain where they are" in motion:
+            continue
+        names = {n for s in choose_statements(predicates).statements for n in s.objects}
+        for o in predicates.objects:
+            if o.object in names and o.extent == "stays":
+                assert f"The {o.object} remains where it is." in motion, text
+                mentioned += 1
+    assert mentioned > 10
+
+
 def test_wrong_candidates_are_compared_with_the_chosen_statements_only() -> None:
     for item, predicates in random_cases(60, BOUNDS):
         text = write_rationale(predicates, item, seed=0)
