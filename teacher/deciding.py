@@ -55,10 +55,10 @@ def choose_statements(
     """Choose the place of an object by which a reader finds the target, and a smallest set of
     further statements that excludes the other distractors.
 
-    The object is the one whose places distinguish the candidates best: the two closest of its
-    places are the farthest apart. A reader compares these places with the one that it predicts, and
-    chooses the closest. This choice depends only on what the candidates show, not on which of them
-    is the target, so that a student can learn it.
+    Of the objects that the target shows, the object is the one whose places distinguish the
+    candidates best: the two closest of its places are the farthest apart. A reader compares these
+    places with the one that it predicts, and chooses the closest. A student can learn this choice
+    from what the candidates show, without knowing which of them is the target.
 
     Of the sets of further statements of a size, the one is chosen with which a reader most likely
     finds every statement true of the predicted state and of the target, and one statement false of
@@ -95,7 +95,7 @@ def choose_statements(
 
 def _choose_place(predicates: RelationalPredicates, shown: Sequence[View]) -> Relation | None:
     """Return where the target shows the object whose places distinguish the shown frames best; of
-    several, the one with the shortest path. None if no object is in view both at the cut and at the
+    several, the leftmost at the cut. None if no object is in view both at the cut and at the
     target."""
     seen = {o.object for o in predicates.objects if o.sight != OUT_OF_VIEW}
     places = [
@@ -104,10 +104,10 @@ def _choose_place(predicates: RelationalPredicates, shown: Sequence[View]) -> Re
         if s.kind == "region" and s.objects[0] in seen
     ]
 
-    def rank(place: Relation) -> tuple[float, float]:
+    def rank(place: Relation) -> tuple[float, int]:
         (name,) = place.objects
-        path = predicates.paths.get(name, UNKNOWN_PATH)
-        return measure_separation([v.places.image.get(name) for v in shown]), -path
+        separation = measure_separation([v.places.image.get(name) for v in shown])
+        return separation, -predicates.left_to_right.index(name)
 
     return max(places, key=rank, default=None)
 

@@ -98,11 +98,12 @@ def find_repeats(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int,
 def find_mentioned(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
     """Yield the row, the position before a name in a section about the scene, and the position of
     each other name that the section has mentioned before, where it was last mentioned."""
-    by_section: dict[tuple[int, str | None], dict[str, int]] = {}
+    section, mentioned = None, {}
     for m in mentions:
+        if (m.row, m.section) != section:
+            section, mentioned = (m.row, m.section), {}
         if m.letter_at is not None:
             continue
-        mentioned = by_section.setdefault((m.row, m.section), {})
         yield from ((m.row, m.first - 1, at) for name, at in mentioned.items() if name != m.name)
         mentioned[m.name] = m.position
 

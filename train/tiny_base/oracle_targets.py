@@ -26,7 +26,7 @@ SPATIAL_WORDS = {
     "heading": COMPASS,
     "region": ("top", "left", "right", "center", "bottom"),
     "speed": ("slowly", "steadily", "quickly", "rests", "stationary"),
-    "gap": ("touch", "apart"),
+    "gap": ("apart",),
     "height": ("above", "below", "level"),
     "extent": EXTENTS,
 }

@@ -11,15 +11,14 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     explain    the steps of a rationale, with another frame of the scene instead of the target
     narrate    a whole rationale with its answer, without any picture
 
-None of them is the selection task: no answer about pictures depends on which candidate is the
-target, except through what it predicts.
-`compare` supposes that a candidate, sampled at random, is the target. Its statements are chosen as
-those that decide an item, so that the model learns to find the objects that tell candidates apart,
-and how far apart their places are. In `explain`, the prediction is true of the target, but another
-frame is shown instead of it, so that the model has to derive the prediction from the clip. The
-outcome of both names the candidate that shows an object closest to a place that no candidate, or
-only another one, shows. `narrate` teaches the language of rationales, in both vocabularies, and how
-an answer follows from what a text says of the candidates.
+None of them is the selection task: where an answer says which candidate agrees with a prediction,
+no picture shows the target. `compare` supposes that a candidate, sampled at random, is the target.
+Its statements are chosen as those that decide an item, so that the model learns to find the objects
+that tell candidates apart, and how far apart their places are. In `explain`, the prediction is true
+of the target, but another frame is shown instead of it, so that the model has to derive the
+prediction from the clip. The outcome of both names the candidate that shows an object closest to a
+place that no candidate, or only another one, shows. `narrate` teaches the language of rationales,
+in both vocabularies, and how an answer follows from what a text says of the candidates.
 """
 
 from __future__ import annotations
@@ -30,6 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data.records import Candidate, Scene, SelectionItem
+from data.world.displacement import frame_displacements
 from models.student.prompts import response
 from teacher.deciding import Decision, choose_statements
 from teacher.narrator import write_match_lines, write_rationale
@@ -63,9 +63,11 @@ PREDICTED, DESCRIBED, COMPARED = 3, 2, 2
 to `describe`, and of candidates that `compare` supposes to be the target."""
 SUPPOSED_PATH = 0.2
 """Path of objects to a supposed target, as a share of the image; a typical path to the target."""
-SUBSTITUTE_FRAMES, SUBSTITUTE_DISPLACEMENT = 40, 0.1
-"""A frame that is shown instead of the target is at most this many frames from it, and shows an
-object at least this share of the image elsewhere, as distractors of the tiny benchmarks do."""
+SUBSTITUTES, SUBSTITUTE_DISPLACEMENT = 12, 34.0
+"""The frame that is shown instead of the target is one of this many frames that are nearest to the
+target in time, of those that differ from the target and from each distractor of the same scene by
+at least this displacement of an object (px at 336 x 336), as candidates of the tiny benchmarks do.
+"""
 
 WEIGHTS = {
     "region": 10, "gap": 2, "side": 2, "height": 2, "nearer": 1, "sight": 1, "between": 1,
@@ -171,7 +173,7 @@ def ask_explain(
     item: SelectionItem,
     rng: np.random.Generator,
 ) -> Question:
-    """Ask for the steps of a rationale; for the first two steps if no statement decides the item.
+    """Ask for the steps of a rationale; for the first two if no statement excludes a shown frame.
 
     The prediction is that of a rationale, but no picture shows the target. So the answer does not
     say which candidate is the target.
@@ -181,7 +183,7 @@ def ask_explain(
     """
     statements = choose_statements(p, shown).statements
     if not statements:
-        return replace(ask_parse(p, item, rng), text=EXPLAIN, candidates=True)
+        return ask_first_steps(p, item, rng)
     writer = make_statement_writer(p, item, rng, statements, SPARSE)
     sections = {
         "Scene parse": writer.scene_parse(),
@@ -192,6 +194,13 @@ def ask_explain(
     }
     lines = [f"{title}: {join_sentences(parts)}" for title, parts in sections.items()]
     return Question(EXPLAIN, "\n".join(lines))
+
+
+def ask_first_steps(
+    p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator
+) -> Question:
+    """Ask for the scene parse and the motion analysis of a rationale."""
+    return replace(ask_parse(p, item, rng), text=EXPLAIN, candidates=True)
 
 
 def ask_narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Generator) -> Question:
@@ -225,22 +234,26 @@ def make_question(
     if kind != "explain":
         return ASK[kind](predicates, item, rng)
     other = replace_target(item, scene, rng)
+    if other is None:
+        return ask_first_steps(predicates, item, rng)
     shown = extract_predicates(other, scene, scene_of, Bounds()).views
     question = ask_explain(predicates, shown, item, rng)
     return replace(question, instead=other.candidates[item.answer])
 
 
-def replace_target(item: SelectionItem, scene: Scene, rng: np.random.Generator) -> SelectionItem:
-    """Return an item with another frame of the scene, sampled at random, as its target."""
-    taken = {c.frame for c in item.candidates if c.scene_id == item.scene_id}
-    first = max(item.prefix_stop + 1, item.target_frame - SUBSTITUTE_FRAMES)
-    last = min(scene.frames - 1, item.target_frame + SUBSTITUTE_FRAMES)
-    frames = [frame for frame in range(first, last + 1) if frame not in taken]
-    places = scene.image_positions / scene.image_size
-    shifts = np.linalg.norm(places[frames] - places[item.target_frame], axis=-1).max(axis=1)
-    clear = [f for f, shift in zip(frames, shifts, strict=True) if shift >= SUBSTITUTE_DISPLACEMENT]
-    # In a scene that comes to rest, no frame differs as much.
-    frame = int(rng.choice(clear)) if clear else frames[int(shifts.argmax())]
+def replace_target(
+    item: SelectionItem, scene: Scene, rng: np.random.Generator
+) -> SelectionItem | None:
+    """Return an item with another frame of its scene as its target (see `SUBSTITUTES`); None if no
+    frame differs enough from all candidates."""
+    others = [c.frame for c in item.candidates if c.scene_id == item.scene_id]
+    frames = np.arange(item.prefix_stop + 1, scene.frames)
+    shifts = frame_displacements(scene)[np.ix_(frames, others)].min(axis=1)
+    clear = frames[shifts >= SUBSTITUTE_DISPLACEMENT]
+    nearest = clear[np.argsort(np.abs(clear - item.target_frame), kind="stable")][:SUBSTITUTES]
+    if not len(nearest):
+        return None
+    frame = int(rng.choice(nearest))
     candidates = list(item.candidates)
     candidates[item.answer] = Candidate(item.scene_id, frame)
     return replace(item, target_frame=frame, candidates=tuple(candidates))
