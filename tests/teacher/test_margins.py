@@ -165,13 +165,13 @@ def test_clear_statements_are_chosen() -> None:
 
 
 def test_objects_with_short_paths_are_preferred() -> None:
-    """If the path of one object grows, a statement about it is not chosen more often."""
+    """If the path of one object grows, fewer of the statements after the place are about it."""
     before = after = 0
-    for _, predicates in random_cases(60, BOUNDS):
+    for _, predicates in random_cases(150, BOUNDS):
         name = predicates.objects[0].object
         longer = replace(predicates, paths={**predicates.paths, name: 5.0})
-        before += any(name in s.objects for s in choose_statements(predicates).statements)
-        after += any(name in s.objects for s in choose_statements(longer).statements)
+        before += any(name in s.objects for s in choose_statements(predicates).statements[1:])
+        after += any(name in s.objects for s in choose_statements(longer).statements[1:])
     assert after < before
 
 
