@@ -93,11 +93,10 @@ class Workers:
         sizes: Mapping[Path, int] | None = None,
     ) -> None:
         """Run the jobs whose files do not exist; see `run`. Each job must write this file last."""
-        sizes = sizes or dict.fromkeys(jobs, 1)
         missing = {str(path): job for path, job in jobs.items() if not path.exists()}
-        sizes_of_missing = {str(path): sizes[path] for path in jobs if str(path) in missing}
-        done = sum(sizes.values()) - sum(sizes_of_missing.values())
-        for _ in self.run(missing, title, unit, done, sizes_of_missing):
+        named = {str(path): sizes[path] if sizes else 1 for path in jobs}
+        done = sum(size for name, size in named.items() if name not in missing)
+        for _ in self.run(missing, title, unit, done, named):
             pass
 
     def _results(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Any]]:

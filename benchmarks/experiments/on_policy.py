@@ -13,11 +13,11 @@ The variants are
 
 The record, `on_policy.parquet`, has a row per test item and run. The first table has accuracies in
 percent, with 95% intervals over scenes and seeds, and minutes of CPU time: those of the trainings
-that a variant needs besides the student, and for the first row those of the student. The second one
-describes the responses: the share of their claims that the oracle supports; answers that follow
-from the response; responses that state a number; different sequences of four words, as a share of
-all; and the share of claims about objects that are out of view at the end of the observation, which
-only a reader of the facts can know.
+that a variant needs besides the student, and for the first row those of the student, without
+trainings that were interrupted. The second one describes the responses: the share of their claims
+that the oracle supports; answers that follow from the response; responses that state a number;
+different sequences of four words, as a share of all; and the share of claims about objects that are
+out of view at the end of the observation, which only a reader of the facts can know.
 """
 
 from __future__ import annotations
@@ -41,19 +41,16 @@ from benchmarks.experiments.experiment import (
     run_command,
     training_settings,
 )
-from benchmarks.experiments.resampling import Resampling, credit_matrix
+from benchmarks.experiments.records import Resampling, count_claims, credit_matrix
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import DistillCommand, ReinforceCommand, SftCommand
-from data.records import FAMILIES, SelectionItem
+from data.records import FAMILIES
 from data.store import Store
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
 from teacher.numbers.detection import find_numbers
-from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.facts import OUT_OF_VIEW
-from teacher.predicates.relations import Bounds
-from teacher.validation.reasons import PARTS, SUPPORTED, read_response
+from teacher.validation.reasons import PARTS
 from teacher.vocabulary import VERSIONS
 
 RECORD = Path(__file__).with_name("on_policy.parquet")
@@ -82,9 +79,11 @@ def main() -> None:
     def run_variant(job: Job) -> list[dict[str, Any]]:
         variant, seed = job
         name = f"{prefix}-{variant.replace(' ', '_')}-{seed}"
+        # What an interrupted training took before is not known.
+        resumed = any(args.checkpoints.glob(f"*/{name}*"))
         started = cpu_minutes()
-        model = train_variant(experiment, variant, name, f"{prefix}-{{}}-{seed}", seed)
-        minutes = cpu_minutes() - started
+        model = train_variant(experiment, variant, name, f"{prefix}-student-{seed}", seed)
+        minutes = None if resumed else cpu_minutes() - started
         shared = experiment.shared_overrides
         run_command([
             "evaluation.select", f"model={model}", "modes=[reasoning]", "batch=64", *shared,
@@ -100,27 +99,28 @@ def main() -> None:
     print_responses(results)
 
 
-def train_variant(experiment: Experiment, variant: str, name: str, name_of: str, seed: int) -> Path:
+def train_variant(experiment: Experiment, variant: str, name: str, student: str, seed: int) -> Path:
     """Train a variant, and return the folder of its run.
 
     Args:
-        name_of: Format of the names of the runs of this seed.
+        name: Run of the variant.
+        student: Run of the student that further training continues.
     """
     shared, checkpoints = experiment.shared_overrides, experiment.args.checkpoints
-    student = checkpoints / "sft" / name_of.format("student")
+    source = checkpoints / "sft" / student
     where = [f"store={experiment.args.store}", f"checkpoints={checkpoints}", f"seed={seed}"]
     if variant in ("student", "longer SFT"):
         longer = [f"train.epochs={experiment.args.epochs}"] * (variant == "longer SFT")
         run_command(["train.sft", *SFT, *longer, *shared, f"seed={seed}", f"run={name}"])
         return checkpoints / "sft" / name
     if variant == "rewards":
-        run_command(["train.reinforce", *REWARDS, f"model={student}", *where, f"run={name}"])
+        run_command(["train.reinforce", *REWARDS, f"model={source}", *where, f"run={name}"])
         return checkpoints / "reinforce" / name
-    teacher = name_of.format("teacher")
+    teacher = f"{name}-teacher"
     facts = [*SFT, "train.facts=true", *shared, f"seed={seed}", f"run={teacher}"]
     run_command(["train.sft", *facts])
     run_command([
-        "train.distill", *DISTILL, f"model={student}",
+        "train.distill", *DISTILL, f"model={source}",
         f"teacher_model={checkpoints / 'sft' / teacher}", *where, f"run={name}",
     ])  # fmt: skip
     return checkpoints / "distill" / name
@@ -143,26 +143,7 @@ def read_rows(folder: Path, store: Store) -> Iterator[dict[str, Any]]:
             "subtype": item.subtype, "scene_id": item.scene_id, "answer": item.letter,
             "letter": response.letter, "numbers": bool(find_numbers(response.text)),
             "text": response.text,
-        } | dict(count_claims(item, response.text, response.letter, store))  # fmt: skip
-
-
-def count_claims(
-    item: SelectionItem, text: str, letter: str | None, store: Store
-) -> Iterator[tuple[str, Any]]:
-    """Yield columns with what a response claims; none for an item without predicates."""
-    scene = store.scene(item.scene_id)
-    predicates = extract_predicates(item, scene, store.scene, Bounds())
-    if predicates is None:
-        return
-    reasons = read_response(text, letter, item.letter, predicates)
-    unseen = {o.object for o in predicates.objects if o.sight == OUT_OF_VIEW}
-    claims = [claim for part in PARTS for claim in reasons.claims[part]]
-    yield "claims", len(claims)
-    yield "supported", sum(c.verdict == SUPPORTED for c in claims)
-    about_scene = [claim for part in ("prefix", "prediction") for claim in reasons.claims[part]]
-    yield "unseen", sum(not unseen.isdisjoint(c.subjects) for c in about_scene)
-    yield "follows", reasons.follows
-    yield "true_reasons", reasons.true
+        } | dict(count_claims(item, response, store))  # fmt: skip
 
 
 def print_accuracies(results: pd.DataFrame) -> None:
@@ -180,8 +161,8 @@ def print_accuracies(results: pd.DataFrame) -> None:
         for subtype in HORIZONS.values():
             some = rows[rows.subtype == subtype]
             cells.append(f"{100 * (some.letter == some.answer).mean():.1f}")
-        minutes = rows.groupby("seed").cpu_minutes.first().mean()
-        print_row(variant, *cells, matrix.shape[1], f"{minutes:.0f}")
+        minutes = rows.groupby("seed").cpu_minutes.first().astype(float).mean()
+        print_row(variant, *cells, matrix.shape[1], "-" if pd.isna(minutes) else f"{minutes:.0f}")
 
 
 def print_responses(results: pd.DataFrame) -> None:
@@ -191,17 +172,17 @@ def print_responses(results: pd.DataFrame) -> None:
         "with numbers", "different sequences of four words", "claims about unseen objects",
     )  # fmt: skip
     for variant in VARIANTS:
-        rows = results[(results.variant == variant) & results.claims.notna()]
+        rows = results[(results.variant == variant) & results.follows.notna()]
         if rows.empty:
             continue
-        claims = rows.claims.sum()
+        claims = sum(rows[f"{part}_claims"].sum() for part in PARTS)
         shares = (
-            rows.supported.sum() / claims,
+            sum(rows[f"{part}_supported"].sum() for part in PARTS) / claims,
             rows.follows.astype(float).mean(),
             rows.true_reasons.astype(float).mean(),
             rows.numbers.mean(),
             rows.groupby("seed").text.apply(share_of_different_sequences).mean(),
-            rows.unseen.sum() / claims,
+            rows.unseen_claims.sum() / claims,
         )
         cells = [f"{100 * share:.1f}" for share in shares]
         print_row(variant, f"{claims / len(rows):.1f}", *cells)

@@ -13,7 +13,7 @@ percentile intervals of a bootstrap that resamples scenes and seeds.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,19 +30,17 @@ from benchmarks.experiments.experiment import (
     read_item_responses,
     training_settings,
 )
-from benchmarks.experiments.resampling import Resampling, credit_matrix
+from benchmarks.experiments.records import Resampling, count_claims, credit_matrix
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import SftCommand
-from data.records import FAMILIES, SelectionItem
+from data.records import FAMILIES
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.selection.distractors import BUILDERS_VERSIONS
-from evaluation.metrics.reasons import read_reasons
-from evaluation.reporting.run_responses import ItemResponse
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
-from teacher.validation.reasons import PARTS, SUPPORTED
+from teacher.validation.reasons import PARTS
 from teacher.vocabulary import VERSIONS
 
 RECORD = Path(__file__).with_name("letters.parquet")
@@ -162,21 +160,6 @@ def read_letters(
                 row |= dict(count_claims(item, response, store))
             rows.append(row)
     return rows
-
-
-def count_claims(
-    item: SelectionItem, response: ItemResponse, store: Store
-) -> Iterator[tuple[str, Any]]:
-    """Yield columns with what a response in reasoning mode claims (see `read_reasons`)."""
-    reasons = read_reasons(item, response.text, response.letter, store)
-    if reasons is None:
-        return
-    for part in PARTS:
-        claims = reasons.claims[part]
-        yield f"{part}_claims", len(claims)
-        yield f"{part}_supported", sum(c.verdict == SUPPORTED for c in claims)
-    yield "follows", reasons.follows
-    yield "true_reasons", reasons.true
 
 
 def print_tables(table: pd.DataFrame) -> None:

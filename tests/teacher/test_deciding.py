@@ -74,7 +74,7 @@ def test_the_place_is_that_of_an_object_seen_at_the_cut() -> None:
 
 def test_the_object_does_not_depend_on_which_candidate_is_the_target() -> None:
     """So a student, which sees the candidates only, can learn to choose it."""
-    compared = chosen_in_many = 0
+    compared = 0
     for _, predicates in random_cases(60, BOUNDS):
         names = {o.object for o in predicates.objects if o.sight == "shown"}
         everywhere = [names <= v.places.image.keys() for v in predicates.views]
@@ -87,10 +87,9 @@ def test_the_object_does_not_depend_on_which_candidate_is_the_target() -> None:
             )
             supposed = replace(predicates, candidates=candidates)
             objects += choose_statements(supposed).statements[0].objects[:1]
+        assert len(set(objects)) == 1
         compared += 1
-        chosen_in_many += len(set(objects)) == 1
     assert compared > 3
-    assert chosen_in_many == compared
 
 
 def test_separation() -> None:

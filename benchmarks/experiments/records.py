@@ -1,4 +1,4 @@
-"""Accuracies of recorded letters, with intervals over scenes and seeds.
+"""Rows of the records of selection experiments, and accuracies with intervals.
 
 A record has a row per test item, variant, seed and mode, with the columns family, scene_id,
 item_id, answer and letter.
@@ -7,14 +7,44 @@ item_id, answer and letter.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from data.records import FAMILIES
+from data.records import FAMILIES, SelectionItem
+from data.store import Store
+from evaluation.reporting.run_responses import ItemResponse
+from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.facts import OUT_OF_VIEW
+from teacher.predicates.relations import Bounds
+from teacher.validation.reasons import PARTS, SUPPORTED, read_response
 
 DRAWS = 4000
 """Number of bootstrap samples."""
+
+
+def count_claims(
+    item: SelectionItem, response: ItemResponse, store: Store
+) -> Iterator[tuple[str, Any]]:
+    """Yield columns with what a response in reasoning mode claims (see `read_response`), and how
+    many of the claims about the scene are about objects out of view at the end of the observation;
+    none for an item without predicates."""
+    scene = store.scene(item.scene_id)
+    predicates = extract_predicates(item, scene, store.scene, Bounds())
+    if predicates is None:
+        return
+    reasons = read_response(response.text, response.letter, item.letter, predicates)
+    for part in PARTS:
+        claims = reasons.claims[part]
+        yield f"{part}_claims", len(claims)
+        yield f"{part}_supported", sum(c.verdict == SUPPORTED for c in claims)
+    unseen = {o.object for o in predicates.objects if o.sight == OUT_OF_VIEW}
+    about_scene = [*reasons.claims["prefix"], *reasons.claims["prediction"]]
+    yield "unseen_claims", sum(not unseen.isdisjoint(c.subjects) for c in about_scene)
+    yield "follows", reasons.follows
+    yield "true_reasons", reasons.true
 
 
 def credit_matrix(table: pd.DataFrame, variant: str, mode: str) -> pd.DataFrame:
