@@ -19,27 +19,13 @@ from dynapix.__main__ import COMMANDS, overview
 from dynapix.selection import SYSTEMATIC
 from evaluation.metrics.selection import Choices, selection_report
 from evaluation.reporting.tables import selection_table
-from tests.evaluation.reporting.measured import run_report
+from tests.dynapix.models import always_a, nearest
 from tests.test_house import COMMANDS as ALL_COMMANDS
 from tests.user_errors import raises_user_error
 
 READING = {"numpy", "pyarrow", "PIL"}
 """The packages that reading a benchmark may import."""
 OWN = {"conf", "data", "dynapix", "evaluation", "models", "teacher"}
-
-
-@pytest.fixture(scope="module")
-def bench(micro_store) -> dynapix.Benchmark:
-    return dynapix.load(micro_store.folder)
-
-
-def always_a(item: dynapix.Item) -> str:
-    return "A"
-
-
-def nearest(item: dynapix.Item) -> list[float]:
-    last = item.prefix[-1].astype(float)
-    return [-np.abs(candidate - last).mean() for candidate in item.candidates]
 
 
 def imported_packages(code: str, folder: Path) -> set[str]:
@@ -198,118 +184,6 @@ def test_results_are_compared_on_the_same_items(bench) -> None:
     few = dynapix.evaluate(bench.selection[:-2], always_a, name="few", progress=False)
     with raises_user_error("different-items", contains=("2 only in one",)):
         one.compare(few)
-
-
-@pytest.mark.parametrize("predict", [always_a, nearest])
-def test_a_saved_result_is_read_back(bench, tmp_path, predict) -> None:
-    def sometimes(item: dynapix.Item) -> object:
-        return None if item.item_id == bench.selection[3].item_id else predict(item)
-
-    result = dynapix.evaluate(bench.selection, sometimes, name="mine", progress=False)
-    folder = result.save(tmp_path / "mine")
-    again = dynapix.Result.load(folder, bench)
-    assert (again.name, again.outcomes) == (result.name, result.outcomes)
-    assert again.failures == result.failures
-    assert again.report == result.report
-    # Saving again replaces the result; a folder with other files is left alone.
-    assert result.save(folder) == folder
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "notes.txt").touch()
-    with raises_user_error("other-files"):
-        result.save(tmp_path / "other")
-
-
-def test_the_report_shows_a_saved_result_beside_the_baselines(bench, tmp_path) -> None:
-    for name, predict in (("letters", always_a), ("scores", nearest)):
-        dynapix.evaluate(bench.selection, predict, name=name, progress=False).save(
-            tmp_path / "runs" / name
-        )
-    folder = run_report(tmp_path, bench.store.folder.parent, items=3, saved=str(tmp_path / "runs"))
-    table = (folder / "tables" / "selection-micro.md").read_text()
-    assert "letters (text)" in table
-    assert "scores (similarity)" in table
-    assert "nearest to the last observed frame" in table
-    page = (folder / "report.html").read_text()
-    assert "letters (text)" in page
-
-
-def test_damaged_results_and_results_on_other_builds_are_refused(bench, tmp_path) -> None:
-    folder = dynapix.evaluate(bench.selection, always_a, progress=False).save(tmp_path / "mine")
-    report = json.loads((folder / "report.json").read_text())
-    (folder / "report.json").write_text(json.dumps({**report, "build": "other"}))
-    with raises_user_error("different-builds", contains=str(folder)):
-        dynapix.Result.load(folder, bench)
-    (folder / "report.json").write_text(json.dumps(report))
-    (folder / "answers.jsonl").write_text('{"text": "A"}\n')
-    with raises_user_error("damaged-file", contains="item_id"):
-        dynapix.Result.load(folder, bench)
-    (folder / "answers.jsonl").unlink()
-    with raises_user_error("damaged-file", contains="answers.jsonl"):
-        dynapix.Result.load(folder, bench)
-    with raises_user_error("damaged-file", contains=str(tmp_path / "none")):
-        dynapix.Result.load(tmp_path / "none", bench)
-
-
-@pytest.mark.parametrize("as_mapping", [False, True])
-def test_embeddings_that_find_every_target_have_full_recall(bench, as_mapping) -> None:
-    frames = np.eye(len(bench.database), dtype=np.float32)
-    names = [frame.name for frame in bench.database]
-    queries = frames[[names.index(query.target.name) for query in bench.retrieval]]
-    embeddings = (queries, frames)
-    if as_mapping:
-        ids = [query.query_id for query in bench.retrieval]
-        embeddings = (
-            dict(zip(ids, queries, strict=True)), dict(zip(names, frames, strict=True))
-        )  # fmt: skip
-    scores = dynapix.evaluate_retrieval(bench.retrieval, *embeddings)
-    expected = {"recall@1": 1, "recall@10": 1, "recall@50": 1, "mrr": 1, "median_rank": 1}
-    assert scores.metrics == {**expected, "tie_rate": 0}
-    assert "R@1" in str(scores)
-    constant = dynapix.evaluate_retrieval(
-        bench.retrieval, np.ones_like(queries), np.ones_like(frames)
-    )
-    assert constant.metrics["recall@1"] == pytest.approx(1 / len(names))
-
-
-def test_saved_retrieval_results_are_in_the_report(bench, tmp_path) -> None:
-    rng = np.random.default_rng(0)
-    queries, frames = (rng.normal(size=(len(r), 8)) for r in (bench.retrieval, bench.database))
-    scores = dynapix.evaluate_retrieval(
-        bench.retrieval, queries, frames, widths=[4, 8], name="mine"
-    )
-    saved = scores.save(tmp_path / "runs" / "mine")
-    assert (saved / "report.txt").read_text() == f"{scores}\n"
-    assert len((saved / "ranks.jsonl").read_text().splitlines()) == len(bench.retrieval)
-    folder = run_report(tmp_path, bench.store.folder.parent, items=0, saved=str(tmp_path / "runs"))
-    table = (folder / "tables" / "retrieval-micro.md").read_text()
-    recall = 100 * scores.metrics["recall@10"]
-    [row] = [line for line in table.splitlines() if "mine" in line]
-    assert f"{recall:.1f}" in row
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "file").touch()
-    with raises_user_error("other-files", contains=str(tmp_path / "other")):
-        scores.save(tmp_path / "other")
-
-
-def test_embeddings_of_another_shape_or_database_are_refused(bench) -> None:
-    rng = np.random.default_rng(0)
-    queries = rng.normal(size=(len(bench.retrieval), 8))
-    frames = rng.normal(size=(len(bench.database), 8))
-    bad = queries.copy()
-    bad[1, 2] = np.nan
-    by_name = {f"other/{k}": row for k, row in enumerate(frames)}
-    for embeddings, hint in (
-        ((queries[1:], frames), f"({len(queries) - 1}, 8)"),
-        ((queries, frames[:, :7]), "7"),
-        ((queries.ravel(), frames), "shape"),
-        ((bad, frames), bench.retrieval[1].query_id),
-        ((queries, by_name), bench.database[0].name),
-        ((queries, "frames"), "not an array of numbers"),
-    ):
-        with raises_user_error("invalid-embeddings", contains=hint):
-            dynapix.evaluate_retrieval(bench.retrieval, *embeddings)
-    with raises_user_error("invalid-setting", contains="1 to 8"):
-        dynapix.evaluate_retrieval(bench.retrieval, queries, frames, widths=[9])
 
 
 def test_a_rationale_is_scored_by_the_oracle(micro_store) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from conf.schema import StudyCommand
 from evaluation.study import setup, storage
-from tests.evaluation.study.running import Server
+from tests.evaluation.study.running import Server, Visitor
 
 ITEMS = 59
 SMALL = 4
@@ -58,3 +58,15 @@ def serve(tmp_path_factory) -> Iterator[Serve]:
     yield start
     for server in servers:
         server.kill()
+
+
+@pytest.fixture(scope="module")
+def small(serve, prepared_small):
+    """A server of a study of four items, which several tests share."""
+    return serve(prepared_small)
+
+
+@pytest.fixture
+def visitor(small) -> Visitor:
+    """The annotator A1, signed in with a new link in each test."""
+    return Visitor(small.port).sign_in(small.links()["A1"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sqlite3
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ from http.client import HTTPConnection, HTTPException, HTTPMessage
 from pathlib import Path
 from urllib.parse import urlencode
 
+from evaluation.study import storage
 from tests.local import free_port
 
 ROOT = Path(__file__).parents[3]
@@ -173,3 +175,12 @@ class Annotator:
             assert self.visitor.answer(page, letter).status == 303
             if "Practice" not in page.text:
                 self.answers[page.hidden("key")] = letter
+
+
+def rows(server, query: str, *values) -> list[sqlite3.Row]:
+    """Return the rows of a query to the study's database."""
+    db = storage.open_study(server.folder / storage.DATABASE)
+    try:
+        return db.execute(query, values).fetchall()
+    finally:
+        db.close()
