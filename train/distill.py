@@ -30,6 +30,7 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     from teacher.narrate import ensure_rationales
     from train.common.checkpoints import newest_checkpoint
     from train.on_policy.continuation import (
+        inherit_settings,
         load_source,
         resolve_continuation,
         source_settings,
@@ -40,8 +41,9 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     from train.on_policy.teachers import LocalTeacher, ServerTeacher, load_teacher, teacher_settings
 
     compat.keep_freed_memory()
-    distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)
     source, trained = source_settings(cfg.model)
+    cfg = inherit_settings(cfg, trained)
+    distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)
     teacher_run = None if cfg.teacher_server.url else teacher_settings(cfg, trained)
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.

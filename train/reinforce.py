@@ -29,6 +29,7 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     from models.trained_runs import product_folder
     from train.common.checkpoints import newest_checkpoint
     from train.on_policy.continuation import (
+        inherit_settings,
         load_source,
         resolve_continuation,
         source_settings,
@@ -37,10 +38,10 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     from train.on_policy.reinforcement import build_trainer, load_items
 
     compat.keep_freed_memory()
-    train = cfg.train
-    responses = "train.batch x train.responses"
-    distributed.split_batch(train.batch * train.responses, train.micro_batch, key=responses)
     source, trained = source_settings(cfg.model)
+    cfg = inherit_settings(cfg, trained)
+    train, responses = cfg.train, "train.batch x train.responses"
+    distributed.split_batch(train.batch * train.responses, train.micro_batch, key=responses)
 
     # The main rank builds what is missing; then every rank reads it from the disk.
     with distributed.main_first():

@@ -41,6 +41,7 @@ from models.distributed import rank_device
 from models.lora_kernels import use_fast_layers
 from teacher.narrate import ensure_rationales
 from train.on_policy import distillation, sampling
+from train.on_policy.continuation import inherit_settings
 from train.on_policy.paired_prompts import PairedPrompts, load_datasets
 from train.on_policy.teachers import LocalTeacher
 
@@ -73,12 +74,10 @@ def measure(name: str, overrides: list[str], steps: int) -> Measurements:
         return measure_sft(overrides, SFT_VARIANTS[comparison.OURS], steps, False)
     trained = compose("train.sft", SftCommand, overrides)
     cfg = compose("train.distill", DistillCommand, ["+exp=on_policy", f"store={trained.store}"])
-    shared = {
-        key: getattr(trained.train, key)
-        for key in ("batch", "micro_batch", "workers", "precision", "gradient_checkpointing")
-    }
+    shared = {key: getattr(trained.train, key) for key in ("batch", "workers", "precision")}
     train = replace(cfg.train, **shared, max_steps=steps + 1, generated_items=0)
-    cfg = replace(cfg, train=train)
+    cfg = inherit_settings(replace(cfg, train=train), trained)
+    train = cfg.train
     store = ensure_benchmark(trained.benchmark, Path(cfg.store), trained.workers)
     rationales = ensure_rationales(store, trained.teacher)
     compat.keep_freed_memory()

@@ -78,8 +78,9 @@ class StudentTrainConfig(TrainConfig):
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
-        if self.micro_batch > 0 and self.batch % self.micro_batch:
-            yield f"{group}micro_batch={self.micro_batch} must divide {group}batch={self.batch}"
+        micro_batch = self.micro_batch or 1
+        if micro_batch > 0 and self.batch % micro_batch:
+            yield f"{group}micro_batch={micro_batch} must divide {group}batch={self.batch}"
 
 
 @dataclass
@@ -107,8 +108,16 @@ class SftTrainConfig(StudentTrainConfig):
 
 @dataclass
 class DistillTrainConfig(StudentTrainConfig):
-    lr: float = setting(1e-5, above=0)
-    """Peak learning rate."""
+    lr: float | None = setting(None, above=0)
+    """Peak learning rate. null takes half of that of the student's training."""
+    micro_batch: int | None = setting(None, least=1)
+    """Number of samples per forward pass on each rank; changes memory and speed, not the result.
+    null takes that of the student's training."""
+    gradient_checkpointing: bool | None = None
+    """Recompute activations in the backward pass; null does as the student's training did."""
+    permute_candidates: bool | None = None
+    """Shuffle the order of each item's candidates in every epoch; null does as the student's
+    training did."""
     epochs: float = 1.0
     """Number of passes over the training items. Each pass samples one response to each item."""
     temperature: float = setting(1.0, above=0)
@@ -141,8 +150,10 @@ class RewardWeights(Settings):
 
 @dataclass
 class ReinforceTrainConfig(TrainConfig):
-    lr: float = setting(1e-5, above=0)
-    """Peak learning rate."""
+    lr: float | None = setting(None, above=0)
+    """Peak learning rate. null takes half of that of the student's training."""
+    gradient_checkpointing: bool | None = None
+    """Recompute activations in the backward pass; null does as the student's training did."""
     epochs: float = 1.0
     """Number of passes over the training items."""
     batch: int = setting(8, least=1)

@@ -1,10 +1,12 @@
-"""Steps that runs share which train the student of another run further."""
+"""Functions that train.distill and train.reinforce share: both train the student of another run
+further."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import asdict, fields, replace
 from pathlib import Path
+from typing import TypeVar
 
 import yaml
 from torch import nn
@@ -28,6 +30,8 @@ from train.common.journal import run_metrics
 from train.common.training_loop import run_training
 
 log = logging.getLogger(__name__)
+
+Command = TypeVar("Command", DistillCommand, ReinforceCommand)
 
 
 def source_settings(model: str | None) -> tuple[Path, SftCommand]:
@@ -62,9 +66,26 @@ def source_settings(model: str | None) -> tuple[Path, SftCommand]:
     return source, trained
 
 
+LR_SHARE = 0.5
+"""Share of the peak learning rate of a student's training with which it is trained further."""
+
+
+def inherit_settings(cfg: Command, trained: SftCommand) -> Command:
+    """Return a run's settings in which those of the student's training replace null."""
+    inherited = {
+        "lr": LR_SHARE * trained.train.lr,
+        "micro_batch": trained.train.micro_batch,
+        "gradient_checkpointing": trained.train.gradient_checkpointing,
+        "permute_candidates": trained.train.permute_candidates,
+    }
+    missing = {f.name for f in fields(cfg.train) if getattr(cfg.train, f.name) is None}
+    changes = {name: value for name, value in inherited.items() if name in missing}
+    return replace(cfg, train=replace(cfg.train, **changes))
+
+
 def resolve_continuation(
-    cfg: DistillCommand | ReinforceCommand, run: Run, trained: SftCommand, data: str
-) -> tuple[DistillCommand | ReinforceCommand, SftCommand]:
+    cfg: Command, run: Run, trained: SftCommand, data: str
+) -> tuple[Command, SftCommand]:
     """Resolve the precision and the base of a run, and write the settings of its student: those of
     the other run, with the training settings of this run where both have them.
 

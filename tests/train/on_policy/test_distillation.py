@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from conf.compose import compose
 from conf.entry import Run
 from conf.runs import open_run
-from conf.schema import DistillCommand, DistillTrainConfig, SftCommand
+from conf.schema import DistillCommand, DistillTrainConfig, ReinforceCommand, SftCommand
 from data.store import Store
 from models import loading
 from models.trained_runs import trained_settings
@@ -22,6 +23,7 @@ from train import distill, sft
 from train.common.journal import read_journal
 from train.export import find_run
 from train.on_policy import distillation, paired_prompts
+from train.on_policy.continuation import inherit_settings
 from train.on_policy.paired_prompts import PairedPrompts
 from train.on_policy.teachers import check_tokenizer
 
@@ -65,6 +67,19 @@ def run_distill(settings: DistillCommand, folder: Path) -> Path:
     folder.mkdir(exist_ok=True)
     distill.main.__wrapped__(settings, Run(folder.name, folder))
     return folder
+
+
+def test_null_settings_are_those_of_the_students_training() -> None:
+    trained = compose("train.sft", SftCommand, ["+exp=cot"])
+    names = ("micro_batch", "gradient_checkpointing", "permute_candidates")
+    inherited = inherit_settings(DistillCommand(model="run"), trained).train
+    assert inherited.lr == trained.train.lr / 2
+    assert all(getattr(inherited, name) == getattr(trained.train, name) for name in names)
+    assert inherit_settings(ReinforceCommand(model="run"), trained).train.lr == inherited.lr
+    given = DistillTrainConfig(
+        lr=1, micro_batch=2, gradient_checkpointing=True, permute_candidates=False
+    )
+    assert inherit_settings(DistillCommand(train=given), trained).train == given
 
 
 def test_datasets_can_be_sent_to_worker_processes(settings, student, micro_store) -> None:
