@@ -11,7 +11,7 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,14 @@ from conf.schema import BenchmarkConfig, SelectCommand
 from data.store import Store, open_store
 from evaluation.metrics.results import SelectionReport, from_json, variant_name
 from evaluation.reporting.run_responses import Responses, read_responses, reading
+from models.fingerprints import settings_key
 
 Job = tuple[str, int]
 """A variant and a seed."""
+
+
+class CommandError(SystemExit):
+    """A command of an experiment failed. Unless it is caught, it ends the script."""
 
 
 def create_parser(description: str, benchmark: str, record: Path) -> argparse.ArgumentParser:
@@ -44,18 +49,27 @@ def create_parser(description: str, benchmark: str, record: Path) -> argparse.Ar
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment that trains and evaluates variants of a model."""
+    """An experiment that trains and evaluates variants of a model.
+
+    The rows of its record have the columns of its identity, and the variant, its settings' key and
+    the seed.
+    """
 
     args: argparse.Namespace
     """The parsed options of `create_parser`."""
-    identity: dict[str, str]
-    """Columns and values that identify the rows of this experiment in the record."""
-    variant_column: str
-    """Name of the column with the variant."""
+    base: str
+    """Hash of the weights that every variant starts from."""
+    settings: Mapping[str, str]
+    """Key of each variant's settings and of the versions that its results depend on, by variant."""
     trainer: str
     """Command that trains a variant, such as train.sft."""
     evaluator: str
     """Command that evaluates a variant, such as evaluation.select."""
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Columns and values that identify the rows of this experiment in the record."""
+        return {"benchmark": self.args.benchmark, "base": self.base}
 
     @property
     def benchmark_overrides(self) -> list[str]:
@@ -67,10 +81,15 @@ class Experiment:
         """Overrides of every training and evaluation."""
         return [*self.benchmark_overrides, f"checkpoints={self.args.checkpoints}"]
 
+    def run_name(self, variant: str, seed: int) -> str:
+        """Return the name of the runs of a variant and a seed."""
+        words = variant.replace(",", "").replace(" ", "_")
+        return f"{self.args.benchmark}-{self.base[:8]}-{self.settings[variant][:8]}-{words}-{seed}"
+
     def read_record(self) -> pd.DataFrame:
         """Return the whole record; an empty table if there is no file yet."""
         if not self.args.record.exists():
-            return pd.DataFrame(columns=[*self.identity, self.variant_column, "seed"])
+            return pd.DataFrame(columns=[*self.identity, "variant", "settings", "seed"])
         return pd.read_parquet(self.args.record)
 
     def read_results(self, seeds: int | None = None) -> pd.DataFrame:
@@ -78,6 +97,7 @@ class Experiment:
         table = self.read_record()
         for column, value in self.identity.items():
             table = table[table[column] == value]
+        table = table[table.settings == table.variant.map(self.settings)]
         return table if seeds is None else table[table.seed < seeds]
 
     def run(
@@ -85,26 +105,38 @@ class Experiment:
     ) -> pd.DataFrame:
         """Run the jobs that are not recorded, and return the results of the seeds to compare.
 
+        A job that fails is reported at the end, after the others.
+
         Args:
             evaluate: Runs a job and returns its rows of the record, without the columns that the
-                experiment adds: its identity, the variant and the seed.
+                experiment adds: its identity, the variant, its settings' key and the seed.
         """
+        failures = []
         if not self.args.table:
             run_command(["data.build", *self.benchmark_overrides])
             recorded = self.read_results()
-            done = set(zip(recorded[self.variant_column], recorded.seed, strict=True))
-            for variant, seed in (job for job in jobs if job not in done):
-                shared = {**self.identity, self.variant_column: variant, "seed": seed}
-                rows = pd.DataFrame([shared | row for row in evaluate((variant, seed))])
-                table = pd.concat([self.read_record(), rows])
-                # A kill while the record is written loses no results.
-                part = self.args.record.with_suffix(".tmp")
-                table.to_parquet(part, index=False, compression="zstd")
-                part.replace(self.args.record)
+            done = set(zip(recorded.variant, recorded.seed, strict=True))
+            for job in (job for job in jobs if job not in done):
+                try:
+                    self._record(job, evaluate(job))
+                except CommandError as error:
+                    failures.append(str(error))
         results = self.read_results(self.args.seeds)
+        if failures:
+            raise SystemExit("\n".join(failures))
         if results.empty:
             raise SystemExit("error: no results are recorded: run without --table")
         return results
+
+    def _record(self, job: Job, rows: list[dict[str, Any]]) -> None:
+        variant, seed = job
+        shared = {"variant": variant, "settings": self.settings[variant], "seed": seed}
+        rows = pd.DataFrame([{**self.identity, **shared, **row} for row in rows])
+        table = pd.concat([self.read_record(), rows])
+        # A kill while the record is written loses no results.
+        part = self.args.record.with_suffix(".tmp")
+        table.to_parquet(part, index=False, compression="zstd")
+        part.replace(self.args.record)
 
     def train_and_evaluate(
         self,
@@ -131,14 +163,17 @@ class Experiment:
         return self.args.checkpoints / self.evaluator.partition(".")[2] / name
 
 
-def training_settings(command: str, schema: type, overrides: Sequence[str]) -> dict[str, Any]:
-    """Return the settings of a training that decide its result, apart from its seed."""
+def training_key(
+    command: str, schema: type, overrides: Sequence[str], versions: Mapping[str, Any]
+) -> str:
+    """Return a short hash of what decides the result of a training, apart from its seed.
+
+    Args:
+        versions: Versions of the code that makes the training's data.
+    """
     settings = asdict(compose(command, schema, overrides))
-    return {
-        name: settings[name]
-        for name in ("student", "retriever", "teacher", "train", "benchmark")
-        if name in settings
-    }
+    deciding = ("student", "retriever", "teacher", "train", "benchmark")
+    return settings_key([{name: settings.get(name) for name in deciding}, versions])
 
 
 def compose_benchmark(benchmark: str) -> BenchmarkConfig:
@@ -163,10 +198,14 @@ def read_item_responses(folder: Path, mode: str, control: str | None = None) -> 
 
 
 def run_command(command: Sequence[str]) -> None:
-    """Run `python -m` with a command, and exit if it fails."""
+    """Run `python -m` with a command.
+
+    Raises:
+        CommandError: The command failed.
+    """
     print("python -m", *command, flush=True)
     if subprocess.run([sys.executable, "-m", *command]).returncode:
-        raise SystemExit(f"error: {' '.join(command)} failed, see above")
+        raise CommandError(f"error: {' '.join(command)} failed, see above")
 
 
 def print_header(*titles: object) -> None:

@@ -12,19 +12,21 @@ The variants are
     rewards         the student, trained further by `train.reinforce`
 
 The record, `on_policy.parquet`, has a row per test item and run. The first table has accuracies in
-percent, with 95% intervals over scenes and seeds, and minutes of CPU time: those of the trainings
-that a variant needs besides the student, and for the first row those of the student, without
-trainings that were interrupted. The second one describes the responses: the share of their claims
-that the oracle supports; answers that follow from the response; responses that state a number;
-different sequences of four words, as a share of all; and the share of claims about objects that are
-out of view at the end of the observation, which only a reader of the facts can know.
+percent, with 95% intervals over scenes and seeds, and minutes of CPU time of all trainings that a
+variant needs, those of the student and the teacher included ("-" if one was interrupted). The
+second table has differences: those from the student compare the runs of each seed, since these
+runs continue this student. The third one describes the responses: the share of their claims that
+the oracle supports; answers that follow from the response; responses that state a number; different
+sequences of four words, as a share of all; and, of the claims about the prefix and the prediction,
+the share about objects that are out of view at the cut.
 """
 
 from __future__ import annotations
 
+import argparse
 import re
 import resource
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +41,7 @@ from benchmarks.experiments.experiment import (
     print_row,
     read_item_responses,
     run_command,
-    training_settings,
+    training_key,
 )
 from benchmarks.experiments.records import Resampling, count_claims, credit_matrix
 from conf.compose import compose
@@ -47,6 +49,7 @@ from conf.failures import report_failures
 from conf.schema import DistillCommand, ReinforceCommand, SftCommand
 from data.records import FAMILIES
 from data.store import Store
+from data.tracks.selection.distractors import BUILDERS_VERSIONS
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
 from teacher.numbers.detection import find_numbers
@@ -54,9 +57,17 @@ from teacher.validation.reasons import PARTS
 from teacher.vocabulary import VERSIONS
 
 RECORD = Path(__file__).with_name("on_policy.parquet")
+VARIANTS = STUDENT, LONGER, DISTILLATION, REWARDS = (
+    "student", "longer SFT", "distillation", "rewards"
+)  # fmt: skip
 SFT = ["+exp=cot", "teacher.predicates=relational"]
-DISTILL, REWARDS = ["+exp=on_policy"], ["+exp=grpo"]
-VARIANTS = ("student", "longer SFT", "distillation", "rewards")
+FACTS = [*SFT, "train.facts=true"]
+DISTILL, REINFORCE = (
+    ["+exp=on_policy", "train.evaluations=2"],
+    ["+exp=grpo", "train.evaluations=2"],
+)
+MINUTES = "cpu_minutes.txt"
+"""File in the folder of a training that was not interrupted."""
 HORIZONS = {"1 s": "in_1s", "2 s": "in_2s"}
 """Subtypes of the time family."""
 
@@ -65,33 +76,22 @@ def main() -> None:
     parser = create_parser(__doc__, "tiny", RECORD)
     parser.add_argument("--epochs", type=float, default=6, help="epochs of the longer SFT")
     args = parser.parse_args()
-    overrides = [f"benchmark={args.benchmark}"]
-    sft = training_settings("train.sft", SftCommand, [*SFT, *overrides])
-    distill = training_settings("train.distill", DistillCommand, [*DISTILL, "model=none"])
-    rewards = training_settings("train.reinforce", ReinforceCommand, [*REWARDS, "model=none"])
-    versions = {"narrator": NARRATOR_VERSION, "words": VERSIONS, "epochs": args.epochs}
-    base = weights_digest(compose("train.sft", SftCommand, overrides).student.model)
-    settings = settings_key({"sft": sft, "distill": distill, "rewards": rewards} | versions)
-    identity = {"base": base, "benchmark": args.benchmark, "settings": settings}
-    experiment = Experiment(args, identity, "variant", "train.sft", "evaluation.select")
-    prefix = f"on_policy-{args.benchmark}-{base[:8]}-{settings[:8]}"
+    base = compose("train.sft", SftCommand, [f"benchmark={args.benchmark}"]).student.model
+    experiment = Experiment(
+        args, weights_digest(base), settings_keys(args), "train.sft", "evaluation.select"
+    )
+    store = Path(args.store)
 
     def run_variant(job: Job) -> list[dict[str, Any]]:
-        variant, seed = job
-        name = f"{prefix}-{variant.replace(' ', '_')}-{seed}"
-        # What an interrupted training took before is not known.
-        resumed = any(args.checkpoints.glob(f"*/{name}*"))
-        started = cpu_minutes()
-        model = train_variant(experiment, variant, name, f"{prefix}-student-{seed}", seed)
-        minutes = None if resumed else cpu_minutes() - started
-        shared = experiment.shared_overrides
+        trained = train_variant(experiment, *job)
+        name = experiment.run_name(*job)
         run_command([
-            "evaluation.select", f"model={model}", "modes=[reasoning]", "batch=64", *shared,
-            f"run={name}",
+            "evaluation.select", f"model={trained[-1]}", "modes=[reasoning]", "batch=64",
+            *experiment.shared_overrides, f"run={name}",
         ])  # fmt: skip
-        store = open_benchmark(Path(args.store), args.benchmark)
-        folder = args.checkpoints / "select" / name
-        return [{"cpu_minutes": minutes, **row} for row in read_rows(folder, store)]
+        minutes = sum_minutes(trained)
+        rows = read_rows(args.checkpoints / "select" / name, open_benchmark(store, args.benchmark))
+        return [{"cpu_minutes": minutes, **row} for row in rows]
 
     jobs = [(variant, seed) for seed in range(args.seeds) for variant in VARIANTS]
     results = experiment.run(jobs, run_variant)
@@ -99,31 +99,60 @@ def main() -> None:
     print_responses(results)
 
 
-def train_variant(experiment: Experiment, variant: str, name: str, student: str, seed: int) -> Path:
-    """Train a variant, and return the folder of its run.
+def settings_keys(args: argparse.Namespace) -> dict[str, str]:
+    """Return the key of each variant's settings: those of all trainings that it needs."""
+    versions = {"builders": BUILDERS_VERSIONS, "narrator": NARRATOR_VERSION, "words": VERSIONS}
 
-    Args:
-        name: Run of the variant.
-        student: Run of the student that further training continues.
-    """
-    shared, checkpoints = experiment.shared_overrides, experiment.args.checkpoints
-    source = checkpoints / "sft" / student
-    where = [f"store={experiment.args.store}", f"checkpoints={checkpoints}", f"seed={seed}"]
-    if variant in ("student", "longer SFT"):
-        longer = [f"train.epochs={experiment.args.epochs}"] * (variant == "longer SFT")
-        run_command(["train.sft", *SFT, *longer, *shared, f"seed={seed}", f"run={name}"])
-        return checkpoints / "sft" / name
-    if variant == "rewards":
-        run_command(["train.reinforce", *REWARDS, f"model={source}", *where, f"run={name}"])
-        return checkpoints / "reinforce" / name
-    teacher = f"{name}-teacher"
-    facts = [*SFT, "train.facts=true", *shared, f"seed={seed}", f"run={teacher}"]
-    run_command(["train.sft", *facts])
-    run_command([
-        "train.distill", *DISTILL, f"model={source}",
-        f"teacher_model={checkpoints / 'sft' / teacher}", *where, f"run={name}",
-    ])  # fmt: skip
-    return checkpoints / "distill" / name
+    def key_of(command: str, schema: type, overrides: list[str]) -> str:
+        return training_key(command, schema, overrides, versions)
+
+    sft = [*SFT, f"benchmark={args.benchmark}"]
+    student = key_of("train.sft", SftCommand, sft)
+    distill = key_of("train.distill", DistillCommand, [*DISTILL, "model=none"])
+    reinforce = key_of("train.reinforce", ReinforceCommand, [*REINFORCE, "model=none"])
+    return {
+        STUDENT: student,
+        LONGER: key_of("train.sft", SftCommand, [*sft, f"train.epochs={args.epochs}"]),
+        DISTILLATION: settings_key([student, distill]),
+        REWARDS: settings_key([student, reinforce]),
+    }
+
+
+def train_variant(experiment: Experiment, variant: str, seed: int) -> list[Path]:
+    """Train what is missing of a variant, and return the folders of its trainings: the last one has
+    the student to evaluate."""
+    args, name = experiment.args, experiment.run_name(variant, seed)
+    student = args.checkpoints / "sft" / experiment.run_name(STUDENT, seed)
+    where = [f"store={args.store}", f"checkpoints={args.checkpoints}"]
+    shared = experiment.shared_overrides
+    trained = []
+
+    def train(command: str, run: str, overrides: list[str]) -> Path:
+        folder = args.checkpoints / command.partition(".")[2] / run
+        interrupted, started = folder.exists(), cpu_minutes()
+        run_command([command, *overrides, f"seed={seed}", f"run={run}"])
+        if not interrupted:
+            (folder / MINUTES).write_text(f"{cpu_minutes() - started}\n")
+        trained.append(folder)
+        return folder
+
+    if variant == LONGER:
+        train("train.sft", name, [*SFT, f"train.epochs={args.epochs}", *shared])
+        return trained
+    train("train.sft", student.name, [*SFT, *shared])
+    if variant == DISTILLATION:
+        teacher = train("train.sft", f"{student.name}-facts", [*FACTS, *shared])
+        models = [f"model={student}", f"teacher_model={teacher}"]
+        train("train.distill", name, [*DISTILL, *models, *where])
+    elif variant == REWARDS:
+        train("train.reinforce", name, [*REINFORCE, f"model={student}", *where])
+    return trained
+
+
+def sum_minutes(trained: Sequence[Path]) -> float | None:
+    """Return the minutes of CPU time of several trainings, or None if one was interrupted."""
+    files = [folder / MINUTES for folder in trained]
+    return sum(float(f.read_text()) for f in files) if all(f.exists() for f in files) else None
 
 
 def cpu_minutes() -> float:
@@ -147,7 +176,8 @@ def read_rows(folder: Path, store: Store) -> Iterator[dict[str, Any]]:
 
 
 def print_accuracies(results: pd.DataFrame) -> None:
-    """Print the accuracy of each variant by family, and of the time family by horizon."""
+    """Print the accuracy of each variant by family, and of the time family by horizon; and the
+    differences between variants."""
     credits = {v: credit_matrix(results, v, "reasoning") for v in VARIANTS}
     credits = {variant: matrix for variant, matrix in credits.items() if matrix.shape[1]}
     resampling = Resampling(next(iter(credits.values())).index)
@@ -163,13 +193,23 @@ def print_accuracies(results: pd.DataFrame) -> None:
             cells.append(f"{100 * (some.letter == some.answer).mean():.1f}")
         minutes = rows.groupby("seed").cpu_minutes.first().astype(float).mean()
         print_row(variant, *cells, matrix.shape[1], "-" if pd.isna(minutes) else f"{minutes:.0f}")
+    print_header("difference", *FAMILIES, "macro")
+    for variant in (DISTILLATION, REWARDS):
+        for other in (LONGER, STUDENT):
+            if {variant, other} <= {*credits}:
+                first, second = credits[variant].align(credits[other], join="inner", axis=1)
+                # Variants with one name share the resampled seeds.
+                name = other if other == STUDENT else variant
+                intervals = resampling.intervals((name, first), (other, second))
+                cells = (f"{m:+.1f} [{low:+.1f}, {high:+.1f}]" for m, low, high in intervals)
+                print_row(f"{variant} minus {other}", *cells)
 
 
 def print_responses(results: pd.DataFrame) -> None:
     """Print what the responses of each variant are like, in percent."""
     print_header(
         "", "claims per response", "supported", "answer follows", "right for true reasons",
-        "with numbers", "different sequences of four words", "claims about unseen objects",
+        "with numbers", "different sequences of four words", "about objects out of view",
     )  # fmt: skip
     for variant in VARIANTS:
         rows = results[(results.variant == variant) & results.follows.notna()]
@@ -182,7 +222,7 @@ def print_responses(results: pd.DataFrame) -> None:
             rows.true_reasons.astype(float).mean(),
             rows.numbers.mean(),
             rows.groupby("seed").text.apply(share_of_different_sequences).mean(),
-            rows.unseen_claims.sum() / claims,
+            rows.unseen_claims.sum() / (rows.prefix_claims + rows.prediction_claims).sum(),
         )
         cells = [f"{100 * share:.1f}" for share in shares]
         print_row(variant, f"{claims / len(rows):.1f}", *cells)

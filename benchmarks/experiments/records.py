@@ -29,7 +29,7 @@ def count_claims(
     item: SelectionItem, response: ItemResponse, store: Store
 ) -> Iterator[tuple[str, Any]]:
     """Yield columns with what a response in reasoning mode claims (see `read_response`), and how
-    many of the claims about the scene are about objects out of view at the end of the observation;
+    many of the claims about the prefix and the prediction are about objects out of view at the cut;
     none for an item without predicates."""
     scene = store.scene(item.scene_id)
     predicates = extract_predicates(item, scene, store.scene, Bounds())

@@ -28,7 +28,7 @@ from benchmarks.experiments.experiment import (
     print_header,
     print_row,
     read_item_responses,
-    training_settings,
+    training_key,
 )
 from benchmarks.experiments.records import Resampling, count_claims, credit_matrix
 from conf.compose import compose
@@ -38,7 +38,7 @@ from data.records import FAMILIES
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.selection.distractors import BUILDERS_VERSIONS
-from models.fingerprints import settings_key, weights_digest
+from models.fingerprints import weights_digest
 from teacher.narrator import NARRATOR_VERSION
 from teacher.validation.reasons import PARTS
 from teacher.vocabulary import VERSIONS
@@ -100,22 +100,19 @@ def main() -> None:
     parser.add_argument("--variants", nargs="+", choices=[*VARIANTS], default=[*VARIANTS])
     args = parser.parse_args()
     overrides = [f"student={args.student}", f"benchmark={args.benchmark}", EPOCHS]
-    preset = compose("train.sft", SftCommand, overrides)
-    base = weights_digest(preset.student.model)
+    base = weights_digest(compose("train.sft", SftCommand, overrides).student.model)
     # Results of other settings, other items or other rationales are not reused.
     versions = {"builders": BUILDERS_VERSIONS, "narrator": NARRATOR_VERSION, "words": VERSIONS}
-    variants = {
-        name: training_settings("train.sft", SftCommand, [*(v.training or ()), *overrides])
+    settings = {
+        name: training_key("train.sft", SftCommand, [*(v.training or ()), *overrides], versions)
         for name, v in VARIANTS.items()
     }
-    settings = settings_key(variants | versions)
-    identity = {"base": base, "benchmark": args.benchmark, "settings": settings}
-    experiment = Experiment(args, identity, "variant", "train.sft", "evaluation.select")
+    experiment = Experiment(args, base, settings, "train.sft", "evaluation.select")
 
     def evaluate(job: Job) -> list[dict[str, Any]]:
         name, seed = job
         variant, student = VARIANTS[name], f"student={args.student}"
-        folder = f"{args.benchmark}-{base[:8]}-{settings[:8]}-{name.replace(' ', '_')}-{seed}"
+        folder = experiment.run_name(*job)
         training = variant.training and [*variant.training, f"seed={seed}", student, EPOCHS]
         # The default modes ask a base for a structured record, which the tiny base cannot write.
         modes = f"modes=[{','.join(variant.modes)}]"

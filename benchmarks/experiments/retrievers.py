@@ -25,14 +25,14 @@ from benchmarks.experiments.experiment import (
     create_parser,
     print_header,
     print_row,
-    training_settings,
+    training_key,
 )
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import ContrastiveCommand
 from data.tracks.selection.distractors import BUILDERS_VERSIONS
 from evaluation.metrics.results import RetrievalResult, from_json
-from models.fingerprints import settings_key, weights_digest
+from models.fingerprints import weights_digest
 
 RANKS = Path(__file__).with_name("ranks.parquet")
 VARIANTS: dict[str, list[str]] = {
@@ -50,26 +50,21 @@ MEASURES = {"recall@1": 1, "recall@10": 1, "recall@50": 1, "mrr": 3, "median_ran
 def main() -> None:
     args = create_parser(__doc__, "tiny", RANKS).parse_args()
     benchmark = f"benchmark={args.benchmark}"
-    preset = compose("train.contrastive", ContrastiveCommand, [benchmark])
+    base = compose("train.contrastive", ContrastiveCommand, [benchmark]).retriever.model
+    # Results of other settings, another base or other items are not reused.
+    versions = {"builders": BUILDERS_VERSIONS}
     settings = {
-        name: training_settings("train.contrastive", ContrastiveCommand, [*variant, benchmark])
+        name: training_key("train.contrastive", ContrastiveCommand, [*variant, benchmark], versions)
         for name, variant in VARIANTS.items()
     }
-    # Results of other settings, another base or other items are not reused.
-    identity = {
-        "benchmark": args.benchmark,
-        "base": weights_digest(preset.retriever.model),
-        "settings": settings_key(settings | {"builders": BUILDERS_VERSIONS}),
-    }
-    experiment = Experiment(args, identity, "variant", "train.contrastive", "evaluation.retrieve")
+    experiment = Experiment(
+        args, weights_digest(base), settings, "train.contrastive", "evaluation.retrieve"
+    )
 
     def evaluate(job: Job) -> list[dict[str, Any]]:
         variant, seed = job
-        words = variant.replace(",", "").replace(" ", "_")
-        # Runs over another base are not reused.
-        versions = f"{identity['base'][:8]}-{identity['settings'][:8]}"
-        name = f"{args.benchmark}-{versions}-{words}-{seed}"
-        return read_ranks(experiment.train_and_evaluate(name, [*VARIANTS[variant], f"seed={seed}"]))
+        training = [*VARIANTS[variant], f"seed={seed}"]
+        return read_ranks(experiment.train_and_evaluate(experiment.run_name(*job), training))
 
     jobs = [(variant, seed) for seed, variant in product(range(args.seeds), VARIANTS)]
     print_tables(experiment.run(jobs, evaluate))
