@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 import dynapix
 from conf import schema
@@ -46,7 +46,8 @@ def settings_of(group: type, prefix: str = "") -> Iterator[tuple[str, str, str]]
     types = get_type_hints(group)
     for field in fields(group):
         nested = [t for t in (types[field.name], *get_args(types[field.name])) if is_dataclass(t)]
-        if nested and not str(types[field.name]).startswith("dict"):
+        by_name = get_origin(types[field.name]) is dict
+        if nested and not by_name:
             yield from settings_of(nested[0], f"{prefix}{field.name}.")
             continue
         made = field.default_factory() if field.default_factory is not MISSING else field.default
@@ -54,6 +55,8 @@ def settings_of(group: type, prefix: str = "") -> Iterator[tuple[str, str, str]]
         default = json.dumps(made, default=lambda value: asdict(value))
         shown = "required" if made is MISSING or made == "???" else default
         yield f"{prefix}{field.name}", shown if len(shown) <= 60 else "see the preset", text
+        if nested and by_name:
+            yield from settings_of(nested[0], f"{prefix}{field.name}.NAME.")
 
 
 def on_env(env: Any, config: Any, **_: Any) -> None:

@@ -188,7 +188,7 @@ def widest_results(measurements: Iterable[Measurement]) -> list[Measurement]:
 
 
 def distinguish_item_sets(measurements: Iterable[Measurement]) -> list[Measurement]:
-    """Return the results, each with what distinguishes its build and its items from the main ones.
+    """Label each result that is not on the main build of its benchmark, or not on its main items.
 
     The main build of a benchmark is that of its most recent run, because two builds can have other
     items and queries with the same ids. The main items of a build are the largest set that a run

@@ -22,8 +22,8 @@ def measure_margin(statement: Relation, places: Places, bounds: Bounds) -> float
     false.
 
     A statement about regions, sides, heights or extremes stays true, or false, if one of its
-    objects moves by less than this in the image. One that an object is between two others does if
-    this object moves. For gaps and "nearer to", which are measured on the ground, this holds
+    objects moves by less than this in the image. For "between", this holds if the object in the
+    middle moves. For gaps and "nearer to", which are measured on the ground, this holds
     approximately. Margins of what is hidden, or hides another object, are constant (`FAINT`).
 
     Args:

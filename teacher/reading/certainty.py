@@ -103,8 +103,8 @@ class CertaintyCheck:
         return not qualified and (not named or letter in named | later)
 
     def _is_general(self, at: int) -> bool:
-        """Return whether a claim without a known subject is plainly about some object: nothing
-        before it negates or doubts it, and more than "be" and unlisted words precedes it."""
+        """Return whether a claim without a known subject must be about an object: no word of
+        negation or doubt precedes it, and some word other than "be" and unlisted words does."""
         before = {tag.name for tag in self.tags[:at]}
         return not before & {"not", "contrast", "maybe", "none"} and not before <= {"word", "be"}
 

@@ -1,7 +1,7 @@
 """Load balancing over several servers.
 
-While a server is down, restarting or busy, its requests go to another server or wait. A single
-request fails only if servers that answer other requests do not answer it.
+While a server is down, restarting or busy, its requests go to another server or wait. A
+request fails only if servers refuse it, or repeatedly fail on it, while they answer other requests.
 """
 
 from __future__ import annotations

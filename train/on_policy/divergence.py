@@ -12,9 +12,9 @@ def measure_divergence(student: Tensor, teacher: Tensor, beta: float) -> Tensor:
     """Return the generalised Jensen-Shannon divergence (N,) of distributions over V tokens.
 
     With the mixture M = beta T + (1 - beta) S, it is beta KL(T || M) + (1 - beta) KL(S || M)
-    (Agarwal et al. 2024, "On-Policy Distillation of Language Models"). It vanishes as beta
-    approaches 0 or 1; there the limits of its ratios to beta and to 1 - beta are returned, KL(T ||
-    S) and KL(S || T).
+    (Agarwal et al. 2024, "On-Policy Distillation of Language Models"). It is zero for
+    beta 0 and 1. There, the function returns the limits of its ratios to beta and to 1 - beta:
+    KL(T || S) for beta 0, and KL(S || T) for beta 1.
 
     Args:
         student: (N, V) logarithms of the student's probabilities S.

@@ -11,14 +11,15 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
     explain    the steps of a rationale, with another frame of the scene instead of the target
     narrate    a whole rationale with its answer, without any picture
 
-None of them is the selection task: where an answer says which candidate agrees with a prediction,
-no picture shows the target. `compare` supposes that a candidate, sampled at random, is the target.
-Its statements are chosen as those that decide an item, so that the model learns to find the objects
-that tell candidates apart, and how far apart their places are. In `explain`, the prediction is true
-of the target, but another frame is shown instead of it, so that the model has to derive the
-prediction from the clip. The outcome of both names the candidate that shows an object closest to a
-place that no candidate, or only another one, shows. `narrate` teaches the language of rationales,
-in both vocabularies, and how an answer follows from what a text says of the candidates.
+None of them is the selection task: if an answer names the candidate that agrees with a prediction,
+its pictures do not include the target. `compare` supposes that a candidate, sampled at random, is
+the target. Its statements are chosen as those that decide an item, so that the model learns to find
+the objects that tell candidates apart, and how far apart their places are. In `explain`, the
+prediction is true of the target, but another frame is shown instead of it, so that the model has to
+derive the prediction from the clip. In both, the outcome names the candidate that shows an object
+closest to a given place: that in the supposed target, or in `explain` the predicted one. `narrate`
+teaches the language of rationales, in both vocabularies, and how an answer follows from what a text
+says of the candidates.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Chooses the items of balanced cells so that no combination of scores reveals the targets.
 
 The ranks of a cell's targets are even (`data.tracks.selection.balance`), but even ranks do not
-suffice: if a target that has the highest score has it by less than a distractor would, a
-combination of scores reveals it. Small deviations of the cells also add up over a family. So each
+suffice: targets with the highest score may lead by a smaller margin than distractors do, and then a
+combination of scores reveals them. Small deviations of the cells also add up over a family. So each
 cell makes more items than its quota (`RESERVE`), and `choose_items` chooses among the items of a
 whole family.
 
