@@ -46,3 +46,29 @@ def save_tiny_qwen3(folder: Path, texts: Iterable[str]) -> Path:
     model.save_pretrained(folder)
     tokenizer.save_pretrained(folder)
     return folder
+
+
+def teach(folder: Path, dialogues: Iterable[tuple[list[dict[str, str]], str]]) -> None:
+    """Train the saved model until it writes the response to each list of messages by heart."""
+    import torch
+    from transformers import AutoTokenizer, Qwen3ForCausalLM
+
+    tokenizer = AutoTokenizer.from_pretrained(folder)
+    model = Qwen3ForCausalLM.from_pretrained(folder, dtype=torch.float32)
+    examples = []
+    for messages, response in dialogues:
+        prompt = tokenizer.apply_chat_template(messages, add_generation_prompt=True)["input_ids"]
+        answer = [*tokenizer(response)["input_ids"], tokenizer.eos_token_id]
+        examples.append((torch.tensor([prompt + answer]), len(answer)))
+    optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
+    for _ in range(300):
+        losses = []
+        for ids, length in examples:
+            logits = model(ids[:, :-1], logits_to_keep=length).logits[0]
+            losses.append(torch.nn.functional.cross_entropy(logits, ids[0, -length:]))
+        if max(losses) < 0.01:
+            break
+        sum(losses).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    model.to(torch.bfloat16).save_pretrained(folder)
