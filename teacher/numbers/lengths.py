@@ -34,7 +34,10 @@ LENGTH = re.compile(
         | (?:{_measure}|{_motion})\s+the\s+{_dimension}\s+of\s+{_article}\s+{_noun}
         | {_gap}\s+(?:is|was|stays|remains|will\s+be)\s+(?:about\s+|roughly\s+)?
           as\s+(?:wide|long|large|great)\s+as\s+{_article}\s+{_noun}
-        | as\s+far\s+as\s+(?:{_article}\s+)?{_noun}\s+is\s+(?:wide|long|tall|broad)
+        | (?:as\s+far\s+as|(?:further|farther|closer|nearer|more|less)\s+than)\s+(?:{_article}\s+)?
+          {_noun}\s+is\s+(?:wide|long|tall|broad)
+        | an?\s+{_noun}\s+apart
+        | {_measure}\s+an?\s+{_noun}\s+away
     )\b""",
     re.VERBOSE | re.IGNORECASE,
 )
