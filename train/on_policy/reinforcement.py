@@ -142,6 +142,7 @@ class MediaGRPOTrainer(GRPOTrainer):
         self._judged: list[JudgedItem] = []
         self._prompts: list[Sample] = []
         self._inputs: list[Sample] = []
+        self._differ = torch.empty(0, dtype=torch.bool)
 
     def _send_telemetry(self) -> None:
         """Send nothing."""
@@ -165,17 +166,30 @@ class MediaGRPOTrainer(GRPOTrainer):
     def _generate_and_score_completions(self, inputs: list[dict[str, Any]]) -> dict[str, Any]:
         """Sample and judge a response to each row, and keep the prompts for the loss.
 
-        The tokens of responses without advantage do not count in the mean over tokens.
+        Responses to an item whose rewards are all equal do not count in the mean over tokens.
         """
         self._judged = [self._items[row["split"]][row["index"]] for row in inputs]
         self._prompts = [judged.render() for judged in self._judged]
         output = super()._generate_and_score_completions(inputs)
-        counted = (output["advantages"] != 0).to(output["completion_mask"].dtype)
-        output["completion_mask"] = output["completion_mask"] * counted[:, None]
+        first = self.accelerator.process_index * len(inputs)
+        counted = self._differ[first : first + len(inputs), None]
+        output["completion_mask"] = output["completion_mask"] * counted
+        mode = "train" if self.model.training else "eval"
+        self._metrics[mode]["frac_reward_zero_std"][-1] = 1 - self._differ.float().mean().item()
         total = self.accelerator.gather(output["completion_mask"].sum()).sum()
         output["num_items_in_batch"] = total.clamp(min=1)
         # TRL shuffles and splits the tensors of its output by their rows.
         return {**output, ROW: torch.arange(len(inputs), device=self.accelerator.device)}
+
+    def _calculate_rewards(self, inputs: list[dict[str, Any]], *rest: Any) -> Tensor:
+        """Return the rewards of all ranks' responses, (N, rewards), and note for each response
+        whether the rewards of the responses to its item differ."""
+        rewards = super()._calculate_rewards(inputs, *rest)
+        count = self.num_generations if self.model.training else self.num_generations_eval
+        sums = (rewards * self.reward_weights.to(rewards.device)).sum(dim=1).view(-1, count)
+        # TRL's mean of equal rewards can differ from them by a rounding error.
+        self._differ = (sums.amax(dim=1) - sums.amin(dim=1) > 1e-6).repeat_interleave(count)
+        return rewards
 
     def _respond(self, prompts: list[str], _: GRPOTrainer) -> dict[str, Any]:
         """Return token ids of prompts and sampled responses, and the judged responses."""
@@ -253,7 +267,17 @@ class MediaGRPOTrainer(GRPOTrainer):
         return torch.zeros((), device=self.accelerator.device), None, None
 
     def log(self, logs: dict[str, float], *args: Any, **settings: Any) -> None:
-        """Raise UserError for a non-finite gradient, before the resulting weights are saved."""
+        """Log the measures of a step, except ratios over no tokens: TRL divides by the tokens of
+        responses that do not count.
+
+        Raises:
+            UserError: The gradient is not finite. The resulting weights are not saved.
+        """
+        measures = self._metrics["train" if self.model.training else "eval"]
+        for name, values in list(measures.items()):
+            measures[name] = [value for value in values if not math.isnan(value)]
+            if not measures[name]:
+                del measures[name]
         super().log(logs, *args, **settings)
         if not math.isfinite(logs.get("grad_norm", 0.0)):
             self._stop("gradient", logs["grad_norm"])

@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from conf.compose import compose
 from conf.entry import Run
@@ -16,16 +17,17 @@ from conf.runs import open_run
 from conf.schema import DistillCommand, DistillTrainConfig, ReinforceCommand, SftCommand
 from data.store import Store
 from models import loading
+from models.student.answer_parser import ParsedAnswer
 from models.trained_runs import trained_settings
 from teacher.narrate import ensure_rationales
 from tests.user_errors import raises_user_error
 from train import distill, sft
 from train.common.journal import read_journal
 from train.export import find_run
-from train.on_policy import distillation, paired_prompts
+from train.on_policy import distillation, paired_prompts, sampling
 from train.on_policy.continuation import inherit_settings
 from train.on_policy.paired_prompts import PairedPrompts
-from train.on_policy.teachers import check_tokenizer
+from train.on_policy.teachers import LocalTeacher, check_tokenizer
 
 pytestmark = pytest.mark.slow
 
@@ -152,6 +154,21 @@ def test_micro_batches_change_neither_loss_nor_gradient(settings, tmp_path) -> N
         records += [r for r in read_journal(folder) if "loss" in r]
     assert records[0]["loss"] == pytest.approx(records[1]["loss"], rel=1e-4)
     assert records[0]["grad_norm"] == pytest.approx(records[1]["grad_norm"], rel=1e-3)
+
+
+def test_a_non_finite_divergence_stops_the_run(settings, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(
+        LocalTeacher, "measure", lambda *_: torch.full((1,), torch.nan, requires_grad=True)
+    )
+    with raises_user_error("non-finite-loss", contains="train.lr"):
+        run_distill(settings, tmp_path / "run")
+
+
+def test_responses_without_answers_stop_the_run(settings, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(sampling, "MAX_UNPARSED", 8)
+    monkeypatch.setattr(distillation, "parse_choice", lambda *_, **__: ParsedAnswer(None))
+    with raises_user_error("nothing-parsed", contains="last 8 sampled responses"):
+        run_distill(settings, tmp_path / "run")
 
 
 def test_the_student_can_be_evaluated_and_exported(settings, student, tmp_path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,9 +16,10 @@ from conf.runs import open_run
 from conf.schema import ReinforceCommand, ReinforceTrainConfig, RewardWeights, SftCommand
 from data.store import Store
 from models.trained_runs import trained_settings
+from tests.user_errors import raises_user_error
 from train import reinforce, sft
 from train.common.journal import read_journal
-from train.on_policy import reinforcement
+from train.on_policy import reinforcement, sampling
 from train.student.trainer import token_losses
 
 pytestmark = pytest.mark.slow
@@ -150,15 +152,42 @@ def test_a_run_resumes_in_its_second_epoch(settings, tmp_path, monkeypatch, shor
     assert len({tuple(epoch) for epoch in epochs}) > 1
 
 
-def test_equal_rewards_leave_the_student_unchanged(settings, tmp_path, monkeypatch) -> None:
-    monkeypatch.setitem(reinforcement.REWARDS, "answer", lambda _: 1.0)
+def test_equal_rewards_give_no_gradient(settings, tmp_path, monkeypatch) -> None:
+    # The mean of six of these rewards in TRL's precision differs from them.
+    monkeypatch.setitem(reinforcement.REWARDS, "answer", lambda _: 9 / 37)
     for name in ("truth", "following", "no_numbers"):
         monkeypatch.setitem(reinforcement.REWARDS, name, lambda _: 0.0)
-    train = replace(settings.train, max_steps=1, evaluations=1)
+    train = replace(settings.train, max_steps=1, evaluations=1, responses=6)
     folder = run_reinforce(replace(settings, train=train), tmp_path / "run")
     (step,) = (r for r in read_journal(folder) if "reward" in r)
     assert step["frac_reward_zero_std"] == 1
     assert step["grad_norm"] == 0
+    assert all(math.isfinite(value) for value in step.values())
+
+
+def test_a_non_finite_loss_stops_the_run(settings, tmp_path, monkeypatch, short_rewards) -> None:
+    compute = reinforcement.GRPOTrainer._compute_loss
+    monkeypatch.setattr(
+        reinforcement.GRPOTrainer, "_compute_loss", lambda *args: compute(*args) * torch.nan
+    )
+    with raises_user_error("non-finite-loss", contains="train.lr"):
+        run_reinforce(settings, tmp_path / "run")
+
+
+def test_responses_without_answers_stop_the_run(settings, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(sampling, "MAX_UNPARSED", 8)
+    judge = reinforcement.judge_response
+    monkeypatch.setattr(
+        reinforcement, "judge_response", lambda *args: replace(judge(*args), letter=None)
+    )
+    with raises_user_error("nothing-parsed", contains="last 8 sampled responses"):
+        run_reinforce(settings, tmp_path / "run")
+
+
+def test_a_step_needs_enough_items(settings, tmp_path) -> None:
+    train = replace(settings.train, batch=1000)
+    with raises_user_error("batch-too-large", contains="train.batch=1000"):
+        run_reinforce(replace(settings, train=train), tmp_path / "run")
 
 
 def test_the_student_can_be_evaluated(settings, student, tmp_path) -> None:
