@@ -14,14 +14,20 @@ import torch
 from conf.compose import compose
 from conf.entry import Run
 from conf.runs import open_run
-from conf.schema import DistillCommand, DistillTrainConfig, ReinforceCommand, SftCommand
+from conf.schema import (
+    DistillCommand,
+    DistillTrainConfig,
+    ExportModelCommand,
+    ReinforceCommand,
+    SftCommand,
+)
 from data.store import Store
 from models import loading
 from models.student.answer_parser import ParsedAnswer
 from models.trained_runs import trained_settings
 from teacher.narrate import ensure_rationales
 from tests.user_errors import raises_user_error
-from train import distill, sft
+from train import distill, export, sft
 from train.common.journal import read_journal
 from train.export import find_run
 from train.on_policy import distillation, paired_prompts, sampling
@@ -185,6 +191,13 @@ def test_the_student_can_be_evaluated_and_exported(settings, student, tmp_path) 
     assert (found.student, found.benchmark) == (source.student, source.benchmark)
     assert (found.train.regime, found.train.lr) == (source.train.regime, settings.train.lr)
     loading.load_trained(found.student, "fp32", run.folder / "student")
+    cfg = ExportModelCommand(
+        run=str(run.folder), checkpoints=str(tmp_path), format="fp32", store=settings.store
+    )
+    (tmp_path / "export").mkdir()
+    export.main.__wrapped__(cfg, Run("run/fp32", tmp_path / "export"))
+    record = json.loads((tmp_path / "export" / "student" / "export.json").read_text())
+    assert record["run"] == "distill/run"
 
 
 def test_a_teacher_with_another_tokenizer_is_refused(processor, student, tmp_path) -> None:
