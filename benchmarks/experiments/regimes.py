@@ -38,6 +38,7 @@ from data.records import FAMILIES
 from data.store import Store
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.selection.distractors import BUILDERS_VERSIONS
+from evaluation.metrics.baselines import baseline_results
 from models.fingerprints import weights_digest
 from teacher.narrator import NARRATOR_VERSION
 from teacher.validation.reasons import PARTS
@@ -134,7 +135,7 @@ def main() -> None:
     trained = [name for name in args.variants if name != ZERO_SHOT]
     jobs = [(ZERO_SHOT, 0)] if ZERO_SHOT in args.variants else []
     jobs += [(name, seed) for seed in range(args.seeds) for name in trained]
-    print_tables(experiment.run(jobs, evaluate))
+    print_tables(experiment.run(jobs, evaluate), open_benchmark(Path(args.store), args.benchmark))
 
 
 def read_letters(
@@ -159,15 +160,16 @@ def read_letters(
     return rows
 
 
-def print_tables(table: pd.DataFrame) -> None:
-    """Print the accuracies of variants and modes, their differences, the controls, and what the
-    responses claim, in percent."""
+def print_tables(table: pd.DataFrame, store: Store) -> None:
+    """Print the accuracies of variants and modes, those of strategies that learn nothing, the
+    differences, the controls, and what the responses claim, in percent."""
     unchanged = table[table.control == UNCHANGED]
     groups = [(name, mode) for name, v in VARIANTS.items() for mode in v.modes]
     correct = {g: credit_matrix(unchanged, *g) for g in groups}
     correct = {group: credits for group, credits in correct.items() if credits.shape[1]}
     resampling = Resampling(next(iter(correct.values())).index)
     print_accuracies(unchanged, correct, resampling)
+    print_baselines(store)
     print_differences(correct, resampling)
     print_controls(table, correct, resampling)
     print_claims(unchanged)
@@ -186,6 +188,12 @@ def print_accuracies(
         ]
         by_seed = " ".join(f"{s:.1f}" for s in seeds)
         print_row(name, mode, *cells, by_seed, f"{100 * rows.letter.notna().mean():.1f}")
+
+
+def print_baselines(store: Store) -> None:
+    print_header("strategy", *FAMILIES, "macro")
+    for row in baseline_results(store.selection("test"), store, seed=0):
+        print_row(row.name, *(f"{100 * row.metrics[name]:.1f}" for name in (*FAMILIES, "macro")))
 
 
 def print_differences(correct: dict[tuple[str, str], pd.DataFrame], resampling: Resampling) -> None:
