@@ -184,13 +184,16 @@ def print_accuracies(results: pd.DataFrame) -> None:
     print_header("", *FAMILIES, "macro", *HORIZONS, "seeds", "CPU minutes")
     for variant, matrix in credits.items():
         rows = results[results.variant == variant]
-        cells = [
-            f"{m:.1f} [{low:.1f}, {high:.1f}]"
-            for m, low, high in resampling.intervals((variant, matrix))
+        # The subtypes of time items are their horizons.
+        by_horizon = credit_matrix(
+            rows[rows.family == "time"].assign(family=rows.subtype), variant, "reasoning"
+        )
+        horizons = Resampling(by_horizon.index, tuple(HORIZONS.values()))
+        intervals = [
+            *resampling.intervals((variant, matrix)),
+            *horizons.intervals((variant, by_horizon))[:-1],
         ]
-        for subtype in HORIZONS.values():
-            some = rows[rows.subtype == subtype]
-            cells.append(f"{100 * (some.letter == some.answer).mean():.1f}")
+        cells = [f"{m:.1f} [{low:.1f}, {high:.1f}]" for m, low, high in intervals]
         minutes = rows.groupby("seed").cpu_minutes.first().astype(float).mean()
         print_row(variant, *cells, matrix.shape[1], "-" if pd.isna(minutes) else f"{minutes:.0f}")
     print_header("difference", *FAMILIES, "macro")

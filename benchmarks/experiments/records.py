@@ -7,7 +7,7 @@ item_id, answer and letter.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -62,10 +62,10 @@ class Resampling:
     with the same seed have nothing in common but its number.
     """
 
-    def __init__(self, items: pd.MultiIndex) -> None:
-        families = items.get_level_values("family")
+    def __init__(self, items: pd.MultiIndex, families: Sequence[str] = FAMILIES) -> None:
+        family_of_item = items.get_level_values("family")
         self._scene, scenes = pd.factorize(items.get_level_values("scene_id"))
-        self._members = [families == family for family in FAMILIES]
+        self._members = [family_of_item == family for family in families]
         share = np.full(len(scenes), 1 / len(scenes))
         # (draws, scenes) how often each draw contains each scene.
         weights = np.random.default_rng(0).multinomial(len(scenes), share, size=DRAWS)
