@@ -62,10 +62,8 @@ VARIANTS = STUDENT, LONGER, DISTILLATION, REWARDS = (
 )  # fmt: skip
 SFT = ["+exp=cot", "teacher.predicates=relational"]
 FACTS = [*SFT, "train.facts=true"]
-DISTILL, REINFORCE = (
-    ["+exp=on_policy", "train.evaluations=2"],
-    ["+exp=grpo", "train.evaluations=2"],
-)
+DISTILL = ["+exp=on_policy", "train.evaluations=2"]
+REINFORCE = ["+exp=grpo", "train.evaluations=2"]
 MINUTES = "cpu_minutes.txt"
 """File in the folder of a training that was not interrupted."""
 HORIZONS = {"1 s": "in_1s", "2 s": "in_2s"}

@@ -104,7 +104,7 @@ class CertaintyCheck:
 
     def _is_general(self, at: int) -> bool:
         """Return whether a claim without a known subject must be about an object: no word of
-        negation or doubt precedes it, and some word other than "be" and unlisted words does."""
+        negation or doubt precedes it, and some listed word other than "be" does."""
         before = {tag.name for tag in self.tags[:at]}
         return not before & {"not", "contrast", "maybe", "none"} and not before <= {"word", "be"}
 

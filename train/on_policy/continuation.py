@@ -134,11 +134,9 @@ def train_and_save(
         trainer: A trainer with a sampler, `responses`.
         memory_settings: The settings that the error for running out of memory advises to lower.
     """
-    try:
-        best_step = run_training(trainer, run, checkpoint, memory_settings)
-        if rank() == 0:
-            loading.save_student(trainer.model, processor, run.folder / "student", precision)
-    finally:
-        trainer.responses.close()
+    best_step = run_training(trainer, run, checkpoint, memory_settings)
+    if rank() == 0:
+        loading.save_student(trainer.model, processor, run.folder / "student", precision)
+    trainer.responses.close()
     log.info("the student is in %s", run.folder / "student")
     return run_metrics(run.folder, best_step)
