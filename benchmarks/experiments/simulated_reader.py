@@ -31,7 +31,7 @@ from benchmarks.experiments.experiment import open_benchmark, print_header, prin
 from conf.failures import report_failures
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
-from teacher.deciding import UNKNOWN_PATH, UNSEEN_DISTANCE, Decision, choose_statements
+from teacher.deciding import UNKNOWN_PATH, Decision, choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation
 from teacher.predicates.places import region_at
@@ -46,6 +46,8 @@ from teacher.predicates.relations import (
 ERRORS = ((0.0, 0.0), (0.02, 0.0), (0.02, 0.15), (0.02, 0.3), (0.03, 0.4))
 """Standard deviations of the seen places, and of the predicted ones as shares of the paths. Those
 of the tiny base are about 0.02 and 0.3."""
+ABSENCE = 0.3
+"""Distance that counts for an object that only one of two frames shows."""
 READERS = ("statements", "closest", "all places")
 BOUNDS = Bounds()
 
@@ -184,10 +186,10 @@ def state_topics(statements: tuple[Relation, ...], found: set[Relation]) -> set[
 
 def measure_distance(one: Places, other: Places, names: Collection[str]) -> float:
     """Return the sum of the distances between the places of objects in two frames. An object that
-    only one of them shows counts `UNSEEN_DISTANCE`."""
+    only one of them shows counts `ABSENCE`."""
     both = one.image.keys() & other.image.keys() & {*names}
     either = (one.image.keys() | other.image.keys()) & {*names}
-    return sum(dist(one.image[name], other.image[name]) for name in both) + UNSEEN_DISTANCE * (
+    return sum(dist(one.image[name], other.image[name]) for name in both) + ABSENCE * (
         len(either) - len(both)
     )
 

@@ -93,12 +93,13 @@ def test_the_object_does_not_depend_on_which_candidate_is_the_target() -> None:
 
 
 def test_separation() -> None:
-    """The two closest places count; what both frames do not show is not compared."""
+    """The two closest places count; frames that do not show the object are equal."""
     assert measure_separation([(0.1, 0.2), (0.4, 0.6), (0.9, 0.2), (0.4, 0.1)]) == (
         pytest.approx(hypot(0.3, 0.1))
     )
-    assert measure_separation([(0.1, 0.2), None, None, None]) == UNSEEN_DISTANCE
-    assert measure_separation([(0.1, 0.2), (0.1, 0.3), None, None]) == pytest.approx(0.1)
+    assert measure_separation([(0.1, 0.2), (0.5, 0.2), (0.9, 0.2), None]) == UNSEEN_DISTANCE
+    assert measure_separation([(0.1, 0.2), (0.1, 0.21), None]) == pytest.approx(0.01)
+    assert measure_separation([(0.1, 0.2), (0.5, 0.2), None, None]) == 0
     assert measure_separation([(0.5, 0.5)] * 2) == measure_separation([None] * 4) == 0
 
 

@@ -284,7 +284,7 @@ def measure_separations(places: Tensor) -> Tensor:
     distances = (candidates[:, first] - candidates[:, second]).norm(dim=2)
     unseen = candidates.isnan().any(dim=2)
     neither = unseen[:, first] & unseen[:, second]
-    distances = distances.nan_to_num(UNSEEN_DISTANCE).masked_fill(neither, torch.inf)
+    distances = distances.nan_to_num(UNSEEN_DISTANCE).masked_fill(neither, 0)
     return distances.amin(dim=1).masked_fill(unseen.all(dim=1), torch.nan)
 
 
