@@ -36,9 +36,9 @@ class Detail(NamedTuple):
     relations: int = 1
     """Relations in the scene parse, and changes of relations in the motion analysis."""
     compared: int = 2
-    """What the candidate analysis of a relational text states of a candidate: all deciding
-    statements up to the first false one (2); of a distractor only the false one (1); and of the
-    target only the first (0)."""
+    """What the candidate analysis of a relational text says of a candidate: what it shows in the
+    respects of all deciding statements (2); of a distractor only what excludes it (1); and of the
+    target only the first statement (0)."""
 
 
 def most_discriminative_object(predicates: Predicates) -> ObjectFacts:

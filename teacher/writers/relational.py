@@ -127,23 +127,26 @@ class RelationalWriter(Writer):
         return f"the {relation.objects[0]} {verb} {self.place(relation)}"
 
     def attribute(self, relation: Relation) -> str:
-        """Return what follows the subject in `shown`."""
+        """Return what follows the subject in `shown` if the relation is true."""
         if relation.kind in SYMMETRIC:
             return f"with {self.other(relation)}"
         return self.place(relation)
 
-    def shown(self, relation: Relation) -> str:
-        """Return a statement as the object of "shows"."""
-        return f"the {relation.objects[0]} {self.attribute(relation)}"
+    def shown(self, statements: Sequence[tuple[Relation, bool]]) -> str:
+        """Return what a candidate shows as the object of "shows".
 
-    def all_shown(self, statements: Sequence[Relation]) -> str:
-        """Return statements that are true of a candidate as the object of "shows"."""
+        Args:
+            statements: Statements about the candidate, and whether each is true of it.
+        """
         text, subject = "", None
-        for s in statements:
+        # What is out of sight comes last: "no red cube and the blue sphere near the top" would deny
+        # both.
+        for s, true in sorted(statements, key=lambda each: each[0].kind == "sight"):
             if s.kind == "sight":
                 part = f"no {s.objects[0]}"
             else:
-                part = self.attribute(s) if s.objects[0] == subject else self.shown(s)
+                said = self.attribute(s) if true else f"not {self.place(s)}"
+                part = said if s.objects[0] == subject else f"the {s.objects[0]} {said}"
                 # In "between the cube and the sphere and with the cylinder left of it", "it" would
                 # be the sphere.
                 subject = s.objects[0] if len(s.objects) == 1 or s.kind in SYMMETRIC else None
@@ -213,45 +216,31 @@ class RelationalWriter(Writer):
         return self.comparison(self.view_of[candidate.letter])
 
     def comparison(self, view: View) -> str:
-        """Describe a candidate by the topics of the deciding statements, in order up to the first
-        statement that is false of it.
+        """Describe a candidate in the respects of the deciding statements.
 
         The text does not say whether the candidate agrees with the prediction. A model that writes
         it does not decide this before it has described all candidates.
         """
-        if (wrong := self.find_false(view)) is None:
-            stated = self.statements if self.detail.compared > 0 else self.statements[:1]
-            return f"shows {self.all_shown(stated)}"
-        true = self.statements[: self.statements.index(wrong)] if self.detail.compared > 1 else []
-        if not true:
-            return f"shows {self.instead(wrong, view)}"
-        subject = true[-1].objects[0] if len(true[-1].objects) == 1 else ""
-        return f"shows {self.all_shown(true)} and {self.instead(wrong, view, subject)}"
+        found = list(dict.fromkeys(self.find_shown(s, view) for s in self.statements))
+        if self.detail.compared < 2:
+            predicted = [(s, True) for s in self.statements]
+            excluding = [each for each in found if each not in predicted]
+            found = excluding[:1] or predicted[: None if self.detail.compared else 1]
+        return f"shows {self.shown(found)}"
 
-    def find_false(self, view: View) -> Relation | None:
-        """Return the first deciding statement that is false of a candidate."""
-        false = (s for s in self.statements if normalize_relation(s) not in view.statements)
-        return next(false, None)
-
-    def instead(self, s: Relation, view: View, subject: str = "") -> str:
-        """Return what a candidate shows instead of a deciding statement that is false of it, as the
-        object of "shows".
-
-        Args:
-            subject: The object that the text named last, which is not named again.
-        """
+    def find_shown(self, s: Relation, view: View) -> tuple[Relation, bool]:
+        """Return what a candidate shows in the respect of a deciding statement: a statement, and
+        whether it is true of the candidate. It is false if no words but its denial tell it."""
+        if normalize_relation(s) in view.statements:
+            return s, True
         facts = {o.object: o for o in view.objects}
-        if s.kind == "sight":
-            return f"the {s.objects[0]} {facts[s.objects[0]].target_region}"
         unseen = [name for name in s.objects if facts[name].target_sight != "shown"]
         if unseen:
-            return f"the {unseen[0]} out of sight"
-        if s.kind == "region":
-            return f"the {s.objects[0]} {facts[s.objects[0]].target_region}"
-        if actual := find_topic(s, view.relations):
-            return (self.attribute if actual.objects[0] == subject else self.shown)(actual)
-        denied = f"not {self.place(s)}"
-        return denied if s.objects[0] == subject else f"the {s.objects[0]} {denied}"
+            return Relation("sight", (unseen[0],), "unseen"), True
+        if s.kind in ("region", "sight"):
+            return Relation("region", s.objects, facts[s.objects[0]].target_region), True
+        actual = find_topic(s, view.relations)
+        return (s, False) if actual is None else (actual, True)
 
     def match(self, candidate: CandidateFacts) -> str:
         # No reason is given: a model that describes the candidate a second time may contradict its

@@ -207,35 +207,35 @@ def test_match_lines_give_the_verdict_only() -> None:
             assert line == f"Candidate {view.letter} {verb}."
 
 
-def test_analyses_state_what_a_candidate_shows_up_to_the_first_false_statement() -> None:
-    walked = 0
+def test_analyses_describe_all_candidates_in_the_same_respects() -> None:
+    """So neither the length of a description nor its last statement tells the target."""
+    alike = denied = 0
     for item, predicates in random_cases(60, BOUNDS):
         writer = RelationalWriter(predicates, choose_statements(predicates), FULL, item.item_id)
+        if not writer.statements:
+            continue
+        texts, descriptions = {}, {}
         for view in predicates.views:
-            false = [s for s in writer.statements if normalize_relation(s) not in view.statements]
-            text = writer.comparison(view)
-            # Only a relation that has no opposite, such as "between", is denied.
-            denied = [writer.instead(s, view) for s in false[:1]]
-            assert " not " not in text or "not " in denied[0]
-            if not false:
-                assert text == f"shows {writer.all_shown(writer.statements)}"
-                continue
-            first, *after = writer.statements[writer.statements.index(false[0]) :]
-            before = writer.statements[: -1 - len(after)]
-            assert {*first.objects} & {n for n in predicates.left_to_right if n in text}
-            unsaid = {n for s in after for n in s.objects}
-            unsaid -= {n for s in (*before, first) for n in s.objects}
-            assert not [n for n in unsaid if n in text]
-            if [s.kind for s in before] == ["region"]:
-                (one,) = before[0].objects
-                assert text.startswith(f"shows the {one} {before[0].value} and ")
-                walked += 1
-            facts = {o.object: o for o in view.objects}
-            if not before and first.kind == "region":
-                (one,) = first.objects
-                if facts[one].target_sight == "shown":
-                    assert text == f"shows the {one} {facts[one].target_region}"
-    assert walked
+            found = [writer.find_shown(s, view) for s in writer.statements]
+            texts[view.letter] = text = writer.comparison(view)
+            descriptions[view.letter] = {*found}
+            for s, (shown, true) in zip(writer.statements, found, strict=True):
+                assert true == (normalize_relation(shown) in view.statements)
+                assert {*shown.objects} <= {*s.objects}
+                assert all(name in text for name in shown.objects)
+                if shown.kind != "sight":
+                    assert {*shown.objects} == {*s.objects}
+                denied += not true
+            if found[0][0].kind == "region":
+                (one,) = found[0][0].objects
+                assert text.startswith(f"shows the {one} {found[0][0].value}")
+        target = texts.pop(predicates.answer)
+        for letter, text in texts.items():
+            same = descriptions[letter] == descriptions[predicates.answer]
+            assert same == (text == target)
+            alike += same
+    assert alike
+    assert denied
 
 
 def test_the_oracle_checks_how_far_off_an_object_is() -> None:
