@@ -56,7 +56,7 @@ class OracleCollator:
         pairs: dict[str, list[tuple[int, ...]]] = {
             "prompt_letters": [*self._find_letters(ids, visual, samples, grid)],
             "text_tokens": [], "object_words": [], "spatial_words": [], "verdicts": [],
-            "choices": [], "comparisons": [], "matches": [],
+            "choices": [], "matches": [],
         }  # fmt: skip
         for row, (sample, text) in enumerate(zip(samples, texts, strict=True)):
             # The token that ends the turn follows the response.
@@ -74,9 +74,6 @@ class OracleCollator:
             ]
             pairs["matches"] += [
                 (row, start + letter, start + outcome) for letter, outcome in text.matches()
-            ]
-            pairs["comparisons"] += [
-                (row, start + shown, start + predicted) for shown, predicted in text.comparisons()
             ]
         start = batch["attention_mask"].argmax(dim=1)
         return batch, stack_samples(samples, mentions, pairs, visual, start, grid)
@@ -189,7 +186,6 @@ def stack_samples(
         spatial_words=integers(pairs["spatial_words"], 2),
         verdicts=integers(pairs["verdicts"], 3),
         choices=integers(pairs["choices"], 3),
-        comparisons=integers(pairs["comparisons"], 3),
         mentioned=integers([*find_mentioned(mentions)], 3),
         matches=integers(pairs["matches"], 3),
         next_in_clip=integers([*find_next_in_clip(mentions)], 3),

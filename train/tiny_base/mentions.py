@@ -37,22 +37,6 @@ CLOSEST = re.compile(
 """Matches where a text names the candidate that shows an object closest to its place."""
 MATCH = re.compile(r"^Candidate (?P<letter>\w) (?:matches|does not match)", re.MULTILINE)
 """Matches where a line says whether a candidate matches the prediction."""
-PREDICTED = re.compile(
-    rf"[Tt]he (?P<name>{NAME.pattern}) (?:will (?:be|have)|should be|remains|stays) "
-    r"(?P<place>[^.]+)\."
-)
-"""Matches a sentence that says where an object will be."""
-CLAIMED = re.compile(
-    rf"\b(?P<verb>shows|and|but) the (?P<name>{NAME.pattern}) (?!not )"
-    rf"(?P<place>between [^.]+? and the (?:{NAME.pattern})|[^.,]+?)(?P<comma>,?)"
-    r"(?P<off> (?:slightly|clearly|far) off,?)?"
-    r"(?=(?P<agrees>,? and agrees|,? and (?:the|with|no) |,? but |(?<=off)\.)"
-    r"| not |,? not |,? and not |\.)"
-)
-"""Matches what a text says that a candidate shows of an object, and how far off it is. The group
-`agrees` matches if the text continues as if this is what was predicted."""
-SHOWN = re.compile(r"(?:[Cc]andidate \w|\bit) shows\b")
-"""Matches the beginning of what a candidate shows."""
 POSSESSES = re.compile(r"\b(?:with|has|have) the $")
 """Matches the words before the sphere in "the cube has the sphere left of it"."""
 PREDICTION = re.compile("Prediction:")
@@ -165,37 +149,6 @@ class TokenizedText:
                 outcome = self.token_at(event.end("letters") - 1)
             elif outcome is not None:
                 yield self.token_at(event.start("letter")), outcome
-
-    def comparisons(self) -> Iterator[tuple[int, int]]:
-        """Yield the index of the last token of each place that a candidate is said to show, also of
-        a comma and of how far off it is, and an index that says whether the place was predicted:
-        that of the last token of the predicted place if both are the same, otherwise that of the
-        word before the object (shows, and, but). After these tokens, the text says whether both are
-        the same. A region is compared with a predicted region, and a relation with a relation; if
-        an object has several of them, they are left out.
-        """
-        predicted: dict[tuple[str, bool], list[tuple[int, str]]] = {}
-        for event in self._find(PREDICTION, PREDICTED, CLAIMED):
-            if event.re is PREDICTION:
-                predicted.clear()
-                continue
-            last = self.token_at(event.end("place") - 1)
-            place = event["place"].removeprefix("with ")
-            kind = event["name"], place.startswith(("near the ", "out of "))
-            if event.re is PREDICTED:
-                predicted.setdefault(kind, []).append((last, place))
-                continue
-            sentence = max(self.text.rfind(end, 0, event.start()) for end in (". ", "\n"))
-            places = predicted.get(kind, [])
-            if len(places) == 1 and SHOWN.search(self.text, max(sentence, 0), event.end("verb")):
-                before = self.token_at(event.start("verb"))
-                (expected, words), *_ = places
-                key = before if event["agrees"] is None and place != words else expected
-                yield last, key
-                if event["comma"]:
-                    yield self.token_at(event.start("comma")), key
-                if event["off"]:
-                    yield self.token_at(event.end("off") - 1), key
 
     def _find(self, *patterns: re.Pattern[str]) -> list[re.Match[str]]:
         """Return the matches of all patterns in the order of the text."""

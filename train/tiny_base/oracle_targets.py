@@ -136,9 +136,6 @@ class OracleTargets:
         choices: (_, 3) row, position before the letter of the candidate that is said to show an
             object closest to its place, and position of the last token at which the text speaks of
             the object in this candidate.
-        comparisons: (_, 3) row, position of the end of a place that a candidate is said to show,
-            and position of the end of the predicted place of the same object if both are the same,
-            otherwise of the word before the object: shows, and, but.
         mentioned: (_, 3) row, position before a name in a section about the scene, and position of
             another name that the section has mentioned before.
         matches: (_, 3) row, position of the letter in a line that says whether a candidate matches,
@@ -177,7 +174,6 @@ class OracleTargets:
     spatial_words: Tensor
     verdicts: Tensor
     choices: Tensor
-    comparisons: Tensor
     mentioned: Tensor
     matches: Tensor
     next_in_clip: Tensor

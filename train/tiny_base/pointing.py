@@ -38,12 +38,9 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     find shown          NAMING 5       name -> likewise, in the picture that the text describes
     subject             RECALLING 0    token that describes an object -> the object's name
     repeat              RECALLING 1    token before a repeated name -> the name's last mention
-    comparison          RECALLING 2    end of a place in a candidate -> the end of the predicted
-                                       place if both are the same, otherwise the word before
-                                       the object: shows, and, but
-    owner               RECALLING 3    token that describes the sphere in "the cube has the sphere
+    owner               RECALLING 2    token that describes the sphere in "the cube has the sphere
                                        left of it" -> the cube's name
-    mentioned           RECALLING 4    token before a name in a section about the scene -> the
+    mentioned           RECALLING 3    token before a name in a section about the scene -> the
                                        other names that the section has mentioned before
     verdict             SPEAKING 0     token before a letter in an outcome -> "agrees" of this
                                        candidate, or its letter after "closest"
@@ -94,9 +91,8 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         ("find shown", NAMING, PICTURES, shown),
         ("subject", RECALLING, 0, targets.subjects),
         ("repeat", RECALLING, 1, targets.repeats),
-        ("comparison", RECALLING, 2, targets.comparisons),
-        ("owner", RECALLING, 3, targets.owners),
-        ("mentioned", RECALLING, 4, targets.mentioned),
+        ("owner", RECALLING, 2, targets.owners),
+        ("mentioned", RECALLING, 3, targets.mentioned),
         ("verdict", SPEAKING, 0, targets.verdicts),
         ("choice", CHOOSING, 0, targets.choices),
         ("next in clip", SPEAKING, 1, next_in_clip),

@@ -150,7 +150,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(sampler, collate
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
         "before", "second before", "track clip", *(f"find {k}" for k in range(PICTURES)), "subject",
-        "find shown", "label", "letter", "repeat", "choice", "comparison", "owner",
+        "find shown", "label", "letter", "repeat", "choice", "owner",
         "next in candidates", "mentioned",
         *(f"track {k}" for k in range(len(LETTERS) - 1)),
     }  # fmt: skip
