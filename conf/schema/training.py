@@ -93,6 +93,10 @@ class SftTrainConfig(StudentTrainConfig):
     facts: bool = False
     """Show the facts of an item as text instead of its frames. Such a model can be the teacher of
     train.distill; it cannot be evaluated."""
+    false_words: float = setting(0.0, least=0, below=1)
+    """Share of the words for places and relations in predictions and candidate analyses that are
+    replaced by false ones, others in each epoch. The student reads them, but is not trained to
+    write them, so that it learns to go on after a mistake. Validation is on true texts."""
     reuse_features: bool = False
     """Cache the frozen vision tower's features of each frame in up to half of the free memory. With
     an 8B model, the features of a frame take about 3 MB."""

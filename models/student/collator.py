@@ -8,6 +8,7 @@ has to compute the logits of these positions.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -73,12 +74,20 @@ def encode(
     ids = prompt.pop("input_ids")[0].tolist()
     types = prompt.pop("mm_token_type_ids")[0].tolist()
     prompt.pop("attention_mask")
-    response = []
+    response, trained = [], []
     if sample.response_ids is not None:
-        response = list(sample.response_ids)
+        response = trained = list(sample.response_ids)
     elif sample.response is not None:
-        response = processor.tokenizer.encode(sample.response, add_special_tokens=False)
-        response.append(processor.tokenizer.eos_token_id)
+        encoded = processor.tokenizer(
+            sample.response, add_special_tokens=False, return_offsets_mapping=True
+        )
+        response = [*encoded["input_ids"], processor.tokenizer.eos_token_id]
+        trained = response.copy()
+        stops = [stop for _, stop in encoded["offset_mapping"]]
+        for first, stop in sample.false_spans:
+            # A space belongs to the token of the next word, whether or not its offsets include it.
+            tokens = slice(bisect_right(stops, first), bisect_right(stops, stop - 1) + 1)
+            trained[tokens] = [IGNORED] * len(trained[tokens])
     if max_length is not None and len(ids) + len(response) > max_length:
         raise UserError(
             f"sample {sample.sample_id} has {len(ids) + len(response)} tokens, more than "
@@ -87,7 +96,7 @@ def encode(
             code="sample-too-long",
         )
     media = {name: prompt[name] for name in MEDIA_INPUTS if name in prompt}
-    labels = [IGNORED] * len(ids) + response
+    labels = [IGNORED] * len(ids) + trained
     return Encoded(ids + response, labels, types + [0] * len(response), media)
 
 

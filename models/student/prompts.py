@@ -80,6 +80,8 @@ class Sample:
         response_ids: Token ids of the response if a model has generated them; the tokenizer may
             divide the same text into other tokens.
         supervised: Whether the response is trained on; if not, the sample only fills a batch.
+        false_spans: Spans of `response` that are false on purpose. The model reads them, but is not
+            trained to write their tokens.
     """
 
     sample_id: str
@@ -89,6 +91,7 @@ class Sample:
     response: str | None = None
     response_ids: tuple[int, ...] | None = None
     supervised: bool = True
+    false_spans: tuple[tuple[int, int], ...] = ()
 
     @property
     def pictures(self) -> int:

@@ -43,7 +43,7 @@ def pair_prompts(
         item: The item with its facts.
         seed: Seed of the responses and, if `permute` is true, of the order of the candidates.
     """
-    student = replace(item, facts="").lazy_sample(frames, frame_count, seed if permute else None)
+    student = replace(item, facts="").lazy_sample(frames, frame_count)
     return replace(student, render=partial(_render, item, frames, frame_count, seed, permute))
 
 
@@ -56,8 +56,8 @@ def _render(
     epoch: int,
 ) -> PairedPrompts:
     shown = item.permuted(seed, epoch) if permute else item
-    student = replace(shown, facts="").render(frames, frame_count, None, epoch)
-    teacher = shown.render(frames, frame_count, None, epoch)
+    student = replace(shown, facts="").render(frames, frame_count)
+    teacher = shown.render(frames, frame_count)
     rng = seeded_rng("response", seed, epoch, item.item.item_id)
     return PairedPrompts(
         replace(student, response=None),
@@ -89,7 +89,7 @@ def load_datasets(
         for item in supervised_items(store, training, *shared, True)["reasoning"]
     ]
     held_out = {
-        mode: StudentDataset([item.lazy_sample(frames, frame_count, None) for item in items])
+        mode: StudentDataset([item.lazy_sample(frames, frame_count) for item in items])
         for mode, items in supervised_items(store, validation, *shared).items()
     }
     check_not_empty(len(samples), "training items with accepted rationales")

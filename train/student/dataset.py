@@ -23,8 +23,24 @@ from models.student.prompts import (
 from teacher.candidate_letters import relabel_text, reorder_candidates
 from teacher.narrator import write_facts, write_match_lines
 from teacher.vocabulary import choose_vocabulary, describe_item
+from train.common.false_words import falsify_words
 from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How samples differ between epochs.
+
+    Attributes:
+        permute_candidates: Whether the order of the candidates differs.
+        false_words: Share of the words for places and relations that are replaced (see
+            `train.common.false_words`).
+    """
+
+    seed: int
+    permute_candidates: bool
+    false_words: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -52,19 +68,33 @@ class SupervisedItem:
         parts = (self.item.question, self.facts, instruction(self.mode, self.regime), self.response)
         return " ".join(filter(None, parts))
 
-    def lazy_sample(self, frames: FrameReader, frame_count: int, seed: int | None) -> LazySample:
-        """Return a sample that shows `frame_count` frames of the prefix. If `seed` is not None, its
-        candidates are permuted in each epoch."""
-        render = partial(self.render, frames, frame_count, seed)
+    def lazy_sample(
+        self, frames: FrameReader, frame_count: int, variation: Variation | None = None
+    ) -> LazySample:
+        """Return a sample that shows `frame_count` frames of the prefix, the same in every epoch
+        unless `variation` is given."""
+        render = partial(self._render_in_epoch, frames, frame_count, variation)
         pairs = -(-frame_count // 2)
         pictures = 0 if self.facts else pairs + len(LETTERS)
         return LazySample(self.text, pictures, render, self.item.family)
 
-    def render(self, frames: FrameReader, frame_count: int, seed: int | None, epoch: int) -> Sample:
-        s = self if seed is None else self.permuted(seed, epoch)
-        if s.facts:
-            return facts_sample(s.item, s.mode, s.regime, s.facts, s.response)
-        return selection_sample(s.item, s.mode, s.regime, frames, frame_count, s.response)
+    def render(self, frames: FrameReader, frame_count: int) -> Sample:
+        if self.facts:
+            return facts_sample(self.item, self.mode, self.regime, self.facts, self.response)
+        return selection_sample(
+            self.item, self.mode, self.regime, frames, frame_count, self.response
+        )
+
+    def _render_in_epoch(
+        self, frames: FrameReader, frame_count: int, variation: Variation | None, epoch: int
+    ) -> Sample:
+        if variation is None:
+            return self.render(frames, frame_count)
+        seed = variation.seed
+        item = self.permuted(seed, epoch) if variation.permute_candidates else self
+        rng = seeded_rng("false words", seed, epoch, self.item.item_id)
+        text, spans = falsify_words(item.response, variation.false_words, rng)
+        return replace(item.render(frames, frame_count), response=text, false_spans=spans)
 
     def permuted(self, seed: int, epoch: int) -> SupervisedItem:
         """Return a copy with permuted candidates, and with their new letters in its texts."""
@@ -136,22 +166,24 @@ def load_datasets(
     Raises:
         UserError: a dataset is empty.
     """
-    train, frame_count, seed = cfg.train, cfg.student.frames, cfg.seed
+    train, frame_count = cfg.train, cfg.student.frames
     frames = FrameReader(store, cfg.student.image_size)
     if train.regime != "answer_only":
         check_not_empty(len(rationales), "accepted rationales")
-    training_items, validation_items = split_items(store, train.validation_items, seed)
+    training_items, validation_items = split_items(store, train.validation_items, cfg.seed)
     by_item = {r.item_id: r for r in rationales}
 
-    def samples_of(items: list[SelectionItem], seed: int | None) -> dict[str, list[LazySample]]:
+    def samples_of(
+        items: list[SelectionItem], variation: Variation | None = None
+    ) -> dict[str, list[LazySample]]:
         by_mode = supervised_items(store, items, by_item, train.regime, cfg.teacher, train.facts)
         return {
-            mode: [s.lazy_sample(frames, frame_count, seed) for s in supervised]
+            mode: [s.lazy_sample(frames, frame_count, variation) for s in supervised]
             for mode, supervised in by_mode.items()
         }
 
-    training = samples_of(training_items, seed if train.permute_candidates else None)
-    validation = samples_of(validation_items, None)
+    variation = Variation(cfg.seed, train.permute_candidates, train.false_words)
+    training, validation = samples_of(training_items, variation), samples_of(validation_items)
     samples = [sample for part in training.values() for sample in part]
     check_not_empty(len(samples), f"samples for train.regime={train.regime}")
     check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")

@@ -86,6 +86,8 @@ class Question:
     Attributes:
         clip, candidates: Whether the prompt shows the clip, and the candidates.
         predicts_target: Whether the answer's predictions are true of the target.
+        false_spans: Spans of the answer that are false on purpose (see
+            `train.common.false_words`).
         instead: The frame that is shown instead of the target, if any.
     """
 
@@ -94,6 +96,7 @@ class Question:
     clip: bool = True
     candidates: bool = True
     predicts_target: bool = True
+    false_spans: tuple[tuple[int, int], ...] = ()
     instead: Candidate | None = None
 
 

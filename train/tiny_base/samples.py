@@ -7,7 +7,7 @@ a question of `train.tiny_base.questions`, or none.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -74,6 +74,7 @@ def make_sample(
         targets += compare_images(images)
     parts.append(f"\n{question.text}")
     sample = conversation(item.item_id, parts, question.answer, clip)
+    sample = replace(sample, false_spans=question.false_spans)
     return OracleSample(sample, tuple(targets), last, observed, future, question.predicts_target)
 
 

@@ -18,7 +18,7 @@ from teacher.predicates.extraction import extract_predicates
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from train.student.dataset import SupervisedItem, supervised_items, tokenizer_corpus
+from train.student.dataset import SupervisedItem, Variation, supervised_items, tokenizer_corpus
 from train.student.lazy_samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
@@ -100,13 +100,14 @@ def test_an_order_depends_on_seed_epoch_and_item(micro_store, frames, student_cf
     assert len(set(map(tuple, first))) > 1
     assert first != orders(supervised[0], seed=1)
     assert first != second
-    for seed in (0, None):
+    for permute in (True, False):
+        variation = Variation(0, permute)
         dataset = StudentDataset(
-            [s.lazy_sample(frames, student_cfg.frames, seed) for s in supervised]
+            [s.lazy_sample(frames, student_cfg.frames, variation) for s in supervised]
         )
         dataset.set_epoch(1)
         for k, s in enumerate(supervised):
-            expected = s if seed is None else s.permuted(seed, 1)
+            expected = s.permuted(0, 1) if permute else s
             assert dataset[k].response == expected.response
 
 
@@ -118,7 +119,7 @@ def test_estimated_lengths_differ_as_the_numbers_of_tokens(
     processor = build_processor(tokenizer_corpus(micro_store, []), 1024, 96, patch)
     by_mode = items_of(micro_store, "cot")
     supervised = by_mode["reasoning"][:3] + by_mode["answer"][:3]
-    samples = [s.lazy_sample(frames, count, None) for count in (4, 5, 12) for s in supervised]
+    samples = [s.lazy_sample(frames, count) for count in (4, 5, 12) for s in supervised]
     data = StudentDataset(samples)
     estimates = np.array(data.lengths(processor, student_cfg.image_size))
     size = student_cfg.max_length

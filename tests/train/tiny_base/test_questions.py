@@ -12,6 +12,7 @@ import pytest
 
 from data.records import LETTERS, SelectionItem
 from data.store import Store
+from models.student.collator import IGNORED, encode
 from teacher.deciding import choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates, View
@@ -189,3 +190,22 @@ def test_sampled_statements_are_different_and_true(described: Described) -> None
             assert {*map(normalize_relation, statements)} <= view.statements
             kinds |= {s.kind for s in statements}
     assert {"region", "side", "height", "gap", "extreme", "between", "nearer"} <= kinds
+
+
+def test_false_words_are_read_but_not_written(sampler, processor) -> None:
+    """A student's labels are its response, without the tokens that any false span touches."""
+    tokenizer, hidden = processor.tokenizer, 0
+    for item in sampler.items[:6]:
+        sample = sampler.make_sample(item, "compare", "test", 0.5).sample
+        encoded = encode(sample, processor, None)
+        response = tokenizer.encode(sample.response, add_special_tokens=False)
+        start = len(encoded.labels) - len(response) - 1
+        assert encoded.input_ids[start:-1] == response
+        stop = 0
+        for token, label in zip(response, encoded.labels[start:-1], strict=True):
+            first, stop = stop, stop + len(tokenizer.decode([token]))
+            false = any(first < end and begin < stop for begin, end in sample.false_spans)
+            assert label == (IGNORED if false else token)
+            hidden += false
+        assert stop == len(sample.response)
+    assert hidden > 10
