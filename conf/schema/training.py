@@ -233,7 +233,7 @@ def stage(steps: int, batch: int, lr: float) -> StageConfig:
 
 @dataclass
 class BaseTrainConfig(Settings):
-    eyes: StageConfig = stage(4000, 8, 2e-3)
+    eyes: StageConfig = stage(4000, 16, 2e-3)
     """The vision tower learns to see objects in single pictures."""
     motion: StageConfig = stage(4000, 8, 1e-3)
     """The whole model learns where objects are and where they go."""

@@ -18,12 +18,19 @@ from train.student.lazy_samples import seeded_rng
 from train.tiny_base.questions import KINDS, QUESTIONS, Question, make_question
 from train.tiny_base.samples import OracleSample, make_sample
 
-NO_QUESTION = Question("", "")
-"""The question of the stages without words."""
+SILENT = {
+    "clip": Question("", "", candidates=False),
+    "candidates": Question("", "", clip=False),
+    "pictures": Question("", ""),
+}
+"""What the samples of the stages without words show; they ask nothing."""
 COMPARISONS = ("compare", "explain")
 """The kinds of questions whose answers compare candidates with a prediction."""
 CYCLE = (*KINDS, *COMPARISONS)
 """The kinds of questions of successive steps. Comparing candidates is harder than the rest."""
+SHOWN = {"eyes": ("clip", "candidates"), "motion": ("pictures",), "words": CYCLE}
+"""The kinds of successive samples of each stage. The pictures of an item resemble each other, so a
+step of `eyes` shows parts of more items."""
 FALSE_WORDS = 0.25
 """Share of the words for places and relations in these answers that are replaced in training. Of
 the regions that the committed base writes, 13 to 30% are wrong."""
@@ -61,10 +68,10 @@ class ItemSampler:
     seed: int
 
     def make_batch(self, stage: str, step: int, size: int) -> list[OracleSample]:
-        """Return this rank's samples of a step with `size` samples over all ranks. All ask the same
-        kind of question, so that they show the same number of pictures."""
+        """Return this rank's samples of a step with `size` samples over all ranks. All are of the
+        same kind, so that they show the same number of pictures."""
         samples = []
-        kind = CYCLE[step % len(CYCLE)] if stage == "words" else None
+        kind = SHOWN[stage][step % len(SHOWN[stage])]
         for position in range(step * size + rank(), (step + 1) * size, world_size()):
             epoch, index = divmod(position, len(self.items))
             order = seeded_rng(self.seed, stage, epoch).permutation(len(self.items))
@@ -73,26 +80,26 @@ class ItemSampler:
         return samples
 
     def make_sample(
-        self, item: SelectionItem, kind: str | None, key: str, false_words: float = 0.0
+        self, item: SelectionItem, kind: str, key: str, false_words: float = 0.0
     ) -> OracleSample:
         """Return a sample of an item (see `ask_question`)."""
         return self.show_question(*self.ask_question(item, kind, key, false_words))
 
     def ask_question(
-        self, item: SelectionItem, kind: str | None, key: str, false_words: float = 0.0
+        self, item: SelectionItem, kind: str, key: str, false_words: float = 0.0
     ) -> tuple[SelectionItem, Question]:
         """Return an item with its candidates in random order, and a question about it.
 
         Args:
-            kind: The kind of question; None asks none.
+            kind: The kind of question, or of `SILENT`.
             key: Seed of the order and of the question, with the run's seed and the item.
             false_words: Share of the words for places and relations that are replaced in answers
                 that compare candidates with a prediction.
         """
         rng = seeded_rng(self.seed, key, item.item_id)
         item = reorder_candidates(item, rng.permutation(len(LETTERS)).tolist())
-        if kind is None:
-            return item, NO_QUESTION
+        if kind in SILENT:
+            return item, SILENT[kind]
         question = make_question(kind, item, self.frames.scene, rng)
         if kind in COMPARISONS:
             answer, spans = falsify_words(question.answer, false_words, rng)

@@ -306,7 +306,7 @@ def build_trainer(
     letters = letter_token_ids(processor.tokenizer)
     heads = OracleHeads(model.get_input_embeddings(), objects, letters)
     collate = OracleCollator(processor, cfg.student.max_length)
-    samples = [sampler.make_sample(item, None, "held out") for item in held_out]
+    samples = [sampler.make_sample(item, "pictures", "held out") for item in held_out]
     worded = {
         kind: [sampler.make_sample(i, kind, "held out") for i in held_out[::2]] for kind in KINDS
     }

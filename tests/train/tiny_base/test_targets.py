@@ -353,6 +353,18 @@ def test_samples_depend_on_seed_and_step_only(sampler: ItemSampler) -> None:
     assert sorted(epoch) == sorted(item.item_id for item in sampler.items)
 
 
+def test_steps_show_the_clip_the_candidates_or_both(sampler: ItemSampler) -> None:
+    for stage, step, shown in (
+        ("eyes", 0, (3, 0)),
+        ("eyes", 1, (0, 4)),
+        ("motion", 0, (3, 4)),
+        ("motion", 1, (3, 4)),
+    ):
+        for s in sampler.make_batch(stage, step, 3):
+            assert (s.sample.pictures - len(s.sample.images), len(s.sample.images)) == shown
+            assert {t.picture for t in s.targets} <= {*range(sum(shown))}
+
+
 def test_ranks_share_the_samples_of_a_step(sampler: ItemSampler, monkeypatch) -> None:
     whole = [s.sample.response for s in sampler.make_batch("words", 3, 4)]
     monkeypatch.setenv("LOCAL_RANK", "0")
