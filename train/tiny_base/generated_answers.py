@@ -9,6 +9,10 @@ generated_name_recall/parse      share of the objects named in the true answers 
 generated_region/predict         share of the claims about regions in answers to `predict` that the
                                  oracle supports, of those that it can decide; likewise for other
                                  kinds of claims
+generated_outcome/explain        share of the answers to `explain` that name a closest candidate, of
+                                 those whose true answers do
+generated_choice/explain         share of these in which the candidate is the one that shows the
+                                 named object closest to its place at the target
 """
 
 from __future__ import annotations
@@ -16,24 +20,26 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from math import dist, inf
 
 from transformers import PreTrainedModel, ProcessorMixin
 
 from conf.schema import StudentConfig
-from data.records import SelectionItem
+from data.records import LETTERS, SelectionItem
 from models.student.collator import Collator
 from models.student.generation import generate
 from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.relations import Bounds
+from teacher.predicates.relations import Bounds, Places
 from teacher.validation.claim_extraction import extract_claims
 from train.tiny_base.data import ItemSampler
-from train.tiny_base.mentions import NAME
+from train.tiny_base.mentions import CLOSEST, NAME
 from train.tiny_base.oracle_targets import WORDS
+from train.tiny_base.questions import Question
 
 SECTIONS = {"parse": "", "predict": "", "describe": "Candidate analysis: "}
 """The kinds of questions whose answers are read, and what they lack to be read as sections of a
-rationale. Answers to `compare` state predictions that need not be true, and `explain` repeats what
-the other kinds ask for."""
+rationale. Answers to `compare` state predictions that need not be true. `explain` repeats what the
+other kinds ask for; of its answers, only the outcome is read."""
 BATCH = 32
 
 
@@ -47,25 +53,49 @@ def measure_generated_answers(
 ) -> dict[str, float]:
     """Return the measures of answers about held-out items, by name."""
     collate = Collator(processor, student.max_length)
-    limit = student.max_new_tokens
     model.eval()
     found: dict[str, list[bool]] = defaultdict(list)
-    for kind, section in SECTIONS.items():
+    for kind in (*SECTIONS, "explain"):
         for k in range(0, len(items), BATCH):
             asked = [sampler.ask_question(item, kind, "held out") for item in items[k : k + BATCH]]
             samples = [
                 replace(sampler.show_question(item, question).sample, response=None)
                 for item, question in asked
             ]
-            texts = generate(model, processor, collate(samples), limit, precision)
+            batch = collate(samples)
+            texts = generate(model, processor, batch, student.max_new_tokens, precision)
             for (item, question), text in zip(asked, texts, strict=True):
-                names = set(NAME.findall(text.text))
-                found[f"generated_name_recall/{kind}"] += [
-                    name in names for name in set(NAME.findall(question.answer))
-                ]
-                for name, right in _read(section + text.text, item, kind, sampler):
+                if kind == "explain":
+                    read = _read_outcome(text.text, item, question, sampler)
+                else:
+                    read = _read(SECTIONS[kind] + text.text, item, kind, sampler)
+                    names = set(NAME.findall(text.text))
+                    true_names = set(NAME.findall(question.answer))
+                    read += [("name_recall", name in names) for name in true_names]
+                for name, right in read:
                     found[f"generated_{name}/{kind}"].append(right)
     return {name: sum(values) / len(values) for name, values in found.items()}
+
+
+def _read_outcome(
+    text: str, item: SelectionItem, question: Question, sampler: ItemSampler
+) -> list[tuple[str, bool]]:
+    """Return whether an answer to `explain` names a closest candidate, and whether it is right. If
+    the true answer names none, nothing is returned."""
+    if not CLOSEST.search(question.answer):
+        return []
+    outcome = CLOSEST.search(text)
+    if outcome is None:
+        return [("outcome", False)]
+    shown = [*item.candidates]
+    if question.instead is not None:
+        shown[item.answer] = question.instead
+    scene = sampler.frames.scene
+    target = Places.of(scene(item.scene_id), item.target_frame).image.get(outcome["name"])
+    places = [Places.of(scene(c.scene_id), c.frame).image.get(outcome["name"]) for c in shown]
+    distances = [dist(target, place) if target and place else inf for place in places]
+    chosen = distances[LETTERS.index(outcome["letter"])] if outcome["letter"] in LETTERS else inf
+    return [("outcome", True), ("choice", chosen == min(distances) < inf)]
 
 
 def _read(

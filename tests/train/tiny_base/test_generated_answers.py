@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from data.render.frame_cache import FrameReader
@@ -23,7 +25,7 @@ def measure(micro_store: Store, model, processor, student_cfg, monkeypatch: pyte
     def measure_answers(change) -> dict[str, float]:
         true = [
             sampler.ask_question(item, kind, "held out")[1].answer
-            for kind in generated_answers.SECTIONS
+            for kind in (*generated_answers.SECTIONS, "explain")
             for item in items[: generated_answers.BATCH]
         ]
         batches = iter(
@@ -50,6 +52,8 @@ def test_true_answers_are_right_in_every_respect(measure) -> None:
         "generated_region/predict",
         "generated_color/parse",
         "generated_name_precision/describe",
+        "generated_outcome/explain",
+        "generated_choice/explain",
     } <= measures.keys()
     assert {k: v for k, v in measures.items() if v < 1} == {}
 
@@ -67,3 +71,13 @@ def test_objects_that_an_answer_lacks_are_noticed(measure) -> None:
     repeated = measure(lambda text: text.split(".")[0] + ".")
     assert repeated["generated_name_recall/parse"] < 0.8
     assert repeated["generated_name_precision/parse"] == 1
+
+
+def test_false_and_missing_outcomes_are_noticed(measure) -> None:
+    order = dict(zip("ABCD", "BCDA", strict=True))
+    closest = re.compile(r"(?<=expected place in candidate )\w")
+    false = measure(lambda text: closest.sub(lambda m: order[m.group()], text))
+    assert false["generated_choice/explain"] == 0
+    assert false["generated_outcome/explain"] == 1
+    missing = measure(lambda text: text.partition("Outcome")[0])
+    assert missing["generated_outcome/explain"] == 0
