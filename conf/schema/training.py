@@ -233,11 +233,11 @@ def stage(steps: int, batch: int, lr: float) -> StageConfig:
 
 @dataclass
 class BaseTrainConfig(Settings):
-    eyes: StageConfig = stage(4000, 16, 2e-3)
+    eyes: StageConfig = stage(3000, 16, 2e-3)
     """The vision tower learns to see objects in single pictures."""
-    motion: StageConfig = stage(4000, 8, 1e-3)
+    motion: StageConfig = stage(1500, 8, 1e-3)
     """The whole model learns where objects are and where they go."""
-    words: StageConfig = stage(4000, 8, 8e-4)
+    words: StageConfig = stage(5000, 8, 8e-4)
     """The model learns to answer questions in words."""
     weight_decay: float = setting(0.05, least=0)
     """Weight decay of AdamW."""

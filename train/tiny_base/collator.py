@@ -14,7 +14,6 @@ from data.records import LETTERS
 from models.student.collator import Collator
 from train.tiny_base.located_mentions import (
     LocatedMention,
-    find_mentioned,
     find_next_in_candidates,
     find_next_in_clip,
     find_repeats,
@@ -186,7 +185,6 @@ def stack_samples(
         spatial_words=integers(pairs["spatial_words"], 2),
         verdicts=integers(pairs["verdicts"], 3),
         choices=integers(pairs["choices"], 3),
-        mentioned=integers([*find_mentioned(mentions)], 3),
         matches=integers(pairs["matches"], 3),
         next_in_clip=integers([*find_next_in_clip(mentions)], 3),
         next_in_candidates=integers([*find_next_in_candidates(mentions)], 3),

@@ -95,19 +95,6 @@ def find_repeats(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int,
         mentioned[m.row, m.name] = m.first
 
 
-def find_mentioned(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
-    """Yield the row, the position before a name in a section about the scene, and the position of
-    each other name that the section has mentioned before, where it was last mentioned."""
-    section, mentioned = None, {}
-    for m in mentions:
-        if (m.row, m.section) != section:
-            section, mentioned = (m.row, m.section), {}
-        if m.letter_at is not None:
-            continue
-        yield from ((m.row, m.first - 1, at) for name, at in mentioned.items() if name != m.name)
-        mentioned[m.name] = m.position
-
-
 def find_next_in_clip(mentions: Sequence[LocatedMention]) -> Iterator[tuple[int, int, int]]:
     """Yield the row, the position before the first mention of an object in a scene parse, and the
     object's visual token at the end of the clip."""

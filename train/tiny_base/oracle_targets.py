@@ -136,8 +136,6 @@ class OracleTargets:
         choices: (_, 3) row, position before the letter of the candidate that is said to show an
             object closest to its place, and position of the last token at which the text speaks of
             the object in this candidate.
-        mentioned: (_, 3) row, position before a name in a section about the scene, and position of
-            another name that the section has mentioned before.
         matches: (_, 3) row, position of the letter in a line that says whether a candidate matches,
             and position of the last letter in the outcome.
         next_in_clip: (_, 3) row, position before the first mention of an object in a scene parse,
@@ -174,7 +172,6 @@ class OracleTargets:
     spatial_words: Tensor
     verdicts: Tensor
     choices: Tensor
-    mentioned: Tensor
     matches: Tensor
     next_in_clip: Tensor
     next_in_candidates: Tensor

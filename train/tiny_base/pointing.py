@@ -40,8 +40,6 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     repeat              RECALLING 1    token before a repeated name -> the name's last mention
     owner               RECALLING 2    token that describes the sphere in "the cube has the sphere
                                        left of it" -> the cube's name
-    mentioned           RECALLING 3    token before a name in a section about the scene -> the
-                                       other names that the section has mentioned before
     verdict             SPEAKING 0     token before a letter in an outcome -> "agrees" of this
                                        candidate, or its letter after "closest"
     next in clip        SPEAKING 1     token before a new name in a scene parse -> the object at the
@@ -92,7 +90,6 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         ("subject", RECALLING, 0, targets.subjects),
         ("repeat", RECALLING, 1, targets.repeats),
         ("owner", RECALLING, 2, targets.owners),
-        ("mentioned", RECALLING, 3, targets.mentioned),
         ("verdict", SPEAKING, 0, targets.verdicts),
         ("choice", CHOOSING, 0, targets.choices),
         ("next in clip", SPEAKING, 1, next_in_clip),

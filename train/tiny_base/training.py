@@ -68,12 +68,13 @@ POINTING = 0.5
 """Weight, in the stage of words, of the losses of attention heads."""
 NAMED = 2.0
 """Weight of the losses of places and motion in texts."""
-WORD_LOSSES = 3.0
+WORD_LOSSES = 5.0
 """Weight of the losses of words: of all words, of those for colours, materials and shapes, of those
 for places, motion and relations, of the letters after "closest", and of the verdicts in the match
 layout. The second and third are a third and a tenth of all words, and harder to predict than the
 others. With a weight of 1, the gradient of these losses was a tenth of that of the losses of places
-and attention heads, and the base named objects that do not exist."""
+and attention heads, and the base named objects that do not exist. With a weight of 3, its sentences
+about two objects were often ungrammatical."""
 
 
 def eyes_losses(

@@ -151,7 +151,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(sampler, collate
     assert losses.keys() == {
         "before", "second before", "track clip", *(f"find {k}" for k in range(PICTURES)), "subject",
         "find shown", "label", "letter", "repeat", "choice", "owner",
-        "next in candidates", "mentioned",
+        "next in candidates",
         *(f"track {k}" for k in range(len(LETTERS) - 1)),
     }  # fmt: skip
     assert not any(loss.item() for loss in losses.values())

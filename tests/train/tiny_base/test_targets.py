@@ -186,26 +186,6 @@ def test_scene_parses_refer_to_the_object_that_they_name_next(sampler, collate) 
         assert token == found[0]
 
 
-def test_sections_refer_to_the_other_names_that_they_have_mentioned(
-    sampler, collate, processor
-) -> None:
-    samples = [sampler.make_sample(item, "explain", "test") for item in sampler.items[:6]]
-    batch, targets = collate(samples)
-    mentioned: dict[tuple[int, int], list[int]] = {}
-    for row, before, at in targets.mentioned.tolist():
-        mentioned.setdefault((row, before), []).append(at)
-    assert len(mentioned) > 20
-    for (row, before), places in mentioned.items():
-        ids = batch["input_ids"][row]
-        text = processor.decode(ids[: before + 1])
-        names = [" ".join(processor.decode(ids[: at + 1]).split()[-3:]) for at in places]
-        following = processor.decode(ids[before + 1 :]).split()[:3]
-        assert len({*names, " ".join(following)}) == len(names) + 1
-        section = text.rpartition("\n")[2]
-        assert section.startswith(("Scene parse", "Motion analysis", "Prediction", "Outcome"))
-        assert all(name.lower() in section.lower() for name in names)
-
-
 def test_pictures_refer_to_the_letters_of_their_candidates(sampler, collate, processor) -> None:
     samples = [sampler.make_sample(item, "describe", "test") for item in sampler.items[:3]]
     samples += [sampler.make_sample(sampler.items[3], "explain", "test")]
