@@ -118,11 +118,13 @@ def measure_separation(places: Sequence[tuple[float, float] | None]) -> float:
     """Return the smallest distance between the places of an object in two frames, as a share of the
     image. If one of two frames does not show the object (None), their distance is
     `UNSEEN_DISTANCE`; if neither does, it is 0. The separation of fewer than two places is 0."""
-    distances = [
-        (one is not other) * UNSEEN_DISTANCE if None in (one, other) else dist(one, other)
-        for one, other in combinations(places, 2)
-    ]
-    return min(distances, default=0.0)
+    return min((_place_distance(*pair) for pair in combinations(places, 2)), default=0.0)
+
+
+def _place_distance(one: tuple[float, float] | None, other: tuple[float, float] | None) -> float:
+    if one is None or other is None:
+        return 0.0 if one is other else UNSEEN_DISTANCE
+    return dist(one, other)
 
 
 def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:

@@ -108,6 +108,12 @@ class SftTrainConfig(StudentTrainConfig):
                 f"{group}facts=true with {group}regime=answer_only: facts need a regime with "
                 f"rationales, such as {group}regime=cot"
             )
+        if self.false_words and self.regime == "answer_only":
+            yield (
+                f"{group}false_words={self.false_words} with {group}regime=answer_only: only "
+                f"rationales have such words; set {group}false_words=0, or choose a regime with "
+                f"rationales, such as {group}regime=cot"
+            )
 
 
 @dataclass

@@ -73,6 +73,13 @@ def test_invalid_value_is_named(override, code, contains):
         preflight("train.sft", SftCommand, [override])
 
 
+@pytest.mark.parametrize("setting", ["train.facts=true", "train.false_words=0.2"])
+def test_settings_of_rationales_need_a_regime_with_rationales(setting: str) -> None:
+    compose("train.sft", SftCommand, ["train.regime=cot", setting])
+    with raises_user_error("invalid-setting", contains=(setting, "train.regime=answer_only")):
+        compose("train.sft", SftCommand, ["train.regime=answer_only", setting])
+
+
 def test_all_failed_checks_are_reported_together():
     with pytest.raises(SettingsError) as caught:
         compose("train.sft", SftCommand, ["train.lr=-1", "train.schedule=x", "benchmark.scenes=1"])
