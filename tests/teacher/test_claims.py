@@ -152,9 +152,9 @@ def test_false_word_is_contradicted(rationales, source, kind):
 
 
 def add_rare_statements(text, predicates):
-    """Add true statements that few rationales have: extremes, what is between what and what covers
-    what to the prediction, what objects pass and which edges they reach to the motion analysis, and
-    how far off candidates show the objects to the candidate analysis."""
+    """Add true statements that few rationales have: extremes, what is between what, what covers what
+    and what is out of sight to the prediction, what objects pass and which edges they reach to the
+    motion analysis, and how far off candidates show the objects to the candidate analysis."""
     true = sorted(predicates.target.statements)
     extremes = [f" The {s.objects[0]} will be {s.value}." for s in true if s.kind == "extreme"]
     between = [
@@ -167,6 +167,7 @@ def add_rare_statements(text, predicates):
         for s in true
         if s.kind == "cover"
     ]
+    unseen = [f" The {s.objects[0]} will be out of sight." for s in true if s.kind == "sight"]
     edges = [f" The {s.objects[0]} {s.value}." for s in true if s.kind == "edge"]
     passed = [
         f" The {s.objects[0]} {s.value} the {s.objects[1]}." for s in true if s.kind == "passing"
@@ -181,7 +182,8 @@ def add_rare_statements(text, predicates):
     text = text.replace("\nOutcome:", f"{''.join(sorted(off))}\nOutcome:")
     text = text.replace("\nPrediction:", f"{''.join(edges + passed)}\nPrediction:")
     return text.replace(
-        "\nCandidate analysis:", f"{''.join(extremes + between + covers)}\nCandidate analysis:"
+        "\nCandidate analysis:",
+        f"{''.join(extremes + between + covers + unseen)}\nCandidate analysis:",
     )
 
 
