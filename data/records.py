@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 FRAMES = 128
 """Frames per scene (CLEVRER's clip length)."""
 FPS = 25
-"""Frame rate of simulated scenes. Questions of retrieval queries count seconds in these frames."""
+"""Frame rate of scenes of the suite `dynapix`. A second in the questions of retrieval queries is
+this number of frames."""
 SELECTION_SECOND = 26
 """Frames that the time family of selection items counts as a second (128 frames in about 5 s)."""
 SPEED_BOUNDS = (0.6, 1.5, 3.0)
@@ -67,7 +68,8 @@ class Collision:
 
 @dataclass(frozen=True)
 class Landing:
-    """An object's first contact with the ground after a fall."""
+    """The first contact of an object that was in the air with the floor or with a static part of
+    the world."""
 
     frame: int
     """The first frame at or after the contact."""
@@ -302,7 +304,7 @@ class Rationale(Record):
     claims: dict[str, list[int]] = field(default_factory=dict)
     """Counts of supported, contradicted and unknown claims about the scene, by kind of claim."""
     predicates: str = "paper 1"
-    """Vocabulary of the predicates on which the text rests, and its version."""
+    """Vocabulary of the predicates from which the text is written, and its version."""
     sufficiency: float | None = None
     """Probability that a reader who knows only the prediction picks the target; None if it was not
     measured (see `teacher.sufficiency`)."""

@@ -90,12 +90,13 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def scene_path(folder: Path, scene_id: str) -> Path:
-    """Path of a scene's oracle in a store or a partial build."""
+    """Return the path of a scene's oracle in a store or a partial build."""
     return folder / SCENES_FOLDER / f"{scene_id}.npz"
 
 
 def part_path(folder: Path, inputs: Any) -> Path:
-    """Path of a job's result in a partial build; its name is a hash of the inputs of the job."""
+    """Return the path of a job's result in a partial build; its name is a hash of the inputs of the
+    job."""
     key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
     return folder / PARTS / f"{key[:32]}.json"
 
@@ -105,7 +106,8 @@ def save_scene(scene: Scene, path: Path) -> None:
     header = {f.name: getattr(scene, f.name) for f in fields(scene) if f.name not in Scene.ARRAYS}
     for name in ("scales", "speed_bounds"):
         if not header[name]:
-            # Scenes of the world of CLEVRER then have the same bytes as before there were worlds.
+            # Default values are left out: an added field does not change the bytes of scenes that
+            # do not use it.
             del header[name]
     arrays = {name: getattr(scene, name) for name in Scene.ARRAYS}
     buffer = io.BytesIO()
@@ -219,11 +221,11 @@ class Store:
         return [RetrievalQuery.from_row(r) for r in kept]
 
     def standard_test(self) -> list[RetrievalQuery]:
-        """The queries of the standard test; their targets are in the database `test`."""
+        """Return the queries of the standard test; their targets are in the database `test`."""
         return [q for q in self.retrieval("test") if q.standard]
 
     def database(self, name: str = "test") -> list[FrameRef]:
-        """The frames of one of `DATABASES`."""
+        """Return the frames of one of `DATABASES`."""
         rows = load_rows(self.folder / "database.parquet")
         return [FrameRef(r["scene_id"], r["frame"]) for r in rows if r["database"] == name]
 

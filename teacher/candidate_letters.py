@@ -34,8 +34,8 @@ def find_letters(text: str) -> list[tuple[int, int]]:
 def relabel_text(text: str, order: Sequence[int]) -> str:
     """Return a rationale whose letters name the same candidates after these are reordered.
 
-    If the candidate analysis describes the candidates in the order of their letters, so does that
-    of the result. Otherwise, a student would have to remember which letters are left.
+    If the candidate analysis describes the candidates in alphabetical order, it is sorted again, so
+    that a student always writes A, B, C and D in this order.
 
     Args:
         text: A rationale for the old order that the validator accepts.

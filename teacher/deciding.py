@@ -15,17 +15,18 @@ from teacher.predicates.margins import measure_margin
 from teacher.predicates.relations import CHANGES, Bounds
 
 SEEN_ERROR, PREDICTED_ERROR = 0.02, 0.3
-"""Standard deviations, along each axis, of the places of objects as a reader is assumed to see them
-(share of the image's width or height), and of what it adds to them when it predicts the target
-(share of the object's path from the cut). Those of the tiny base are about as large."""
+"""Standard deviations, along each axis, of a reader's errors in the places of objects. `SEEN_ERROR`
+is for places that it sees (share of the image's width or height). `PREDICTED_ERROR` is added for
+places that it predicts (share of the object's path from the cut). The errors of the tiny base are
+about as large."""
 RELATION_FACTOR = 3.0
-"""Factor on these errors for statements about relations, which readers find less surely than where
-one object is. Of the statements of a tiny base about candidates, 88% of those about regions were
-right, and 26 to 63% of those about sides, heights and gaps."""
+"""Factor on these errors for statements about relations, because readers judge relations less
+accurately than places. Of the statements of a tiny base about candidates, 88% of those about
+regions were right, and 26 to 63% of those about sides, heights and gaps."""
 UNSEEN_DISTANCE = 0.1
 """Distance between two candidates of which one does not show an object, as a share of the image.
-With a larger one, the narrator more often chooses an object that the target may lack, which a
-student cannot know: in 1% of the tiny test items with 0.1, in 2% with 0.3."""
+With a larger value, the narrator more often chooses an object that the target does not show, which
+a student cannot know. It does so in 1% of the tiny test items with 0.1, and in 2% with 0.3."""
 UNKNOWN_PATH = 1.0
 """Path that is assumed for an object that is not visible both at the cut and at the target."""
 
@@ -46,7 +47,8 @@ class Decision:
 
     @property
     def place(self) -> Relation | None:
-        """The statement that says where the object is by whose place a reader finds the target."""
+        """The first statement if it gives the region of an object, otherwise None. A reader finds
+        the target by the place of this object."""
         first = self.statements[:1]
         return first[0] if first and first[0].kind == "region" else None
 

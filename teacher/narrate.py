@@ -81,7 +81,7 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     log.info("report: %s", page)
     return {
         "accepted": float(figures["accepted"]),
-        "answers": float(sum(figures["responses"])),
+        "responses": float(sum(figures["responses"])),
         "set_aside": float(figures["set_aside"]),
         "too_short": float(figures["too_short"]),
         "mean_words": float(np.mean(figures["lengths"] or [0])),
@@ -188,7 +188,7 @@ def check_items(journal: Journal, items: list[SelectionItem]) -> None:
 
 
 def report_other_vocabularies(journal: Journal, cfg: TeacherConfig) -> None:
-    """Log which rationales of a journal rest on another vocabulary, or on another version of it.
+    """Log which rationales of a journal use another vocabulary, or another version of it.
     They stay in the file, and are not used."""
     current = name_vocabulary(cfg)
     others = Counter(r.predicates for r in journal.rationales if r.predicates != current)

@@ -37,7 +37,7 @@ def build_messages(
     system = SYSTEM.format(
         sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words, relations=relational
     )
-    facts = json.dumps(format_facts(predicates, item), separators=(",", ":"))
+    facts = json.dumps(format_facts(predicates), separators=(",", ":"))
     user = f"Question: {item.question}\nFacts: {facts}\nAnswer to reach: {item.letter}"
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
 
@@ -56,7 +56,7 @@ def _build_cited_messages(
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
 
 
-def format_facts(predicates: Predicates, item: SelectionItem) -> dict[str, Any]:
+def format_facts(predicates: Predicates) -> dict[str, Any]:
     """Return predicates as a teacher on a server reads them.
 
     Of relational predicates, they have the statements that decide the item, with their values now

@@ -239,7 +239,7 @@ def write_report(
         write_atomically(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.make(item)]))
         predicates = describe_item(item, store, cfg)
         facts = predicates and choose_vocabulary(predicates, cfg)
-        examples.append((accepted[k], json.dumps(facts and format_facts(facts, item), indent=1)))
+        examples.append((accepted[k], json.dumps(facts and format_facts(facts), indent=1)))
     template = (files("teacher") / "templates" / "report.html").read_text()
     page = jinja2.Template(template, autoescape=True).render(
         teacher=accepted[0].teacher if accepted else "an unnamed teacher",

@@ -1,4 +1,4 @@
-"""Vocabularies: the predicates that rationales rest on, and their versions."""
+"""Vocabularies: the kinds of predicates from which rationales are written, and their versions."""
 
 from __future__ import annotations
 
@@ -38,5 +38,5 @@ def describe_item(
 
 
 def choose_vocabulary(predicates: RelationalPredicates, cfg: TeacherConfig) -> Predicates:
-    """Return the predicates of the vocabulary that rationales rest on."""
+    """Return the predicates of the vocabulary in the settings."""
     return predicates if cfg.predicates == "relational" else predicates.without_relations()

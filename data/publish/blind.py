@@ -113,7 +113,7 @@ def train_model(name: str, features: torch.Tensor, answers: torch.Tensor, seed: 
     count = max(1, int(VALIDATION * len(order)))
     held, kept = order[:count], order[count:]
     best, state = -1.0, model.state_dict()
-    for _ in tqdm(range(EPOCHS), desc=f"training {name}", unit="epoch", disable=None):
+    for _ in tqdm(range(EPOCHS), desc=f"training {name}", unit="epoch"):
         model.train()
         for batch in kept[torch.randperm(len(kept), generator=generator)].split(BATCH):
             loss = nn.functional.cross_entropy(model(features[batch].float()), answers[batch])
@@ -146,7 +146,7 @@ def encode_items(items: Sequence[SelectionItem], store: Store) -> tuple[torch.Te
     ]
     encode = _load_encoder()
     parts = []
-    progress = tqdm(total=len(frames), desc="encoding frames", unit="frame", disable=None)
+    progress = tqdm(total=len(frames), desc="encoding frames", unit="frame")
     for first in range(0, len(frames), CHUNK):
         images = [_image(ref, store) for ref in frames[first : first + CHUNK]]
         parts.append(encode(images))

@@ -102,7 +102,7 @@ class SheetRows:
         return self._item(record) if isinstance(record, SelectionItem) else self._query(record)
 
     def _item(self, item: SelectionItem) -> Row:
-        """The prefix and the candidates of an item, with the answer marked."""
+        """Return the prefix and the candidates of an item, with the answer marked."""
         values = {name.replace("_", " "): getattr(item, name) for name in HEADING_FIELDS}
         fields = [f"{name} {value}" for name, value in values.items() if value is not None]
         details = [item.split, *fields, f"minimum displacement {item.min_displacement:.0f} px"]
@@ -120,7 +120,7 @@ class SheetRows:
         return Row(heading, self._prefix(item), cells)
 
     def _query(self, query: RetrievalQuery) -> Row:
-        """The prefix, the target and the hard negatives of a query.
+        """Return the prefix, the target and the hard negatives of a query.
 
         The first hard negative of a counterfactual query is the factual frame: the scene with the
         object, at the target's moment.
@@ -157,8 +157,8 @@ class SheetRows:
 def _describe_frame(record: SelectionItem | RetrievalQuery, frame: FrameRef) -> str:
     """Describe when a frame occurs: its index and its offset in frames from the end of the prefix.
 
-    The offset is omitted if the frame belongs to another scene; the scene's counterfactual counts
-    as the same scene.
+    The offset is omitted if the frame belongs to another scene. A counterfactual and an alternative
+    future of the scene count as the same scene.
     """
     is_same_scene = original_scene_id(frame.scene_id) == record.scene_id
     offset = frame.frame - record.prefix_stop

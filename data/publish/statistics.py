@@ -33,7 +33,8 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
         distractors in the event family, or a difficulty in the window family.
     """
     items = store.selection()
-    rows = pd.DataFrame([_describe_item(item, store) for item in items])
+    progress = tqdm(items, desc="describing items", unit="item")
+    rows = pd.DataFrame([_describe_item(item, store) for item in progress])
     categories = rows.explode("category").groupby("category")
     earlier = pd.crosstab(categories.obj["category"], categories.obj["earlier"])
     candidates = categories[["nearest distractor", "least"]].median()
@@ -58,7 +59,7 @@ def measure_shortcuts(items: list[SelectionItem], store: Store, blind: bool) -> 
         from data.publish.blind import blind_accuracies
 
         blind_right = blind_accuracies(items, store, store.manifest["seed"])
-    progress = tqdm(items, desc="scoring shortcuts", unit="item", disable=None)
+    progress = tqdm(items, desc="scoring shortcuts", unit="item")
     config = store.manifest["config"]
     scores = np.stack([shortcuts.item_scores(item, store.scene, config) for item in progress])
     answers = np.array([item.answer for item in items])

@@ -271,14 +271,18 @@ def _locate(parent: h5py.Group, *keys: str) -> str:
 
 
 def _get_group(parent: h5py.Group, key: str) -> h5py.Group:
-    return _get_dataset(parent, key, "keys")
+    return _get_child(parent, key, "keys")
 
 
-def _get_dataset(parent: h5py.Group, key: str, attribute: str = "dtype") -> Any:
+def _get_dataset(parent: h5py.Group, key: str) -> h5py.Dataset:
+    return _get_child(parent, key, "dtype")
+
+
+def _get_child(parent: h5py.Group, key: str, attribute: str) -> Any:
     """Return a child of `parent`, with or without the suffix of later versions.
 
     Raises:
-        RecordError: The child is missing, damaged or of another kind, which is recognised by its
+        RecordError: The child is missing, damaged or of another kind, which is recognized by its
             `attribute`: a dataset has a `dtype`, a group has `keys`.
     """
     names = [name for name in (key, f"{key}_cam0") if name in parent]

@@ -87,7 +87,7 @@ def _unpack(archive: zipfile.ZipFile, frame: int, shape: list[int]) -> np.ndarra
 
 
 def frames_path(folder: Path, scene_id: str) -> Path:
-    """Path of the archive of a scene's frames in a store."""
+    """Return the path of the archive of a scene's frames in a store."""
     return folder / FRAMES_FOLDER / f"{scene_id}.zip"
 
 

@@ -30,7 +30,7 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
         limit_gb: Maximum total size of these frames on disk. Rendering stops when the next scene
             would exceed it; the remaining frames are rendered on demand.
     """
-    options = {"frames": which, "bound_gb": limit_gb, "renderer": store.manifest["renderer"]}
+    options = {"frames": which, "frames_gb": limit_gb, "renderer": store.manifest["renderer"]}
     path = store.folder / FRAMES_FOLDER / RECORD
     if path.exists() and options.items() <= json.loads(path.read_text()).items():
         return

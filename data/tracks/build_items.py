@@ -61,7 +61,7 @@ def make_items_and_queries(
 
     Returns:
         The items; the queries, up to `QUERY_RESERVE` times their quotas; and the numbers of items
-        and queries that were dropped because too few other frames differ enough from their targets.
+        and queries that were dropped because no suitable distractors or hard negatives were found.
     """
     quotas = {name: _with_reserve(cfg, name, quota) for name, quota in cell_quotas(cfg).items()}
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives

@@ -64,9 +64,9 @@ def sample_scene(world: WorldConfig, seed: int, index: int) -> Sample:
     """Sample scene `index` of a world: its bodies and their motion.
 
     Raises:
-        UserError: the camera does not see the middle; a part is not entirely in front of the camera
-            and above the floor; or no suitable scene was found, and the message names the most
-            frequent reason.
+        UserError: the camera does not see `start.middle`; a part is not entirely in front of the
+            camera and above the floor; or no suitable scene was found, and the message names the
+            most frequent reason.
     """
     camera = Camera.from_settings(world.camera)
     check_view(world, camera)
@@ -89,8 +89,8 @@ def sample_scene(world: WorldConfig, seed: int, index: int) -> Sample:
 
 
 def check_view(world: WorldConfig, camera: Camera) -> None:
-    """Raises UserError if the camera does not see the middle, or if a part is not entirely in front
-    of the camera and above the floor."""
+    """Raises UserError if the camera does not see `start.middle`, or if a part is not entirely in
+    front of the camera and above the floor."""
     uses_middle = world.start.kind != "strike"
     if uses_middle and not is_on_screen(np.array(world.start.middle), 0.0, camera):
         raise UserError(

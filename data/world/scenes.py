@@ -128,7 +128,7 @@ def read_release(
             inputs = [str(path), split, file.stat().st_size, file.stat().st_mtime_ns]
             part = part_path(folder, inputs)
             if _problem_of(part):
-                # What was wrong may be mended, such as a missing video beside the record.
+                # The problem may have been fixed since, such as a missing video beside the record.
                 part.unlink()
             jobs[part] = partial(_read_one, cfg, path, split, folder, part)
             split_of[part] = split

@@ -12,7 +12,7 @@ from data.world.camera import Camera
 from data.world.physics import Body, Motion, shared_simulator
 from data.world.shapes import BOUNDING_RADIUS, half_height
 from data.world.starts import (
-    NO_COLLISION,
+    OVERLAP,
     RejectedError,
     Sample,
     SizedObject,
@@ -31,8 +31,8 @@ PLACEMENTS = 40
 EARLIEST, TAIL = 15, 17
 """First frame of a planned collision, and number of frames at the end of a scene without one."""
 CLEAR = 0.7
-"""Distance (simulator units) from the paths of other objects at which an object of scale 1 is
-placed at rest."""
+"""Minimum distance (simulator units) of an object at rest from the paths of other objects, for
+scale 1."""
 SLOW = 0.3
 """Minimum speed (simulator units/s) of an object at its planned collision."""
 
@@ -62,14 +62,14 @@ class _Slide:
         goal = min(intended, self.world.start.max_collisions or intended)
         bodies = [self._entering(objects[0])]
         motion = shared_simulator().simulate(bodies, self.world)
+        if motion.touching_at_start:
+            raise RejectedError(OVERLAP)
         for added in objects[1:]:
             attempts = (self._try_body(bodies, motion, added, goal) for _ in range(PLACEMENTS))
             extended = next(filter(None, attempts), None)
             if extended is None:
                 raise RejectedError(NO_PLACE)
             bodies, motion = extended
-        if not motion.collisions:
-            raise RejectedError(NO_COLLISION)
         return Sample(bodies, motion)
 
     def _body(

@@ -62,7 +62,7 @@ def throw(
 ) -> Sample:
     """Sample objects above the floor or above a part that move towards the middle.
 
-    A share of `at_rest` objects lies at rest around the middle instead.
+    With probability `start.at_rest`, an object starts at rest near the middle instead.
     """
     start, boxes = world.start, world_boxes(world)
     bodies = []

@@ -62,8 +62,8 @@ class ObjectFacts:
 class Meeting:
     """Two objects, and when they collide after the cut.
 
-    `when` is "imminent", "soon" or "later"; None if they do not collide any more, or "unseen" if
-    the scene ends while they still approach each other.
+    `when` is "imminent", "soon" or "later"; None if they do not collide after the cut, or "unseen"
+    if the scene ends while they still approach each other.
     """
 
     objects: tuple[str, str]
@@ -187,9 +187,9 @@ class RelationalPredicates(Predicates):
 
     `left_to_right` are the names of the objects in the order of their places along the image's
     width at the cut, `observed` are the relations at the cut, and `views` are the candidates as a
-    reader sees them. That of the answer is the view of the target. `paths` are the distances in the
-    image, as shares of its width and height, of the objects that are visible at the cut and the
-    target from one to the other. `bounds` are those of the words for relations.
+    reader sees them. That of the answer is the view of the target. `paths` are the distances that
+    objects move in the image from the cut to the target, in shares of its width and height; only
+    objects that are visible at both have one. `bounds` are those of the words for relations.
     """
 
     left_to_right: tuple[str, ...]

@@ -152,7 +152,7 @@ class CertaintyCheck:
         return self.tags[at].name == self.sentence[before].name == "region"
 
     def _is_subject_plain(self, name: str, at: int) -> bool:
-        """Return whether the subject of the tag at `at` is beyond doubt the object `name`."""
+        """Return whether the subject of the tag at `at` is certainly the object `name`."""
         before = [i for i in self.indexes_of[name] if i < at]
         after = [i for i in self.indexes_of[name] if i > at]
         if not before and not after:

@@ -93,10 +93,10 @@ class ServerPool:
         return await self._request(lambda server: server.score(token_ids))
 
     async def load_adapter(self, folder: Path) -> None:
-        """Load adapters on every server under the name `cfg.model`.
+        """Load an adapter on every server under the name `cfg.model`.
 
         Raises:
-            NoResponseError: A server cannot load them, or was not available for
+            NoResponseError: A server cannot load it, or was not available for
                 `cfg.unreachable_timeout` seconds.
             UserError: A server loads no adapters, or rejects the API key.
         """
@@ -113,9 +113,9 @@ class ServerPool:
             await asyncio.sleep(random_pause(failures))
 
     async def unload_adapter(self, name: str) -> None:
-        """Unload the adapters with a name on every server that has them."""
+        """Unload the adapter `name` on every server that has it."""
         for server in self.servers:
-            # A server that was started again does not have them.
+            # A server that was started again does not have it.
             with suppress(RequestError):
                 await server.unload_adapter(name)
 

@@ -134,7 +134,7 @@ class ServerClient:
         return await self._translate_errors(request)
 
     async def load_adapter(self, folder: Path) -> None:
-        """Load adapters under the name `cfg.model`.
+        """Load an adapter under the name `cfg.model`.
 
         Raises:
             RequestError: The request failed.
@@ -143,7 +143,7 @@ class ServerClient:
         await self._change_adapters("load", {"lora_name": self.cfg.model, "lora_path": str(folder)})
 
     async def unload_adapter(self, name: str) -> None:
-        """Unload the adapters with a name. It raises the errors of `load_adapter`."""
+        """Unload the adapter `name`. It raises the errors of `load_adapter`."""
         await self._change_adapters("unload", {"lora_name": name})
 
     async def _change_adapters(self, action: str, body: dict[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""What a student's response claims, and whether its answer rests on true reasons."""
+"""What a student's response claims, and whether its answer follows from true reasons."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class ResponseReasons:
     """The reasons of one response.
 
     Attributes:
-        claims: The claims about each of `PARTS`, with the verdicts of the oracle. That an object
-            exists is no claim, but a statement about an object that the scene lacks is one, which
-            the oracle contradicts.
+        claims: The claims about each of `PARTS`, with the verdicts of the oracle. A mention of an
+            existing object is not counted. A mention of an object that the scene lacks is counted
+            as a contradicted claim.
         follows: Whether the text says of the chosen candidate, and of no other, that it agrees.
         sufficiency: Probability that a reader who knows only the prediction picks the target (see
             `teacher.sufficiency`).

@@ -39,7 +39,8 @@ def counterfactual_id(scene_id: str, removed: int) -> str:
 
 
 def _prefix_stop(scene: Scene, removed: int) -> int | None:
-
+    """Return the last frame of the prefix: before the first contact of object `removed`, at most
+    `LATEST_STOP`. None if the prefix would end before frame `FPS`."""
     contacts = [c.frame for c in scene.collisions if removed in c.objects]
     stop = min(LATEST_STOP, contacts[0] - 1) if contacts else -1
     return stop if stop >= FPS else None

@@ -1,7 +1,7 @@
 """Scores of candidates that involve no prediction, and the balance of the target's rank in them.
 
-A strategy without foresight chooses the candidate with the lowest or highest score. It is right in
-a quarter of the items if the target has each of the four ranks equally often.
+A strategy that does not predict chooses the candidate with the lowest or highest score. It is right
+in a quarter of the items if the target has each of the four ranks equally often.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ TOUCHING = 0.05
 APART = 10.0
 """Gap (simulator units) of a frame in which fewer than two objects are visible."""
 LIMIT, TOLERANCE = 1.75, 0.015
-"""The count of targets of a rank may differ from a quarter of all items by `LIMIT`, and by this
-share of the items."""
+"""The number of targets with one rank may differ from a quarter of the items by at most
+LIMIT + TOLERANCE * items."""
 START = 0.75
-"""Maximum distance from 0 of the counts at the start."""
+"""The initial counts are samples from [-START, START], less the mean of each score's four
+counts."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ def _gap(scene: Scene, frame: int) -> float:
 
 
 def nearly_equal(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Whether scores differ by less than the precision of the stored positions."""
+    """Return whether scores differ by less than the precision of the stored positions."""
     return np.isclose(one, other, rtol=1e-4, atol=1e-3)
 
 

@@ -154,7 +154,7 @@ class BalancedPicker:
     def _groups(
         self, scene: Scene, timing: Timing, about: tuple[int, ...], family: str
     ) -> list[Group]:
-        """Return the groups of objects whose other velocities may give an item.
+        """Return the groups of objects whose velocities may be changed to make distractors.
 
         Their objects move at the end of the prefix, and visibly until the target. In event and
         window items, objects that collide change by one velocity: otherwise the target would often

@@ -86,7 +86,8 @@ class DistractorPicker:
         """Make an item from the first distractors of each pool that differ by `min_displacement`.
 
         Args:
-            make_pools: Function that returns the possible distractors. A balanced item needs none.
+            make_pools: Function that returns the possible distractors. It is a function because
+                `BalancedPicker` does not need them, and computing them takes time.
             about: Indices of the objects whose positions count in frames of the item's scene; None
                 for all objects. In frames of other scenes, all objects count.
             fields: Fields of the item, as for `new_item`.

@@ -43,7 +43,7 @@ def make_item(
     """Make an item whose distractors are other frames after the prefix.
 
     The item's question and subtype state the whole seconds from the prefix to the target of the
-    timing; the argument `subtype` is not used.
+    timing; `subtype` is ignored, because matched-anchor pairs call this function with another one.
     """
     horizon = timing.target - timing.stop
     seconds = horizon // SELECTION_SECOND
