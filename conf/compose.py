@@ -75,7 +75,8 @@ def register(command: str, schema: type) -> None:
 
 
 def config_name(command: str) -> str:
-    """Name of a command's config and of its folder of runs, such as sft for train.sft."""
+    """Return the name of a command's config and of its folder of runs, such as sft for
+    train.sft."""
     return CONFIG_NAMES.get(command) or command.rpartition(".")[2]
 
 
@@ -96,7 +97,8 @@ def preflight(command: str, schema: type, overrides: list[str]) -> None:
 
 
 def list_presets(command: str, schema: type) -> dict[str, list[str]]:
-    """The presets of each group of a command, and the overlays whose comment names the command."""
+    """Return the presets of each group of a command, and the overlays whose comment names the
+    command."""
     with open_hydra(command, schema) as loader:
         groups = {g: loader.get_group_options(g) for g in loader.list_groups("")}
     for group in OVERLAYS:
@@ -197,7 +199,7 @@ def _unknown_key(command: str, key: str) -> str:
 
 
 def nearest_key(key: str, known: Iterable[str]) -> str | None:
-    """The known key most similar to `key`, or None if none is similar enough.
+    """Return the known key most similar to `key`, or None if none is similar enough.
 
     The similarity of the last parts counts twice, so that `lr` suggests `train.lr`.
     """

@@ -15,7 +15,7 @@ DEVICE = r"\d+|(GPU|MIG)-\S+"
 
 
 def visible_gpus() -> list[str]:
-    """The GPUs that this process may use, in the notation of CUDA_VISIBLE_DEVICES."""
+    """Return the GPUs that this process may use, in the notation of CUDA_VISIBLE_DEVICES."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None:
         # Like CUDA, ignore everything after the first invalid device.

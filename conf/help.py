@@ -85,15 +85,16 @@ def _setting_lines(key: str, value: Any, text: str) -> Iterator[str]:
 
 
 def description(schema: type, name: str) -> str:
-    """The docstring below a field of a schema, or below the field of the same name in a base class;
-    empty if there is none."""
+    """Return the docstring below a field of a schema, or below the field of the same name in a base
+    class; empty if there is none."""
     schemas = [kind for kind in schema.__mro__ if is_dataclass(kind)]
     return next((text for kind in schemas if (text := _docstrings(kind).get(name))), "")
 
 
 @cache
 def _docstrings(schema: type) -> dict[str, str]:
-    """The docstrings of the fields that a dataclass defines itself, each joined to one line."""
+    """Return the docstrings of the fields that a dataclass defines itself, each joined to one
+    line."""
     [node] = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
     assert isinstance(node, ast.ClassDef)
     return {

@@ -61,7 +61,7 @@ class Run:
 
 
 def rank() -> int:
-    """Rank of this process under a launcher such as torchrun; 0 without a launcher.
+    """Return the rank of this process under a launcher such as torchrun; 0 without a launcher.
 
     Rank 0 is the main rank, which prepares, logs and writes for all ranks.
     """
@@ -69,17 +69,18 @@ def rank() -> int:
 
 
 def world_size() -> int:
-    """Number of ranks that a launcher started; 1 without a launcher."""
+    """Return the number of ranks that a launcher started; 1 without a launcher."""
     return int(os.environ["WORLD_SIZE"]) if "LOCAL_RANK" in os.environ else 1
 
 
 def local_world_size() -> int:
-    """Number of ranks on this machine; 1 without a launcher."""
+    """Return the number of ranks on this machine; 1 without a launcher."""
     return int(os.environ.get("LOCAL_WORLD_SIZE", 1)) if "LOCAL_RANK" in os.environ else 1
 
 
 def run_name(run: str | None, overrides: Sequence[str]) -> str:
-    """`run` if it is set; otherwise a name made from the overrides, whatever the order of keys."""
+    """Return `run` if it is set; otherwise a name built from the overrides. The order of the keys
+    does not matter."""
     if run is not None:
         return run
     # If a key occurs twice, its last value takes effect; the stable sort keeps their order.
@@ -98,18 +99,19 @@ def _key(override: str) -> str:
 
 
 def resolve_run_name(run: str, folder: str) -> str:
-    """Name of a run in `folder`; `run` is either this name or the path of the run's folder."""
+    """Return the name of a run in `folder`; `run` is either this name or the path of the run's
+    folder."""
     return os.path.relpath(run, folder) if is_inside(run, folder) else os.path.normpath(run)
 
 
 def is_inside(path: str, folder: str) -> bool:
-    """Whether `path` is `folder` or below it."""
+    """Return whether `path` is `folder` or below it."""
     return bool(path) and not os.path.relpath(path, folder).startswith("..")
 
 
 def runs_folder(checkpoints: str, product: str, run: str = "") -> str:
-    """Folder to which the names of the runs that train a product (student or retriever) are
-    relative. If `run` is the folder of a run of train.distill or train.reinforce, this is
+    """Return the folder to which the names of the runs that train a product (student or retriever)
+    are relative. If `run` is the folder of a run of train.distill or train.reinforce, this is
     `checkpoints`, so that the run's name begins with "distill/" or "reinforce/"."""
     if product == "student" and any(is_inside(run, f"{checkpoints}/{f}") for f in CONTINUATIONS):
         return checkpoints
@@ -117,14 +119,17 @@ def runs_folder(checkpoints: str, product: str, run: str = "") -> str:
 
 
 def is_run_name(run: str) -> bool:
-    """Whether a name, such as exp-cot or SWEEP/NUMBER, stays within the folder of runs."""
+    """Return whether a name, such as exp-cot or SWEEP/NUMBER, stays within the folder of runs."""
     return not os.path.isabs(run) and run.split(os.sep)[0] not in (".", "..")
 
 
-def finished_metrics(run: Run) -> dict[str, float] | None:
-    """Metrics of a finished run; None for a run that is not finished."""
+def read_finished_metrics(run: Run) -> dict[str, float] | None:
+    """Return the metrics of a run that is finished, and log how to train again; otherwise None."""
     path = run.folder / "metrics.json"
-    return json.loads(path.read_text()) if path.exists() else None
+    if not path.exists():
+        return None
+    log.info("%s is finished; to train again, delete it or give run=NAME", run.folder)
+    return json.loads(path.read_text())
 
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)
@@ -164,7 +169,8 @@ def open_run(run: Run, settings: dict[str, Any], command: str) -> None:
 
 
 def other_settings_error(subject: str, changes: Sequence[str]) -> SettingsError:
-    """Error for results with other settings; `subject` is a clause like "FOLDER contains a run"."""
+    """Return an error for results with other settings; `subject` is a clause like "FOLDER contains
+    a run"."""
     return SettingsError(
         f"{subject} with other settings: {'; '.join(changes[:3])}. Choose another folder with "
         "run=NAME, or delete this one.",
@@ -205,7 +211,7 @@ def wait_for_lock(handle: int, busy: str) -> None:
 
 
 def changed_settings(folder: Path, settings: dict[str, Any]) -> list[str]:
-    """`compare_settings` of the run in `folder` and `settings`; empty if there is no run."""
+    """Return `compare_settings` of the run in `folder` and `settings`; empty if there is no run."""
     path = folder / "config.yaml"
     if not path.exists():
         return []
@@ -238,14 +244,16 @@ def compare_settings(before: Any, now: Any) -> list[str]:
 
 
 def run_id(run: Run) -> str:
-    """Unique id of a run, from its folder and the time of its first start; resuming keeps it."""
+    """Return the unique id of a run, from its folder and the time of its first start; resuming
+    keeps it."""
     record = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))
     first = [*record["earlier_starts"], record["started"]][0]
     return hashlib.sha256(f"{run.folder.resolve()} {first}".encode()).hexdigest()[:16]
 
 
 def _git() -> dict[str, Any] | None:
-    """The commit of the code, and whether there are uncommitted changes; None without git."""
+    """Return the commit of the code, and whether there are uncommitted changes; None without
+    git."""
 
     def git(*arguments: str) -> str:
         command, folder = ["git", *arguments], Path(__file__).parent

@@ -79,7 +79,7 @@ def evaluate_retrieval(
 ) -> RetrievalScores:
     """Rank every frame of the database for each query by cosine similarity.
 
-    Frames that tie with the target count by their mean over all orders of the tied frames.
+    If frames tie with the target, each measure is its mean over all orders of the tied frames.
 
     Args:
         queries: `Benchmark.retrieval`, or some of its queries.

@@ -34,7 +34,8 @@ def saved_run(
     settings = {"benchmark": store.manifest["config"], "model": None}
     write_text(folder / "config.yaml", json.dumps(settings, indent=1) + "\n")
     started = datetime.now(UTC).isoformat(timespec="seconds")
-    record = {"command": "dynapix.evaluate", "kind": kind, "name": name, "seed": seed}
+    command = "dynapix.evaluate_retrieval" if kind == "retrieve" else "dynapix.evaluate"
+    record = {"command": command, "kind": kind, "name": name, "seed": seed}
     write_json(folder / "run.json", {**record, "started": started, "earlier_starts": []})
     yield
     write_json(folder / "metrics.json", metrics)

@@ -25,9 +25,8 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     folder, trained = resolve_model(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     student, regime = trained.student, trained.train.regime
     # By default, a base is measured in both record modes, a student in the modes of its training.
-    # check_modes refuses a student that was trained in none.
     default_modes = ["record", "constrained"] if folder is None else modes_of_regime(regime)
-    modes = cfg.modes or default_modes or ["answer"]
+    modes = cfg.modes or default_modes
     if folder is not None:
         check_modes(folder, regime, modes)
 

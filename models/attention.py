@@ -1,4 +1,6 @@
-"""Attention for Qwen3-VL in the fastest way for the machine, with transformers' results.
+"""Choose the fastest attention for Qwen3-VL on this machine.
+
+Up to rounding, the results are those of transformers.
 
 In the vision tower, patches attend to the patches of the same image or of the same pair of a clip's
 frames, both called a frame below. Without flash attention, transformers computes the attention in

@@ -102,5 +102,5 @@ def split_batch(batch: int, micro_batch: int = 1, key: str = "train.batch") -> i
 
 
 def is_sharded() -> bool:
-    """Whether the launcher shards the model over the ranks (FSDP)."""
+    """Return whether the launcher shards the model over the ranks (FSDP)."""
     return os.environ.get("ACCELERATE_USE_FSDP") == "true"

@@ -127,7 +127,8 @@ def find_commit(model: str, revision: str | None = None) -> str:
 
 
 def is_hub_model(model: str | None) -> bool:
-    """Whether `model` is a name on the hub: neither None (a built model) nor an existing folder."""
+    """Return whether `model` is a name on the hub: neither None (a built model) nor an existing
+    folder."""
     return model is not None and not Path(model).is_dir()
 
 

@@ -108,7 +108,10 @@ def base_id(preset: Preset) -> str:
 def data_digest(store_identity: str, texts: Iterable[str]) -> str:
     """Return a digest of a run's training data.
 
-    `texts` are those of a student's samples, or the ids of a retriever's queries, in order.
+    Args:
+        texts: What identifies the training samples, in order: the texts of a student's samples, or
+            the ids of items or queries. Runs that train the student of another run further add the
+            digest of its weights.
     """
     whole = hashlib.sha256(store_identity.encode())
     for text in texts:

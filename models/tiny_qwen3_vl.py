@@ -91,7 +91,7 @@ def build_model(sizes: ArchitectureConfig, vocabulary: int) -> Qwen3VLForConditi
 
 
 def build_processor(
-    corpus: Iterable[str], vocabulary: int, image_size: int, patch: int = 16
+    corpus: Iterable[str], vocabulary: int, image_size: int, patch: int
 ) -> Qwen3VLProcessor:
     """Return a processor with a byte-level BPE tokenizer that is trained on `corpus`.
 

@@ -60,7 +60,7 @@ def retriever_cfg() -> RetrieverConfig:
 
 @pytest.fixture(scope="session")
 def processor(micro_store: Store) -> ProcessorMixin:
-    return build_processor(dataset.tokenizer_corpus(micro_store, []), 1024, 96)
+    return build_processor(dataset.tokenizer_corpus(micro_store, []), 1024, 96, 16)
 
 
 @pytest.fixture

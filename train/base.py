@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from conf.entry import Run, command
-from conf.runs import finished_metrics, rank
+from conf.runs import rank, read_finished_metrics
 from conf.schema import BaseCommand
 
 log = logging.getLogger(__name__)
@@ -19,8 +19,7 @@ log = logging.getLogger(__name__)
 
 @command("train.base", BaseCommand)
 def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
-    if (metrics := finished_metrics(run)) is not None:
-        log.info("%s is finished; to train again, delete it or give run=NAME", run.folder)
+    if (metrics := read_finished_metrics(run)) is not None:
         return metrics
 
     from transformers import set_seed

@@ -10,7 +10,7 @@ from pathlib import Path
 from conf.entry import command
 from conf.errors import UserError
 from conf.gpus import restrict_to_one_gpu
-from conf.runs import Run, finished_metrics, rank
+from conf.runs import Run, rank, read_finished_metrics
 from conf.schema import ContrastiveCommand
 from conf.trackers import check_trackers
 
@@ -19,8 +19,7 @@ log = logging.getLogger(__name__)
 
 @command("train.contrastive", ContrastiveCommand)
 def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
-    if (metrics := finished_metrics(run)) is not None:
-        log.info("%s is finished; to train again, delete it or give run=NAME", run.folder)
+    if (metrics := read_finished_metrics(run)) is not None:
         return metrics
     restrict_to_one_gpu()
     check_trackers(cfg.train.report_to)
@@ -70,7 +69,9 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     use_fast_layers(model)
 
     trainer = build_trainer(cfg, run, store, model, training, validation, rank_batch, checkpoint)
-    memory_settings = "train.mini_batch, retriever.image_size or retriever.frames"
+    memory_settings = (
+        "train.mini_batch, retriever.image_size or retriever.frames, set train.reuse_features=false"
+    )
     best_step = run_training(trainer, run, checkpoint, memory_settings)
 
     if rank() == 0:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 from conf.entry import Run, command
 from conf.gpus import restrict_to_one_gpu
-from conf.runs import finished_metrics
+from conf.runs import read_finished_metrics
 from conf.schema import DistillCommand
 from conf.trackers import check_trackers
-
-log = logging.getLogger(__name__)
 
 
 @command("train.distill", DistillCommand)
 def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
-    if (metrics := finished_metrics(run)) is not None:
-        log.info("%s is finished; to train again, delete it or give run=NAME", run.folder)
+    if (metrics := read_finished_metrics(run)) is not None:
         return metrics
     restrict_to_one_gpu()
     check_trackers(cfg.train.report_to)

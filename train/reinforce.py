@@ -1,23 +1,23 @@
-"""Train a student further with rewards: what the simulator finds true in its responses."""
+"""Train a student further by reinforcement learning (GRPO), with rewards from the oracle.
+
+The rewards depend on the answer, on the claims that the oracle supports or contradicts, and on the
+form of the response.
+"""
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 from conf.entry import Run, command
 from conf.gpus import restrict_to_one_gpu
-from conf.runs import finished_metrics
+from conf.runs import read_finished_metrics
 from conf.schema import ReinforceCommand
 from conf.trackers import check_trackers
-
-log = logging.getLogger(__name__)
 
 
 @command("train.reinforce", ReinforceCommand)
 def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
-    if (metrics := finished_metrics(run)) is not None:
-        log.info("%s is finished; to train again, delete it or give run=NAME", run.folder)
+    if (metrics := read_finished_metrics(run)) is not None:
         return metrics
     restrict_to_one_gpu()
     check_trackers(cfg.train.report_to)

@@ -20,8 +20,8 @@ from teacher.reading.grounding import Claim
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.reasons import CONTRADICTED, SUPPORTED, ResponseReasons, read_response
 
-ENOUGH_CLAIMS = 6
-"""Number of different claims from which on their share counts. Fewer claims earn less."""
+MIN_CLAIMS = 6
+"""Minimum denominator of `reward_truth`: a response with fewer different claims earns less."""
 MAX_MENTIONS = 10
 """A claim that a response states more often than this counts as contradicted each further time. In
 the narrator's responses, the analysis and the match layout repeat what is predicted for each false
@@ -85,7 +85,7 @@ def reward_truth(response: JudgedResponse) -> float:
             elif _is_earned(claim):
                 supported.add(key)
     repeated = sum(max(0, count - MAX_MENTIONS) for count in mentions.values())
-    total = max(len(affirmed | contradicted) + repeated, ENOUGH_CLAIMS)
+    total = max(len(affirmed | contradicted) + repeated, MIN_CLAIMS)
     return (len(supported - contradicted) - len(contradicted) - repeated) / total
 
 
@@ -101,8 +101,8 @@ def _is_earned(claim: Claim) -> bool:
 
 
 def reward_following(response: JudgedResponse) -> float:
-    """Return 1 if the answer follows from the text, the text is rather true than false (see
-    `reward_truth`), and the oracle supports a claim of its prediction; otherwise 0."""
+    """Return 1 if the answer follows from the text, `reward_truth` is positive, and the oracle
+    supports a claim of its prediction; otherwise 0."""
     predicted = any(map(_is_earned, response.reasons.claims["prediction"]))
     return float(response.reasons.follows and predicted and reward_truth(response) > 0)
 

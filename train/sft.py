@@ -9,7 +9,7 @@ from pathlib import Path
 
 from conf.entry import Run, command
 from conf.gpus import restrict_to_one_gpu
-from conf.runs import finished_metrics, rank
+from conf.runs import rank, read_finished_metrics
 from conf.schema import SftCommand
 from conf.trackers import check_trackers
 
@@ -18,8 +18,7 @@ log = logging.getLogger(__name__)
 
 @command("train.sft", SftCommand)
 def main(cfg: SftCommand, run: Run) -> dict[str, float]:
-    if (metrics := finished_metrics(run)) is not None:
-        log.info("%s is finished; to train again, delete it or give run=NAME", run.folder)
+    if (metrics := read_finished_metrics(run)) is not None:
         return metrics
     restrict_to_one_gpu()
     check_trackers(cfg.train.report_to)
@@ -69,7 +68,9 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         check_adapters(checkpoint, model, student.lora.rank, student.model)
 
     trainer = build_trainer(cfg, run, model, processor, training, validation, checkpoint)
-    memory_settings = "train.micro_batch, student.image_size or student.frames"
+    memory_settings = (
+        "train.micro_batch, student.image_size or student.frames, set train.reuse_features=false"
+    )
     best_step = training_loop.run_training(trainer, run, checkpoint, memory_settings)
 
     weights = training_loop.gather_weights(trainer)

@@ -179,7 +179,7 @@ def write_random_base(preset: str, texts: list[str], image_size: int, folder: Pa
     with torch.device("cuda" if torch.cuda.is_available() else "cpu"):
         model = AutoModelForImageTextToText.from_config(config, dtype=torch.bfloat16)
     model.save_pretrained(folder)
-    build_processor(texts, 1024, image_size).save_pretrained(folder)
+    build_processor(texts, 1024, image_size, patch=16).save_pretrained(folder)
 
 
 def reset_peak_memory() -> None:

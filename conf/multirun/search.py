@@ -143,7 +143,7 @@ def _recorded_trials(folder: Path, settings: dict[str, str]) -> list[dict[str, A
 
 
 def distribution(override: Override) -> BaseDistribution:
-    """The distribution from which Optuna samples the values of a swept key.
+    """Return the distribution from which Optuna samples the values of a swept key.
 
     interval(...) gives real numbers, int(interval(...)) integers, and tag(log,interval(...)) a
     logarithmic scale. A range of integers is sampled as integers, any other sweep as categories.

@@ -133,7 +133,8 @@ class Sweep:
         return Job(self.folder / str(number), f"#{number} {title}", overrides, command)
 
     def _skip_if_finished(self, job: Job) -> bool:
-        """Whether the job finished earlier with the same settings; if so, record it as done."""
+        """Return whether the job finished earlier with the same settings; if so, record it as
+        done."""
         if not (job.folder / "metrics.json").exists():
             return False
         settings = compose(self.command, self.schema, job.overrides)

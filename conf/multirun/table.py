@@ -14,20 +14,20 @@ JOB_FILE = "job.json"
 AT_START_SUFFIX = "_at_start"
 """Suffix of the metrics that are measured before the first training step. Tables of sweeps leave
 them out, because they have the same value in most jobs."""
-LOWER_IS_BETTER = r"loss|_rank$|set_aside|too_short|reject"
+LOWER_IS_BETTER = r"loss|_error(/|$)|_rank$|set_aside|too_short|reject"
 """Pattern in the names of the metrics of which lower values are better."""
 
 
 def read_jobs(folder: Path) -> list[dict[str, Any]]:
-    """The jobs of a sweep that have ended, by number."""
+    """Return the jobs of a sweep that have ended, by number."""
     paths = [p for p in folder.glob(f"*/{JOB_FILE}") if p.parent.name.isdecimal()]
     jobs = [read_job(path.parent) for path in paths]
     return sorted(jobs, key=lambda job: job["job"])
 
 
 def read_job(folder: Path) -> dict[str, Any]:
-    """The record of an ended job: its number (`job`), `overrides`, `status` (done or failed) and
-    `metrics`, without those that are measured before training."""
+    """Return the record of an ended job: its number (`job`), `overrides`, `status` (done or failed)
+    and `metrics`, without those that are measured before training."""
     job = json.loads((folder / JOB_FILE).read_text())
     path = folder / "metrics.json"
     metrics = json.loads(path.read_text()) if job["status"] == "done" and path.exists() else {}
@@ -77,6 +77,6 @@ def varying_overrides(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
 
 
 def is_lower_better(metric: str) -> bool:
-    """Whether lower values of a metric are better: losses, ranks, and the numbers of rejected
-    responses, of items that were set aside, and of items whose prefix is too short."""
+    """Return whether lower values of a metric are better: losses, ranks, and the numbers of
+    rejected responses, of items that were set aside, and of items whose prefix is too short."""
     return re.search(LOWER_IS_BETTER, metric) is not None

@@ -23,7 +23,8 @@ from conf.schema.training import (
 PARALLEL_BACKENDS = ("loky", "ray")
 BASE_LAYERS, BASE_HEADS = 7, 6
 """Minimum numbers of language layers and of attention heads of a base that `train.base` trains: its
-targets refer to the first seven layers, and to one head for the clip and one for each candidate."""
+targets refer to the first seven layers, and in one of them to six heads: one for the clip, one for
+each candidate, and one for the picture that the text describes."""
 
 
 @dataclass

@@ -46,8 +46,9 @@ class GenerationCommand(CommandConfig):
     """Training settings of the preset. For a base, only train.precision is used and, in
     evaluation.select, train.regime, which determines the prompt."""
     model: str | None = None
-    """Folder of a run of train.sft, or of its export. The settings saved there replace `student`
-    and `train`. null measures the base that `student` names."""
+    """Folder of a run of train.sft, train.distill or train.reinforce, or of its export. The
+    settings saved there replace `student` and `train`. null measures the base that `student`
+    names."""
     batch: int = setting(16, least=1)
     """Number of prompts per generated batch; not used with servers."""
     seed: int = setting(0, least=0)
@@ -110,7 +111,8 @@ class ReportCommand(CommandConfig):
     """Run folders below `checkpoints`, or glob patterns of them, such as [select/cot,retrieve/*];
     null reports every finished run, and the results in `saved`."""
     saved: str = "runs"
-    """Folder of the results that `dynapix.Result.save` wrote."""
+    """Folder of the results that the `save` methods of `dynapix.Result` and
+    `dynapix.RetrievalScores` wrote."""
     items: int = setting(120, least=0)
     """Maximum number of items shown per benchmark, sampled evenly from the subtypes and from
     correct and wrong answers."""

@@ -53,8 +53,8 @@ class Settings:
         return [*problems, *self.find_problems(group)]
 
     def find_problems(self, group: str) -> Iterable[str]:
-        """One message per further problem, such as settings that exclude each other. Subclasses
-        override this method."""
+        """Return one message per further problem, such as settings that exclude each other.
+        Subclasses override this method."""
         return ()
 
 
@@ -86,7 +86,7 @@ def _check_value(
 
 
 def is_url(text: str) -> bool:
-    """Whether `text` is a complete http or https address."""
+    """Return whether `text` is a complete http or https address."""
     try:
         parts = urlsplit(text)
         return parts.scheme in ("http", "https") and parts.port != 0 and " " not in text

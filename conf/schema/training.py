@@ -147,7 +147,8 @@ class RewardWeights(Settings):
     truth: float = setting(0.5, least=0)
     """Weight of the share of claims that the oracle supports less that of those it contradicts."""
     following: float = setting(0.25, least=0)
-    """Weight of 1 for an answer that follows from a text that is rather true than false."""
+    """Weight of 1 for an answer that follows from a text with more supported than contradicted
+    claims."""
     no_numbers: float = setting(0.5, least=0)
     """Weight of -1 for a text with numbers."""
     form: float = setting(0.5, least=0)
@@ -239,7 +240,7 @@ def stage(steps: int, batch: int, lr: float) -> StageConfig:
 
 @dataclass
 class BaseTrainConfig(Settings):
-    eyes: StageConfig = stage(3000, 16, 2e-3)
+    vision: StageConfig = stage(3000, 16, 2e-3)
     """The vision tower learns to see objects in single pictures."""
     motion: StageConfig = stage(1500, 8, 1e-3)
     """The whole model learns where objects are and where they go."""

@@ -90,8 +90,8 @@ def rank_metrics(
 ) -> dict[str, float]:
     """Return recall, mean reciprocal rank, median rank and rate of ties of a matrix of scores.
 
-    Scores are compared in fp32. Frames that tie with the target count by their mean over all orders
-    of the tied frames.
+    Scores are compared in fp32. If frames tie with the target, each measure is its mean over all
+    orders of the tied frames.
 
     Args:
         scores: (queries, frames); a higher score ranks first.

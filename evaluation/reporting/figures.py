@@ -32,7 +32,7 @@ def accuracy_figure(
 
     Args:
         accuracy: The accuracy of each model, by the model's label and by family or horizon.
-        with_paper: Whether the accuracy of the paper's CoT student are plotted as diamonds.
+        with_paper: Whether the accuracies of the paper's CoT student are plotted as diamonds.
     """
     groups = list(dict.fromkeys(group for by_group in accuracy.values() for group in by_group))
     figure = empty_figure(8, 4.4)

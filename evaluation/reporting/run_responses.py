@@ -41,7 +41,7 @@ class ItemResponse:
 
 
 FAILED = ItemResponse("", "", "no scores")
-"""The response of a model of the library that gave no scores for an item."""
+"""The response to an item for which the `predict` of `dynapix.evaluate` failed."""
 Responses = Mapping[str, ItemResponse]
 """Responses by item id."""
 

@@ -61,7 +61,7 @@ def gather_runs(
     """Return the finished runs below `root` and the results in `saved`, oldest first.
 
     Args:
-        saved: Folder of the results that `dynapix.Result.save` wrote.
+        saved: Folder of the results of `dynapix.Result.save` and `dynapix.RetrievalScores.save`.
         patterns: Titles of runs, or glob patterns of titles, such as select/*; None for all runs.
 
     Returns:
@@ -120,7 +120,7 @@ def _read_run(folder: Path, title: str, root: Path) -> FinishedRun:
     with reading(folder, "run.json"):
         record = json.loads((folder / "run.json").read_text())
         started = min(map(str, [record["started"], *record["earlier_starts"]]))
-        # The results that `dynapix.Result.save` wrote name the command whose files they have.
+        # Results that were saved from Python name the command whose files they have.
         kind = record.get("kind", kind)
     report, responses = None, {}
     if kind in REPORT_TYPES:

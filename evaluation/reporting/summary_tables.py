@@ -30,7 +30,7 @@ GROUPS = (
     "two-stage predict-then-match",
     "direct embedders",
 )
-"""Labels of the groups of rows in the report's tables, in their order."""
+"""Labels of the groups of measured models, in their order. Baselines and people follow."""
 BEST = {
     **dict.fromkeys((*FAMILY_COLUMNS, "Macro", "Micro", *RECALL_COLUMNS, "MRR"), max),
     "Median": min,

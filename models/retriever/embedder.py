@@ -80,7 +80,8 @@ def load_retriever(
         source = str(folder)
         with main_first():
             if rank() == 0:
-                processor = build_processor(texts, cfg.architecture.vocabulary, cfg.image_size)
+                sizes = cfg.architecture
+                processor = build_processor(texts, sizes.vocabulary, cfg.image_size, sizes.patch)
                 build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
                 processor.save_pretrained(folder)
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}

@@ -231,7 +231,7 @@ def _read_record(text: str, start: int) -> tuple[list[str | None], int | None]:
 
 
 def _is_template(choices: Sequence[str | None], letters: str) -> bool:
-    """Whether each choice lists all letters, such as "A|B|C|D", and nothing else."""
+    """Return whether each choice lists all letters, such as "A|B|C|D", and nothing else."""
     return all(
         choice is not None
         and _ONLY_LETTERS.fullmatch(choice)

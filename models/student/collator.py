@@ -92,7 +92,8 @@ def encode(
         raise UserError(
             f"sample {sample.sample_id} has {len(ids) + len(response)} tokens, more than "
             f"student.max_length={max_length}: raise student.max_length, or lower "
-            "student.image_size or student.frames",
+            "student.image_size or student.frames; train.distill and train.reinforce take these "
+            "settings from the run that model names",
             code="sample-too-long",
         )
     media = {name: prompt[name] for name in MEDIA_INPUTS if name in prompt}

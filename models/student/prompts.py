@@ -136,12 +136,12 @@ def response(rationale: str, matches: Sequence[str], letter: str, mode: str, reg
 
 
 def has_analysis(regime: str) -> bool:
-    """Whether a regime's rationales keep their candidate analysis."""
+    """Return whether a regime's rationales keep their candidate analysis."""
     return regime != "cot_no_candidate_analysis"
 
 
 def has_matches(regime: str) -> bool:
-    """Whether a regime's responses have the match layout."""
+    """Return whether a regime's responses have the match layout."""
     return regime in ("cot", "cot_no_candidate_analysis")
 
 

@@ -93,6 +93,8 @@ def test_saved_retrieval_results_are_in_the_report(bench, tmp_path) -> None:
     saved = scores.save(tmp_path / "runs" / "mine")
     assert (saved / "report.txt").read_text() == f"{scores}\n"
     assert len((saved / "ranks.jsonl").read_text().splitlines()) == len(bench.retrieval)
+    record = json.loads((saved / "run.json").read_text())
+    assert record["command"] == "dynapix.evaluate_retrieval"
     folder = run_report(tmp_path, bench.store.folder.parent, items=0, saved=str(tmp_path / "runs"))
     table = (folder / "tables" / "retrieval-micro.md").read_text()
     recall = 100 * scores.metrics["recall@10"]

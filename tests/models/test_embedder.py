@@ -49,6 +49,17 @@ def test_a_query_is_instruction_then_video_then_text_and_a_generation_prompt(
     assert "of 6 x 3 x 3 tokens" in audit_retriever(model, retriever_cfg, query, frames)
 
 
+def test_patches_have_the_size_of_the_architecture(
+    micro_store, frames, retriever_cfg, tmp_path
+) -> None:
+    sizes = replace(retriever_cfg.architecture, patch=8)
+    cfg = replace(retriever_cfg, architecture=sizes)
+    query = micro_store.retrieval("train")[0]
+    features = load(micro_store, cfg, tmp_path).preprocess([query_input(query, frames, cfg)])
+    side = cfg.image_size // sizes.patch
+    assert features["video_grid_thw"].tolist() == [[6, side, side]]
+
+
 def test_timestamps_follow_the_clips_frame_rate(
     micro_store, frames, retriever_cfg, tmp_path, monkeypatch
 ) -> None:

@@ -152,9 +152,9 @@ def test_false_word_is_contradicted(rationales, source, kind):
 
 
 def add_rare_statements(text, predicates):
-    """Add true statements that few rationales have: extremes, what is between what, what covers what
-    and what is out of sight to the prediction, what objects pass and which edges they reach to the
-    motion analysis, and how far off candidates show the objects to the candidate analysis."""
+    """Add true statements that few rationales have: extremes, what is between what, what covers
+    what and what is out of sight to the prediction, what objects pass and which edges they reach to
+    the motion analysis, and how far off candidates show the objects to the candidate analysis."""
     true = sorted(predicates.target.statements)
     extremes = [f" The {s.objects[0]} will be {s.value}." for s in true if s.kind == "extreme"]
     between = [

@@ -187,7 +187,7 @@ def test_item_whose_objects_all_look_alike_has_no_statements() -> None:
 
 def test_prompts_have_the_deciding_statements_and_their_truth_in_each_candidate() -> None:
     for item, predicates in random_cases(30, BOUNDS):
-        stated = format_facts(predicates, item)["deciding"]
+        stated = format_facts(predicates)["deciding"]
         for statement, fact in zip(choose_statements(predicates).statements, stated, strict=True):
             assert all(name in fact["statement"] for name in statement.objects)
             for view in predicates.views:

@@ -21,7 +21,7 @@ def save_tiny_qwen3(folder: Path, texts: Iterable[str]) -> Path:
 
     from models.tiny_qwen3_vl import build_processor
 
-    tokenizer = build_processor(texts, vocabulary=1024, image_size=32).tokenizer
+    tokenizer = build_processor(texts, vocabulary=1024, image_size=32, patch=16).tokenizer
     tokenizer.chat_template = TEMPLATE
     torch.manual_seed(0)
     config = Qwen3Config(

@@ -1,9 +1,9 @@
-"""Rationales with false words for places and relations, for training.
+"""Replace words for places and relations in training rationales by false ones.
 
-Some of these words are wrong in what a model writes. A model that was trained only on true texts
-chooses a candidate by them. Here, some of them are replaced in predictions and candidate analyses,
-and the model is trained to go on correctly. So it learns to choose by what it sees and predicts. It
-is not trained to write the false words.
+A model makes mistakes in the predictions and descriptions that it writes. If it was trained only on
+true texts, it relies on these mistakes when it chooses a candidate. Here, some words are replaced,
+and the loss ignores them: the model learns to continue correctly after a mistake, but not to write
+one.
 """
 
 from __future__ import annotations
@@ -54,6 +54,10 @@ def falsify_words(
     text: str, share: float, rng: np.random.Generator
 ) -> tuple[str, tuple[tuple[int, int], ...]]:
     """Replace a share of the words for places and relations in predictions and candidate analyses.
+
+    Args:
+        share: Probability that a word is replaced.
+        rng: Chooses the words and their replacements.
 
     Returns:
         The text, and the spans that are not to be trained: each false word and the character after

@@ -47,8 +47,8 @@ def run_training(
     add_callbacks(trainer, run)
     check_fsdp(trainer, checkpoint)
     advice = (
-        f"lower {memory_settings}, or set train.gradient_checkpointing=true and "
-        "train.reuse_features=false, in another run (run=NAME)"
+        f"lower {memory_settings}, or set train.gradient_checkpointing=true, in another run "
+        "(run=NAME)"
     )
     with explain_errors("while training", advice):
         train_to_last_step(trainer, checkpoint)

@@ -2,7 +2,7 @@
 
 TRL 1.16 passes images to the model, but no videos with true times (huggingface/trl issues 4144 and
 5373), and it casts the adapters of a 4-bit base to bf16, in which small updates vanish. Both are
-mended here: `MediaGRPOTrainer` computes the probabilities of responses with the project's own
+fixed here: `MediaGRPOTrainer` computes the probabilities of responses with the project's own
 inputs, and keeps the adapters in fp32. It also keeps the order of the items when a run resumes in a
 later epoch, leaves items whose responses have equal rewards out of the mean, and stops at a
 non-finite loss.
@@ -51,7 +51,7 @@ ROW = "row"
 
 @dataclass(frozen=True)
 class JudgedItem:
-    """An item, its prompt without response, and what judges a response to it."""
+    """An item, its predicates, by which responses are judged, and its prompt without response."""
 
     item: SelectionItem
     predicates: RelationalPredicates

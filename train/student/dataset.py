@@ -191,8 +191,8 @@ def load_datasets(
 
 
 def uses_only(item: SelectionItem, scenes: set[str]) -> bool:
-    """Whether the prefix and all candidates of an item are frames of these scenes or of their
-    alternative futures."""
+    """Return whether the prefix and all candidates of an item are frames of these scenes or of
+    their alternative futures."""
     shown = (item.scene_id, *(c.scene_id for c in item.candidates))
     return {original_scene_id(scene) for scene in shown} <= scenes
 

@@ -163,17 +163,27 @@ def stack_samples(
         ),
         name_places=torch.tensor([m.places for m in mentions]).reshape(-1, 2 * PICTURES) - 0.5,
         name_displacements=torch.tensor([m.future for m in mentions]).reshape(-1, 2),
-        description_tokens=integers([(m.row, k) for m in mentions for k in m.spoken], 2),
+        description_tokens=integers([(m.row, k) for m in mentions for k in m.described], 2),
         description_states=torch.tensor(
-            [(*m.state, *m.offset, *m.off) for m in mentions for _ in m.spoken]
+            [(*m.state, *m.offset, *m.error) for m in mentions for _ in m.described]
         ).reshape(-1, 8),
         description_letters=torch.tensor(
-            [-1 if m.section == "Outcome" else m.picture - 1 for m in mentions for _ in m.spoken],
+            [
+                -1 if m.section == "Outcome" else m.picture - 1
+                for m in mentions
+                for _ in m.described
+            ],
             dtype=torch.long,
         ),
-        subjects=integers([(m.row, k, m.position) for m in mentions for k in m.spoken[1:]], 3),
-        owners=integers(
-            [(m.row, k, m.owner) for m in mentions if m.owner is not None for k in m.spoken], 3
+        subjects=integers([(m.row, k, m.position) for m in mentions for k in m.described[1:]], 3),
+        references=integers(
+            [
+                (m.row, k, m.reference)
+                for m in mentions
+                if m.reference is not None
+                for k in m.described
+            ],
+            3,
         ),
         text_letters=integers(
             [(m.row, m.position, m.letter_at) for m in mentions if m.letter_at is not None], 3

@@ -28,12 +28,12 @@ COMPARISONS = ("compare", "explain")
 """The kinds of questions whose answers compare candidates with a prediction."""
 CYCLE = (*KINDS, *COMPARISONS)
 """The kinds of questions of successive steps. Comparing candidates is harder than the rest."""
-SHOWN = {"eyes": ("clip", "candidates"), "motion": ("pictures",), "words": CYCLE}
+SHOWN = {"vision": ("clip", "candidates"), "motion": ("pictures",), "words": CYCLE}
 """The kinds of successive samples of each stage. The pictures of an item resemble each other, so a
-step of `eyes` shows parts of more items."""
+step of `vision` shows parts of more items."""
 FALSE_WORDS = 0.25
-"""Share of the words for places and relations in these answers that are replaced in training. Of
-the regions that the committed base writes, 13 to 30% are wrong."""
+"""Share of the words for places and relations that are replaced in training, in answers to
+`COMPARISONS`. A trained base writes about as large a share of its regions wrongly."""
 CORPUS_ITEMS = 800
 """Number of items whose texts the tokenizer is trained on."""
 

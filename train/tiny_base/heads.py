@@ -4,24 +4,24 @@ The heads are discarded after the training. A text names a few objects; the head
 every visible object in every picture. They are linear, so the base itself has to represent what
 they predict. They read
 
-    "seen"     visual tokens, as the vision tower gives them: colour, material, shape, whether the
-               centre of an object is in the token, where in the token and in the image, and the
-               displacement between the two frames of the picture
-    "known"    visual tokens after the layer `MIDDLE`: place, whether the object moves, velocity,
-               displacements ahead, and, in a candidate, displacement since the end of the clip
-               and the smallest distance between two of the object's places in this and the earlier
-               candidates
-    "spelled"  names of objects in a text after the layer `MIDDLE`: colour, material and shape, as
-               in "seen", so that attention can compare a name with visual tokens
-    "named"    names of objects in a text after the layer `NAMING`: in which pictures the object is
-               visible and where, its displacement up to the moment that the item asks for, and how
-               far apart the candidates show it
-    "spoken"   tokens from the end of a name until the text names another object, candidate or
-               section, or the sentence ends, after the layer `SPEAKING`: place and velocity of the
-               named object in the picture that the text describes there; if the text says that
-               another object has it beside it, its displacement from this object; and, in a
-               candidate, its displacement and distance from the place where it is expected, and the
-               candidate's letter
+    "vision"       visual tokens, as the vision tower gives them: colour, material, shape, whether
+                   the centre of an object is in the token, where in the token and in the image, and
+                   the displacement between the two frames of the picture
+    "object"       visual tokens after the layer `MIDDLE`: place, whether the object moves,
+                   velocity, displacements ahead, and, in a candidate, displacement since the end of
+                   the clip and the smallest distance between two of the object's places in this and
+                   the earlier candidates
+    "name_words"   names of objects in a text after the layer `MIDDLE`: colour, material and shape,
+                   as in "vision", so that attention can compare a name with visual tokens
+    "name"         names of objects in a text after the layer `NAMING`: in which pictures the object
+                   is visible and where, its displacement up to the moment of the target, and how
+                   far apart the candidates show it
+    "description"  tokens from the end of a name until the text names another object, candidate or
+                   section, or the sentence ends, after the layer `SPEAKING`: place and velocity of
+                   the named object in the picture that the text describes there; if the text gives
+                   its place relative to another object, its displacement from that object; and, in
+                   a candidate, its displacement and distance from the expected place, and the
+                   candidate's letter
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
 at the tower's output and motion in the middle layers. Attention heads are trained too (see
@@ -42,7 +42,7 @@ from train.tiny_base.oracle_targets import AHEAD, PICTURES, OracleTargets
 
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
 DISPLACEMENTS = ("velocity", *AHEADS, "since")
-SCALES = {"place": 6.0, "offset": 3.0, "off": 6.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
+SCALES = {"place": 6.0, "offset": 3.0, "error": 6.0, "inside": 1.0, "shift": 15.0} | dict.fromkeys(
     (*DISPLACEMENTS, "separation"), 5.0
 )
 """Factors on places and displacements, so that their losses are of similar size."""
@@ -84,30 +84,33 @@ class OracleHeads(nn.Module):
         def heads(widths: Mapping[str, int]) -> nn.ModuleDict:
             return nn.ModuleDict({name: nn.Linear(hidden, n) for name, n in widths.items()})
 
-        self.seen = heads({"presence": 1, "inside": 2, "shift": 2, "place": 2})
-        self.known = heads(
+        self.vision = heads({"presence": 1, "inside": 2, "shift": 2, "place": 2})
+        self.object = heads(
             {"place": 2, "moving": 1, "separation": 1} | dict.fromkeys(DISPLACEMENTS, 2)
         )
-        self.named = heads({"visible": PICTURES, "places": 2 * PICTURES, "future": 2})
-        self.spoken = heads({"place": 2, "velocity": 2, "offset": 2, "off": 2})
+        self.name = heads({"visible": PICTURES, "places": 2 * PICTURES, "future": 2})
+        self.description = heads({"place": 2, "velocity": 2, "offset": 2, "error": 2})
         self.separation, self.distance = nn.Linear(hidden, 1), nn.Linear(hidden, 1)
         self.norms = nn.ModuleDict(
-            {n: nn.LayerNorm(hidden) for n in ("seen", "known", "named", "spelled", "spoken")}
+            {
+                name: nn.LayerNorm(hidden)
+                for name in ("vision", "object", "name_words", "name", "description")
+            }
         )
 
-    def seen_losses(self, tokens: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+    def vision_losses(self, tokens: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the losses of the vision tower's output at all visual tokens, (B, T, H)."""
-        tokens = self.norms["seen"](tokens)
+        tokens = self.norms["vision"](tokens)
         row, token = targets.objects.T
         seen = tokens[row, token]
-        presence = self.seen["presence"](tokens)[..., 0]
+        presence = self.vision["presence"](tokens)[..., 0]
         losses = {"presence": 2 * binary_cross_entropy_with_logits(presence, targets.presence)}
         for kind, logits in self.word_logits(seen).items():
             losses[kind] = cross_entropy(logits, targets.truth[kind])
         truth = targets.truth | {"inside": targets.inside}
         for name in ("inside", "shift", "place"):
-            losses[f"seen {name}"] = regression_loss(
-                self.seen[name](seen), truth[name], SCALES[name]
+            losses[f"vision {name}"] = regression_loss(
+                self.vision[name](seen), truth[name], SCALES[name]
             )
         return losses
 
@@ -116,18 +119,18 @@ class OracleHeads(nn.Module):
         weight = self._embedding[0].weight
         return {kind: seen @ weight[ids].T for kind, ids in self._word_ids.items()}
 
-    def known_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+    def object_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the losses at all visual tokens after the layer `MIDDLE`, (B, T, H)."""
-        known = self.norms["known"](hidden[targets.objects[:, 0], targets.objects[:, 1]])
+        objects = self.norms["object"](hidden[targets.objects[:, 0], targets.objects[:, 1]])
         truth = targets.truth
         losses = {
-            name: regression_loss(self.known[name](known), truth[name], SCALES[name])
+            name: regression_loss(self.object[name](objects), truth[name], SCALES[name])
             for name in ("place", "separation", *DISPLACEMENTS)
         }
         observed = ~truth["velocity"][:, 0].isnan()
         if observed.any():
             moves = (truth["velocity"][observed].norm(dim=1) > MOVING_SPEED).float()
-            moving = self.known["moving"](known[observed])[:, 0]
+            moving = self.object["moving"](objects[observed])[:, 0]
             losses["moving"] = binary_cross_entropy_with_logits(moving, moves)
         return losses
 
@@ -143,27 +146,27 @@ class OracleHeads(nn.Module):
             `color`, `material` and `shape` (N,), whether the word is right; `moving` and, for
             moving objects, `heading` (one of eight), likewise; and errors as shares of the image:
             `place_error`, and `<displacement>_error` beside `<displacement>_still`, the error of
-            staying put, of objects that are displaced, and `separation_error` beside
+            predicting no displacement, of objects that are displaced, and `separation_error` beside
             `separation_constant`, the error of the median.
         """
         truth = targets.truth
         row, token = targets.objects.T
-        seen = self.norms["seen"](tokens)[row, token]
+        seen = self.norms["vision"](tokens)[row, token]
         words = self.word_logits(seen)
         found = {kind: logits.argmax(dim=-1) == truth[kind] for kind, logits in words.items()}
         moves = truth["velocity"].norm(dim=1) > MOVING_SPEED
         if hidden is None:
-            shift = self.seen["shift"](seen)
+            shift = self.vision["shift"](seen)
             found["heading"] = (heading_octant(shift) == heading_octant(truth["velocity"]))[moves]
             return found
-        known = self.norms["known"](hidden[row, token])
+        objects = self.norms["object"](hidden[row, token])
         read = {
-            name: self.known[name](known).float() / SCALES[name]
+            name: self.object[name](objects).float() / SCALES[name]
             for name in SCALES
-            if name in self.known
+            if name in self.object
         }
         observed = ~truth["velocity"][:, 0].isnan()
-        found["moving"] = ((self.known["moving"](known)[:, 0] > 0) == moves)[observed]
+        found["moving"] = ((self.object["moving"](objects)[:, 0] > 0) == moves)[observed]
         headings = [heading_octant(values["velocity"]) for values in (read, truth)]
         found["heading"] = (headings[0] == headings[1])[moves]
         found["place_error"] = (read["place"] - truth["place"]).norm(dim=1)
@@ -181,84 +184,84 @@ class OracleHeads(nn.Module):
         found["separation_constant"] = (separation - separation.nanmedian())[compared].abs()
         return found
 
-    def spelled_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+    def name_word_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the losses at names in texts, from the output of the layer `MIDDLE`, (B, L, H)."""
         row, at = targets.names.T
-        spelled = self.norms["spelled"](hidden[row, at])
+        names = self.norms["name_words"](hidden[row, at])
         return {
             kind: cross_entropy(logits, targets.name_words[kind])
-            for kind, logits in self.word_logits(spelled).items()
+            for kind, logits in self.word_logits(names).items()
         }
 
-    def named_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+    def name_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the losses at names in texts, from the output of the layer `NAMING`, (B, L, H)."""
         row, at = targets.names.T
-        named = self.norms["named"](hidden[row, at])
+        names = self.norms["name"](hidden[row, at])
         pictures = targets.has_picture[row]
         visible = (targets.name_tokens >= 0).float()[pictures]
         separations = measure_separations(targets.name_places)[:, None]
         return {
             "visible": binary_cross_entropy_with_logits(
-                self.named["visible"](named)[pictures], visible
+                self.name["visible"](names)[pictures], visible
             ),
             "places": regression_loss(
-                self.named["places"](named), targets.name_places, SCALES["place"]
+                self.name["places"](names), targets.name_places, SCALES["place"]
             ),
             "future": regression_loss(
-                self.named["future"](named), targets.name_displacements, SCALES["since"]
+                self.name["future"](names), targets.name_displacements, SCALES["since"]
             ),
             "separation": regression_loss(
-                self.separation(named), separations, SCALES["separation"]
+                self.separation(names), separations, SCALES["separation"]
             ),
         }
 
-    def spoken_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+    def description_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
         """Return the losses at the tokens that describe a named object, from the output of the
         layer `SPEAKING`, (B, L, H)."""
         row, at = targets.description_tokens.T
-        spoken = self.norms["spoken"](hidden[row, at])
-        truth = dict(zip(self.spoken, targets.description_states.split(2, dim=1), strict=True))
+        described = self.norms["description"](hidden[row, at])
+        truth = dict(zip(self.description, targets.description_states.split(2, dim=1), strict=True))
         losses = {
-            name: regression_loss(head(spoken), truth[name], SCALES[name])
-            for name, head in self.spoken.items()
+            name: regression_loss(head(described), truth[name], SCALES[name])
+            for name, head in self.description.items()
         }
-        distance = truth["off"].norm(dim=1, keepdim=True)
-        losses["distance"] = regression_loss(self.distance(spoken), distance, SCALES["off"])
+        distance = truth["error"].norm(dim=1, keepdim=True)
+        losses["distance"] = regression_loss(self.distance(described), distance, SCALES["error"])
         letters = targets.description_letters
         if (letters >= 0).any():
             # A head that attends to the closest candidate thus finds the letter there.
-            logits = spoken[letters >= 0] @ self._embedding[0].weight[self._letter_ids].T
+            logits = described[letters >= 0] @ self._embedding[0].weight[self._letter_ids].T
             losses["letter"] = cross_entropy(logits, letters[letters >= 0])
         return losses
 
-    def spoken_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
-        """Return `spoken_place_error`, the error of the place that the heads read at the tokens
-        that describe a named object, as a share of the image."""
+    def description_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+        """Return `description_place_error`, the error of the place that the heads read at the
+        tokens that describe a named object, as a share of the image."""
         row, at = targets.description_tokens.T
-        read = self.spoken["place"](self.norms["spoken"](hidden[row, at])).float()
+        read = self.description["place"](self.norms["description"](hidden[row, at])).float()
         errors = (read / SCALES["place"] - targets.description_states[:, :2]).norm(dim=1)
-        return {"spoken_place_error": errors[~errors.isnan()]}
+        return {"description_place_error": errors[~errors.isnan()]}
 
-    def named_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
-        """Return what the heads read at names: `named_visible`, whether they tell if a picture
-        shows the object, and errors as shares of the image: `named_place_error`, and
-        `named_future_error` beside `named_future_still`, the error of staying put, of objects that
-        will be displaced."""
+    def name_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
+        """Return what the heads read at names: `name_visible`, whether they tell if a picture
+        shows the object, and errors as shares of the image: `name_place_error`, and
+        `name_future_error` beside `name_future_still`, the error of predicting no displacement, of
+        objects that will be displaced."""
         row, at = targets.names.T
-        named = self.norms["named"](hidden[row, at])
-        read = {name: self.named[name](named).float() for name in ("places", "future")}
+        names = self.norms["name"](hidden[row, at])
+        read = {name: self.name[name](names).float() for name in ("places", "future")}
         places = (read["places"] / SCALES["place"] - targets.name_places).unflatten(1, (-1, 2))
         errors = places.norm(dim=-1)
         still = targets.name_displacements.norm(dim=1)
         displaced = still > MOVING_SPEED
         future = (read["future"] / SCALES["since"] - targets.name_displacements).norm(dim=1)
         pictures = targets.has_picture[row]
-        visible = (self.named["visible"](named) > 0) == (targets.name_tokens >= 0)
+        visible = (self.name["visible"](names) > 0) == (targets.name_tokens >= 0)
         return {
-            "named_visible": visible[pictures].float(),
-            "named_place_error": errors[~errors.isnan()],
-            "named_future_error": future[displaced],
-            "named_future_still": still[displaced],
+            "name_visible": visible[pictures].float(),
+            "name_place_error": errors[~errors.isnan()],
+            "name_future_error": future[displaced],
+            "name_future_still": still[displaced],
         }
 
 

@@ -18,29 +18,30 @@ class LocatedMention:
 
     Attributes:
         row, first, position: Row of the batch, and positions of the name's first and last token.
-        spoken: Positions of the tokens that describe the object, from the name's last token on.
+        described: Positions of the tokens that describe the object, from the name's last token on.
         section: Title of the section of the rationale; None before the first.
         state: Place (from -0.5 to 0.5) and velocity of the object in the picture that the text
-            speaks of; NaN where the oracle does not determine them.
-        letter_at: Position of the letter of the candidate that the text speaks of, if any.
-        picture: Index of the picture that the text speaks of: 0 for the last one of the clip, 1 to
+            describes; NaN where the oracle does not determine them.
+        letter_at: Position of the letter of the candidate that the text describes, if any.
+        picture: Index of the picture that the text describes: 0 for the last one of the clip, 1 to
             4 for the candidates.
         found: Visual token of the object in each of `PICTURES`, or -1.
         places: The object's places in these pictures, NaN where it is not visible.
-        future: Its displacement to the moment that the item asks for, or NaN.
-        owner: Position of the cube's name if this is the sphere in "the cube has the sphere left of
-            it", otherwise None.
-        offset: The displacement from the owner to this object in the picture that the text speaks
-            of, or NaN.
-        off: If the text speaks of a candidate, the displacement of the object there from the place
-            where it is expected, otherwise NaN.
+        future: Its displacement to the moment of the target, or NaN.
+        reference: Position of the name of the reference object if the text gives this object's
+            place relative to it, as to the cube in "the cube has the sphere left of it"; otherwise
+            None.
+        offset: The displacement from the reference object to this object in the picture that the
+            text describes, or NaN.
+        error: If the text describes a candidate, the displacement of the object there from its
+            expected place, otherwise NaN.
     """
 
     name: str
     row: int
     first: int
     position: int
-    spoken: range
+    described: range
     section: str | None
     state: tuple[float, ...]
     letter_at: int | None
@@ -48,9 +49,9 @@ class LocatedMention:
     found: tuple[int, ...]
     places: tuple[float, ...]
     future: tuple[float, float]
-    owner: int | None
+    reference: int | None
     offset: tuple[float, float]
-    off: tuple[float, float]
+    error: tuple[float, float]
 
 
 def locate_mentions(
@@ -59,12 +60,12 @@ def locate_mentions(
     """Yield the mentions of objects in a sample's response, whose first token is at `start`."""
     shown = shown_objects(sample)
     mentions = [*text.mentions()]
-    states = [spoken_state(sample, shown, m) for m in mentions]
+    states = [described_state(sample, shown, m) for m in mentions]
     for m, state in zip(mentions, states, strict=True):
-        owner = None if m.owner is None else start + mentions[m.owner].last
+        reference = None if m.reference is None else start + mentions[m.reference].last
         offset = UNKNOWN
-        if m.owner is not None:
-            offset = state[0] - states[m.owner][0], state[1] - states[m.owner][1]
+        if m.reference is not None:
+            offset = state[0] - states[m.reference][0], state[1] - states[m.reference][1]
         pictures = [shown.get((sample.last + k, m.name)) for k in range(PICTURES)]
         yield LocatedMention(
             m.name,
@@ -79,7 +80,7 @@ def locate_mentions(
             tuple(t.token(grid) if t else -1 for t in pictures),
             tuple(x for t in pictures for x in (t.place if t else UNKNOWN)),
             sample.future.get(m.name, UNKNOWN),
-            owner,
+            reference,
             offset,
             measure_error(sample, shown, m),
         )
@@ -120,7 +121,7 @@ def find_next_in_candidates(mentions: Sequence[LocatedMention]) -> Iterator[tupl
 def measure_error(
     sample: OracleSample, shown: Mapping[tuple[int, str], ObjectTarget], mention: Mention
 ) -> tuple[float, float]:
-    """Return the displacement of a named object in the candidate that the text speaks of from its
+    """Return the displacement of a named object in the candidate that the text describes from its
     place in the supposed target or, if none is supposed, at the target; NaN where the oracle does
     not determine it."""
     if mention.letter is None:
@@ -147,11 +148,11 @@ def predicted_place(
     return now.place[0] + moved[0], now.place[1] + moved[1]
 
 
-def spoken_state(
+def described_state(
     sample: OracleSample, shown: Mapping[tuple[int, str], ObjectTarget], mention: Mention
 ) -> tuple[float, ...]:
     """Return the place (from -0.5 to 0.5) and the velocity of a named object in the picture that
-    the text speaks of there; NaN where the oracle does not determine them."""
+    the text describes there; NaN where the oracle does not determine them."""
     place, velocity = UNKNOWN, UNKNOWN
     if mention.letter is not None:
         seen = shown.get((sample.last + 1 + LETTERS.index(mention.letter), mention.name))

@@ -1,4 +1,4 @@
-"""Where a text speaks of which object, and of which picture."""
+"""Where a text describes which object, and in which picture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EVENTS = re.compile(
     rf"|(?P<name>{NAME.pattern})|[Cc]andidate (?P<letter>[{''.join(LETTERS)}])\b"
     rf"|(?P<section>{'|'.join(SECTIONS)}):|(?P<end>\.(?=\s|$))"
 )
-"""Matches where a text supposes that a candidate is the target, where it begins to speak of an
+"""Matches where a text supposes that a candidate is the target, where it begins to describe an
 object, a candidate or a section, and where a sentence ends."""
 AGREES = re.compile(
     r"[Cc]andidate (?P<letter>\w) [^.]*,? and (?P<word>agrees)(?=\.| with the prediction\.)"
@@ -37,7 +37,7 @@ CLOSEST = re.compile(
 """Matches where a text names the candidate that shows an object closest to its place."""
 MATCH = re.compile(r"^Candidate (?P<letter>\w) (?:matches|does not match)", re.MULTILINE)
 """Matches where a line says whether a candidate matches the prediction."""
-POSSESSES = re.compile(r"\b(?:with|has|have) the $")
+REFERENCE = re.compile(r"\b(?:with|has|have) the $")
 """Matches the words before the sphere in "the cube has the sphere left of it"."""
 PREDICTION = re.compile("Prediction:")
 
@@ -49,13 +49,14 @@ class Mention:
 
     Attributes:
         first, last: Indices of the name's first and last token.
-        stop: Index of the first token that no longer speaks of the object.
+        stop: Index of the first token that no longer describes the object.
         section: Title of the section of the rationale; None before the first.
-        letter: The candidate that the text speaks of; None if it speaks of the scene.
+        letter: The candidate that the text describes; None if it describes the scene.
         letter_at: Index of the token of the letter, if any.
         supposed: The candidate that the text supposes to be the target, if any.
-        owner: Index of the mention of the cube if this is the sphere in "the cube has the sphere
-            left of it", otherwise None.
+        reference: Index of the mention of the reference object if the text gives this object's
+            place relative to it, as to the cube in "the cube has the sphere left of it"; otherwise
+            None.
     """
 
     name: str
@@ -66,7 +67,7 @@ class Mention:
     letter: str | None
     letter_at: int | None
     supposed: str | None
-    owner: int | None
+    reference: int | None
 
 
 class TokenizedText:
@@ -93,14 +94,14 @@ class TokenizedText:
         starts = [*(e.start() for e in events), len(self.text)]
         for event, following in zip(events, starts[1:], strict=True):
             if name := event["name"]:
-                owner = None
-                if previous and POSSESSES.search(self.text[end : event.start()]):
+                reference = None
+                if previous and REFERENCE.search(self.text[end : event.start()]):
                     # "The cube with the sphere left of it and with the cylinder near it": the cube.
-                    owner = count - 1 if previous.owner is None else previous.owner
+                    reference = count - 1 if previous.reference is None else previous.reference
                 first, last = self.token_at(event.start()), self.token_at(event.end() - 1)
                 stop = self.token_at(following)
                 where = section, letter, letter_at, supposed
-                previous = Mention(name, first, last, stop, *where, owner)
+                previous = Mention(name, first, last, stop, *where, reference)
                 end, count = event.end(), count + 1
                 yield previous
             elif event["supposed"]:
@@ -131,7 +132,7 @@ class TokenizedText:
 
     def choices(self) -> Iterator[tuple[int, int]]:
         """Yield the index of the token of each letter after "closest", and that of the last token
-        at which the text speaks of the object in this candidate."""
+        at which the text describes the object in this candidate."""
         described: dict[tuple[str, str], int] = {}
         mentions = [m for m in self.mentions() if m.section == "Candidate analysis" and m.letter]
         for event in CLOSEST.finditer(self.text):

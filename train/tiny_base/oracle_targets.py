@@ -110,17 +110,17 @@ class OracleTargets:
             that the text describes, or -1 where it is not visible.
         name_places: (M, 2 * PICTURES) its places relative to the centre of each picture, NaN where
             it is not visible.
-        name_displacements: (M, 2) its displacement up to the moment that the item asks for, or NaN.
+        name_displacements: (M, 2) its displacement up to the moment of the target, or NaN.
         description_tokens: (S, 2) row and position of the tokens that describe a named object, from
             the end of its name on.
         description_states: (S, 8) place and velocity of the object there, its displacement from its
-            owner, and that from the place where it is expected, or NaN.
+            reference, and that from the place where it is expected, or NaN.
         description_letters: (S,) index of the letter of the candidate in which the text, before its
             outcome, describes the object there; -1 for the clip.
         subjects: (_, 3) row, position after a name, and position of the name.
-        owners: (_, 3) row, position of a token that describes the sphere in "the cube has the
+        references: (_, 3) row, position of a token that describes the sphere in "the cube has the
             sphere left of it", and position of the cube's name.
-        text_letters: (_, 3) row, position of a name where the text speaks of a candidate, and
+        text_letters: (_, 3) row, position of a name where the text describes a candidate, and
             position of the candidate's letter in the text.
         prompt_letters: (_, 3) row, position of a visual token of a candidate, and position of its
             letter in the prompt.
@@ -134,8 +134,8 @@ class OracleTargets:
         verdicts: (_, 3) row, position before the letter of a candidate in an outcome, and position
             of the word that says that the candidate agrees, or of its letter after "closest".
         choices: (_, 3) row, position before the letter of the candidate that is said to show an
-            object closest to its place, and position of the last token at which the text speaks of
-            the object in this candidate.
+            object closest to its place, and position of the last token that describes the object in
+            this candidate.
         matches: (_, 3) row, position of the letter in a line that says whether a candidate matches,
             and position of the last letter in the outcome.
         next_in_clip: (_, 3) row, position before the first mention of an object in a scene parse,
@@ -163,7 +163,7 @@ class OracleTargets:
     description_states: Tensor
     description_letters: Tensor
     subjects: Tensor
-    owners: Tensor
+    references: Tensor
     text_letters: Tensor
     prompt_letters: Tensor
     repeats: Tensor

@@ -38,7 +38,7 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
     find shown          NAMING 5       name -> likewise, in the picture that the text describes
     subject             RECALLING 0    token that describes an object -> the object's name
     repeat              RECALLING 1    token before a repeated name -> the name's last mention
-    owner               RECALLING 2    token that describes the sphere in "the cube has the sphere
+    reference           RECALLING 2    token that describes the sphere in "the cube has the sphere
                                        left of it" -> the cube's name
     verdict             SPEAKING 0     token before a letter in an outcome -> "agrees" of this
                                        candidate, or its letter after "closest"
@@ -89,7 +89,7 @@ def pointing_losses(trace: Trace, targets: OracleTargets) -> dict[str, Tensor]:
         ("find shown", NAMING, PICTURES, shown),
         ("subject", RECALLING, 0, targets.subjects),
         ("repeat", RECALLING, 1, targets.repeats),
-        ("owner", RECALLING, 2, targets.owners),
+        ("reference", RECALLING, 2, targets.references),
         ("verdict", SPEAKING, 0, targets.verdicts),
         ("choice", CHOOSING, 0, targets.choices),
         ("next in clip", SPEAKING, 1, next_in_clip),

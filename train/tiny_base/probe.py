@@ -54,7 +54,7 @@ class Probe:
         """Return the measures of a stage by name."""
         self.model.eval()
         with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
-            measures = self._read_heads(with_motion=stage != "eyes")
+            measures = self._read_heads(with_motion=stage != "vision")
             if stage == "words":
                 measures |= self._measure_predicted_words()
         return measures
@@ -93,8 +93,8 @@ class Probe:
                 before = before - (mask.shape[1] - labels.shape[1] - 1)
                 chosen = predicted[row, before] == labels[row, before]
                 found[f"words_choice/{kind}"].append(chosen.float())
-                measures = self.heads.named_measures(trace.outputs[NAMING], targets)
-                measures |= self.heads.spoken_measures(trace.outputs[SPEAKING], targets)
+                measures = self.heads.name_measures(trace.outputs[NAMING], targets)
+                measures |= self.heads.description_measures(trace.outputs[SPEAKING], targets)
                 for name, values in measures.items():
                     found[f"{name}/{kind}"].append(values)
         return average(found)

@@ -4,8 +4,8 @@ The oracle determines the answers, in the phrases of the built-in narrator. The 
 (`KINDS`) ask for
 
     parse      the objects at the end of a clip, and their motion
-    predict    where each object will be at the target, and how the objects will lie to each other
-    describe   where each candidate shows each object, and how they lie to each other
+    predict    where each object will be at the target, and relations between the objects then
+    describe   where each candidate shows each object, and relations between them
     compare    for each of two candidates, the statements that tell it apart from the others, what
                the candidates show instead, and which other candidate is closest to it
     explain    the steps of a rationale, with another frame of the scene instead of the target

@@ -34,8 +34,8 @@ class OracleSample:
         last: Index of the last picture of the clip, which the candidates follow; -1 without clip.
         observed: Places and velocities of objects, by name, at the cut, which texts about the clip
             describe.
-        future: Displacements of objects, by name, from the end of the clip to the moment that the
-            item asks for.
+        future: Displacements of objects, by name, from the end of the clip to the moment of the
+            target.
         predicts_target: Whether predictions in the response are true of that moment.
     """
 

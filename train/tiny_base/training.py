@@ -1,6 +1,6 @@
-"""Train the tiny base in stages: eyes, motion, words.
+"""Train the tiny base in stages: vision, motion, words.
 
-    eyes     the vision tower, and the embeddings of the words for colours, materials and shapes,
+    vision   the vision tower, and the embeddings of the words for colours, materials and shapes,
              learn to see the objects of single pictures
     motion   the whole model learns from clips and candidates where objects are and where they go
     words    the model, but not the vision tower, learns to answer questions in words; the targets
@@ -58,9 +58,9 @@ from train.tiny_base.trace import (
 
 log = logging.getLogger(__name__)
 
-STAGES = ("eyes", "motion", "words")
+STAGES = ("vision", "motion", "words")
 CHECKPOINT = "state.pt"
-WARMUP_STEPS, LEAST_RATE = 40, 0.05
+WARMUP_STEPS, MIN_LR_FACTOR = 40, 0.05
 DENSE = 1.0
 """Weight, in the stage of words, of the losses at visual tokens and of the colours, materials and
 shapes at names."""
@@ -77,10 +77,10 @@ and attention heads, and the base named objects that do not exist. With a weight
 about two objects were often ungrammatical."""
 
 
-def eyes_losses(
+def vision_losses(
     model: PreTrainedModel, heads: OracleHeads, batch: dict[str, Tensor], targets: OracleTargets
 ) -> dict[str, Tensor]:
-    return heads.seen_losses(encode_pictures(model, batch), targets)
+    return heads.vision_losses(encode_pictures(model, batch), targets)
 
 
 def motion_losses(
@@ -104,13 +104,13 @@ def words_losses(
     pointing = pointing_losses(trace, targets)
     losses |= {name: POINTING * loss for name, loss in pointing.items()}
     if len(targets.names) and len(targets.objects):
-        named = heads.named_losses(trace.outputs[NAMING], targets)
-        losses |= {f"named {name}": NAMED * loss for name, loss in named.items()}
-        spoken = heads.spoken_losses(trace.outputs[SPEAKING], targets)
-        losses |= {f"spoken {name}": NAMED * loss for name, loss in spoken.items()}
+        names = heads.name_losses(trace.outputs[NAMING], targets)
+        losses |= {f"name {name}": NAMED * loss for name, loss in names.items()}
+        described = heads.description_losses(trace.outputs[SPEAKING], targets)
+        losses |= {f"description {name}": NAMED * loss for name, loss in described.items()}
     if len(targets.names):
-        spelled = heads.spelled_losses(trace.outputs[MIDDLE], targets)
-        losses |= {f"spelled {kind}": DENSE * loss for kind, loss in spelled.items()}
+        words = heads.name_word_losses(trace.outputs[MIDDLE], targets)
+        losses |= {f"name {kind}": DENSE * loss for kind, loss in words.items()}
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()
     losses["words"] = WORD_LOSSES * cross_entropy(predicted, following, ignore_index=IGNORED)
     # The logits and labels are those of the last tokens.
@@ -132,13 +132,13 @@ def words_losses(
 def dense_losses(trace: Trace, heads: OracleHeads, targets: OracleTargets) -> dict[str, Tensor]:
     """Return the losses at the visual tokens of the whole model."""
     return {
-        **heads.seen_losses(select_tokens(trace.embedded, targets.visual), targets),
-        **heads.known_losses(select_tokens(trace.outputs[MIDDLE], targets.visual), targets),
+        **heads.vision_losses(select_tokens(trace.embedded, targets.visual), targets),
+        **heads.object_losses(select_tokens(trace.outputs[MIDDLE], targets.visual), targets),
     }
 
 
 LOSSES: dict[str, Callable[..., dict[str, Tensor]]] = {
-    "eyes": eyes_losses, "motion": motion_losses, "words": words_losses,
+    "vision": vision_losses, "motion": motion_losses, "words": words_losses,
 }  # fmt: skip
 
 
@@ -282,10 +282,10 @@ class BaseTrainer:
 
 
 def learning_rate_factor(step: int, steps: int) -> float:
-    """Return the learning rate at a step as a share of the peak: a linear warm-up, then a cosine
-    down to `LEAST_RATE`."""
+    """Return the factor of the peak learning rate at a step: a cosine from 1 to `MIN_LR_FACTOR`
+    over all steps, multiplied by a linear warm-up in the first `WARMUP_STEPS` steps."""
     cosine = (1 + math.cos(math.pi * step / steps)) / 2
-    return min(1, (step + 1) / WARMUP_STEPS) * (LEAST_RATE + (1 - LEAST_RATE) * cosine)
+    return min(1, (step + 1) / WARMUP_STEPS) * (MIN_LR_FACTOR + (1 - MIN_LR_FACTOR) * cosine)
 
 
 def build_trainer(

@@ -261,6 +261,13 @@ def test_world_without_suitable_scenes_is_refused(world: dict[str, Any], key: st
         sample_scene(WorldConfig(name="bad", **world), 0, 0)
 
 
+def test_object_that_enters_inside_a_part_is_sampled_again() -> None:
+    """Its motion ends at the first frame, so that no other object could be placed by it."""
+    parts = {"wall": PartConfig([-0.7, 3.3, 0.45], [4.0, 1.0, 0.9])}
+    sample = sample_scene(WorldConfig(name="walled", parts=parts), 0, 3)
+    assert len(sample.motion.states) == FRAMES
+
+
 @pytest.mark.parametrize("height", [-0.2, np.nan])
 def test_scene_with_an_object_below_the_floor_is_rejected(height: float) -> None:
     sample = sample_scene(WorldConfig(), 0, 0)

@@ -34,8 +34,8 @@ from train.tiny_base.training import motion_losses, words_losses
 def test_texts_without_pictures_have_losses(sampler, collate, deep_model, heads) -> None:
     batch, targets = collate([sampler.make_sample(i, "narrate", "test") for i in sampler.items[:3]])
     losses = words_losses(deep_model, heads, batch, targets)
-    assert {"words", "spelled color", "verdict", "repeat", "match", "matches"} <= losses.keys()
-    assert not {"color", "place", "named places", "find 0", "label", "find shown"} & losses.keys()
+    assert {"words", "name color", "verdict", "repeat", "match", "matches"} <= losses.keys()
+    assert not {"color", "place", "name places", "find 0", "label", "find shown"} & losses.keys()
     assert sum(losses.values()).isfinite()
 
 
@@ -77,19 +77,19 @@ def test_losses_train_the_layers_that_they_refer_to(samples, collate, deep_model
     assert deep_model.model.visual.blocks[0].attn.qkv.weight.grad is not None
 
 
-def test_measures_of_what_is_right_and_of_staying_put(samples, collate, deep_model) -> None:
+def test_measures_of_right_heads_and_of_no_displacement(samples, collate, deep_model) -> None:
     # The small tokenizer splits words, and some have the same first token.
     tokens = {"color": [*range(20, 28)], "material": [28, 29], "shape": [30, 31, 32]}
     heads = OracleHeads(deep_model.get_input_embeddings(), tokens, [33, 34, 35, 36])
     _, targets = collate(samples)
     truth, (row, token) = targets.truth, targets.objects.T
-    hidden = heads.known["place"].in_features
-    heads.norms["seen"] = heads.norms["known"] = torch.nn.Identity()
+    hidden = heads.object["place"].in_features
+    heads.norms["vision"] = heads.norms["object"] = torch.nn.Identity()
     moves = truth["velocity"].norm(dim=1) > 0.012
 
     # Each head of the middle layers reads two numbers of its own.
     known = torch.zeros(*targets.visual.shape, hidden)
-    for k, (name, head) in enumerate(heads.known.items()):
+    for k, (name, head) in enumerate(heads.object.items()):
         torch.nn.init.zeros_(head.weight)
         torch.nn.init.zeros_(head.bias)
         width = head.out_features
@@ -130,9 +130,9 @@ def test_words_stage_has_all_losses_and_learns(samples, collate, deep_model, hea
     totals = []
     for _ in range(8):
         losses = words_losses(deep_model, heads, batch, targets)
-        assert {"words", "track clip", "find 0", "named places", "color", "since"} <= losses.keys()
+        assert {"words", "track clip", "find 0", "name places", "color", "since"} <= losses.keys()
         assert {"subject", "letter", "repeat", "choice", "choices"} <= losses.keys()
-        assert {"spoken place", "spoken letter", "spelled color"} <= losses.keys()
+        assert {"description place", "description letter", "name color"} <= losses.keys()
         total = sum(losses.values())
         optimizer.zero_grad()
         total.backward()
@@ -150,7 +150,7 @@ def test_pointing_is_lossless_if_all_attention_is_on_the_object(sampler, collate
     losses = pointing_losses(Certain(), targets)
     assert losses.keys() == {
         "before", "second before", "track clip", *(f"find {k}" for k in range(PICTURES)), "subject",
-        "find shown", "label", "letter", "repeat", "choice", "owner",
+        "find shown", "label", "letter", "repeat", "choice", "reference",
         "next in candidates",
         *(f"track {k}" for k in range(len(LETTERS) - 1)),
     }  # fmt: skip

@@ -80,7 +80,7 @@ def test_the_match_layout_refers_to_the_last_letter_of_the_outcome(processor) ->
     assert [*text.matches()] == [(line, outcome) for line in lines]
 
 
-def test_owners_are_named_before_what_is_beside_them(processor) -> None:
+def test_references_are_named_before_what_is_beside_them(processor) -> None:
     text = TokenizedText(
         "Prediction: At the end, the red metal cube will have the gray metal cube left of it. The "
         "gray metal cube will be near the top.\n"
@@ -89,5 +89,5 @@ def test_owners_are_named_before_what_is_beside_them(processor) -> None:
         "shows the red metal cube nearer to the gray metal cube than to the blue rubber sphere.",
         processor.tokenizer,
     )
-    owners = [mention.owner for mention in text.mentions()]
-    assert owners == [None, 0, None, None, 3, 3, None, None, None]
+    references = [mention.reference for mention in text.mentions()]
+    assert references == [None, 0, None, None, 3, 3, None, None, None]

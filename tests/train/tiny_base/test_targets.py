@@ -16,7 +16,7 @@ from teacher.deciding import UNSEEN_DISTANCE
 from teacher.predicates.motion import find_cut, motion_start
 from train.tiny_base.collator import object_token_ids, spatial_token_ids
 from train.tiny_base.data import ItemSampler
-from train.tiny_base.located_mentions import measure_error, spoken_state
+from train.tiny_base.located_mentions import described_state, measure_error
 from train.tiny_base.mentions import TokenizedText
 from train.tiny_base.oracle_targets import (
     AHEAD,
@@ -247,7 +247,7 @@ def test_spoken_states_are_those_of_the_oracle(sampler, collate, processor) -> N
     shown = {(t.picture, t.name): t.place for t in explained.targets}
     compared = set()
     for m in text.mentions():
-        place = np.add(spoken_state(explained, shown_objects(explained), m)[:2], 0.5)
+        place = np.add(described_state(explained, shown_objects(explained), m)[:2], 0.5)
         if m.letter is not None:
             expected = shown.get((explained.last + 1 + LETTERS.index(m.letter), m.name))
         elif m.section in ("Prediction", "Outcome"):
@@ -265,12 +265,12 @@ def test_offsets_lead_from_the_owner_to_the_object(sampler, collate) -> None:
     _, targets = collate(samples)
     at = [tuple(position) for position in targets.description_tokens.tolist()]
     states = dict(zip(at, targets.description_states, strict=True))
-    owners = {(row, k): (row, owner) for row, k, owner in targets.owners.tolist()}
-    assert len(owners) > 20
+    references = {(row, k): (row, reference) for row, k, reference in targets.references.tolist()}
+    assert len(references) > 20
     compared = 0
     for position, state in states.items():
-        if position in owners:
-            expected = state[:2] - states[owners[position]][:2]
+        if position in references:
+            expected = state[:2] - states[references[position]][:2]
             assert torch.allclose(state[4:6], expected, equal_nan=True)
             compared += int(not expected.isnan().any())
         else:
@@ -335,8 +335,8 @@ def test_samples_depend_on_seed_and_step_only(sampler: ItemSampler) -> None:
 
 def test_steps_show_the_clip_the_candidates_or_both(sampler: ItemSampler) -> None:
     for stage, step, shown in (
-        ("eyes", 0, (3, 0)),
-        ("eyes", 1, (0, 4)),
+        ("vision", 0, (3, 0)),
+        ("vision", 1, (0, 4)),
         ("motion", 0, (3, 4)),
         ("motion", 1, (3, 4)),
     ):

@@ -34,7 +34,7 @@ STAGE = StageConfig(steps=4, batch=2, lr=1e-3)
 @pytest.fixture
 def cfg(micro, micro_store: Store, student_cfg) -> BaseCommand:
     train = BaseTrainConfig(
-        eyes=STAGE, motion=STAGE, words=replace(STAGE, steps=8), precision="fp32",
+        vision=STAGE, motion=STAGE, words=replace(STAGE, steps=8), precision="fp32",
         evaluations=2, checkpoint_steps=3, validation_items=4, log_steps=1,
     )  # fmt: skip
     student = replace(student_cfg, architecture=SIZES, frames=4)
@@ -86,7 +86,7 @@ def test_killed_run_resumes_as_if_it_had_never_stopped(
     assert journals[0] == journals[1]
     records = [json.loads(line) for line in journals[0].splitlines()]
     assert [r["step"] for r in records] == [*range(1, 17)]
-    assert {r["stage"] for r in records} == {"eyes", "motion", "words"}
+    assert {r["stage"] for r in records} == {"vision", "motion", "words"}
 
 
 def test_checkpoints_of_another_tokenizer_are_refused(cfg, micro_store: Store, tmp_path) -> None:
@@ -103,7 +103,7 @@ def test_eyes_train_the_vision_tower_alone(cfg, micro_store: Store, tmp_path: Pa
     trainer = start(cfg, micro_store, tmp_path / "run")
     trainer.optimizer = trainer._new_optimizer()
     before = {name: w.clone() for name, w in trainer.model.state_dict().items()}
-    trainer._train_step("eyes", STAGE)
+    trainer._train_step("vision", STAGE)
     changed = {n for n, w in trainer.model.state_dict().items() if not torch.equal(w, before[n])}
     assert changed
     # The words of objects are trained too: their embeddings are the targets.
@@ -117,7 +117,7 @@ def test_command_saves_a_base_that_can_be_loaded(cfg, tmp_path: Path) -> None:
     metrics = main.__wrapped__(cfg, run)
     assert 0 <= metrics["color"] <= 1
     assert metrics["ahead_25_still"] > 0
-    assert metrics["named_future_still/predict"] > 0
+    assert metrics["name_future_still/predict"] > 0
     student = replace(cfg.student, architecture=None, model=str(run.folder / "student"))
     model, processor = loading.load_base(student, "bf16", list)
     assert {p.dtype for p in model.parameters()} <= {torch.float32, torch.bfloat16}
