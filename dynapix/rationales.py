@@ -10,7 +10,7 @@ from teacher.numbers.detection import find_numbers
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates
 from teacher.predicates.relations import Bounds
-from teacher.reading.grounding import VERDICTS, Claim
+from teacher.reading.claims import VERDICTS, Claim
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 

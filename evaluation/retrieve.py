@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 @command("evaluation.retrieve", RetrieveCommand)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
-    from evaluation.embedders.base import open_retriever
+    from evaluation.embedders.embedder import open_retriever
     from evaluation.metrics import results
     from evaluation.reporting import tables
     from evaluation.retrieval import exact_search, standard_test

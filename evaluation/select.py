@@ -35,7 +35,8 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.render.frame_cache import FrameReader
-    from evaluation.generators import base, response_log
+    from evaluation.generators import response_log
+    from evaluation.generators.generator import item_sample, open_generator, response_settings
     from evaluation.metrics.reasons import measure_reasons
     from evaluation.metrics.results import variant_name
     from evaluation.metrics.selection import Choices, selection_report
@@ -43,12 +44,12 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = FrameReader(store, student.image_size)
-    model = base.open_generator(cfg, folder, trained)
+    model = open_generator(cfg, folder, trained)
     answers, keys, runs_folder = {}, {}, Path(cfg.checkpoints, "select")
     # The results under a control are compared with those on the unchanged items.
     for control in dict.fromkeys([None, cfg.control]):
         settings = {
-            mode: base.response_settings(
+            mode: response_settings(
                 mode, regime, student, cfg.seed, model.identity, store.identity, control
             )
             for mode in modes
@@ -59,7 +60,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             log.info("reusing %d answers from other runs of this model", count)
         for mode in modes:
             log.info("measuring %s in %s mode, control %s", model.name, mode, control or "none")
-            sample_of = partial(base.item_sample, regime, frames, student, control, mode)
+            sample_of = partial(item_sample, regime, frames, student, control, mode)
             respond = partial(model.respond, mode, sample_of)
             answers[mode, control] = response_log.collect_responses(items, mode, respond, responses)
             keys[mode, control] = responses.keys[mode]

@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 @command("evaluation.similarity", SimilarityCommand)
 def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from data.records import FrameRef
-    from evaluation.embedders.base import open_retriever
+    from evaluation.embedders.embedder import open_retriever
     from evaluation.metrics.results import SIMILARITY
     from evaluation.metrics.selection import (
         Choices,

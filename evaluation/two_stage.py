@@ -33,8 +33,8 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.render.frame_cache import FrameReader
-    from evaluation.embedders.base import open_embedders
-    from evaluation.generators.base import open_generator
+    from evaluation.embedders.embedder import open_embedders
+    from evaluation.generators.generator import open_generator
     from evaluation.metrics import results
     from evaluation.metrics.ranking import query_metrics
     from evaluation.reporting import tables

@@ -7,7 +7,7 @@ tests must pass with them; tests/models/test_compat.py names a hook that a libra
 
 Hooks in other modules, which subclass a library's classes or depend on how it passes its inputs:
 
-- `models.lora_kernels` swaps the class of peft's `Linear` and `Linear4bit` layers, registers a
+- `models.fast_layers` swaps the class of peft's `Linear` and `Linear4bit` layers, registers a
   `LoraVariant` in their `lora_variant`, and overrides `_cast_input_dtype`.
 - `models.attention` registers a function whose name contains "flash", because Qwen3-VL's vision
   tower then passes all frames in one call, with `cu_seq_lens_q` and `max_length_q`.

@@ -14,7 +14,7 @@ from yaml import YAMLError
 
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
-from models.resolved import read_resolved, with_resolved_commit
+from models.resolved_settings import read_resolved, with_resolved_commit
 
 EXPORT = "export.json"
 """A file that only the folders that `train.export` writes contain."""

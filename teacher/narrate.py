@@ -22,8 +22,8 @@ from conf.entry import Run, command
 from conf.errors import UserError
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
+from teacher.journal import Journal, save_accepted
 from teacher.narrator import write_rationale
-from teacher.rationale_log import Journal, save_accepted
 from teacher.report import (
     Figures,
     describe_sufficiency,

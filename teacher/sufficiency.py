@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from teacher.predicates.facts import Relation, RelationalPredicates, View
 from teacher.predicates.relations import VALUES, normalize_relation
-from teacher.reading.grounding import BETWEEN, OBJECT_CHECKS, TARGET, Claim
+from teacher.reading.claims import BETWEEN, OBJECT_CHECKS, TARGET, Claim
 from teacher.sections import split_sections
 
 SECTION = "Prediction"

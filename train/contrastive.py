@@ -29,14 +29,14 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
     from models.compat import keep_freed_memory
     from models.distributed import is_sharded, main_first, split_batch
-    from models.lora_kernels import use_fast_layers
-    from models.resolved import data_digest, resolve_run
+    from models.fast_layers import use_fast_layers
+    from models.resolved_settings import data_digest, resolve_run
     from models.retriever.embedder import load_retriever, tokenizer_texts
     from train.common.checkpoints import newest_checkpoint
     from train.common.journal import run_metrics
     from train.common.training_loop import explain_load_errors, run_training
     from train.retriever.batches import split_queries
-    from train.retriever.run import build_trainer
+    from train.retriever.trainer_setup import build_trainer
 
     keep_freed_memory()
     if is_sharded():

@@ -21,7 +21,7 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
     from models import compat, distributed
     from models.fingerprints import weights_digest
-    from models.resolved import data_digest
+    from models.resolved_settings import data_digest
     from models.trained_runs import product_folder
     from teacher.narrate import ensure_rationales
     from train.common.checkpoints import newest_checkpoint

@@ -41,7 +41,7 @@ COMMANDS = {"student": SftCommand, "retriever": ContrastiveCommand}
 @command("train.export", ExportModelCommand)
 def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
     from data.store import hash_file
-    from models.resolved import RESOLVED
+    from models.resolved_settings import RESOLVED
     from models.trained_runs import EXPORT, export_record, settings_file
     from train.common.model_card import model_card
 
@@ -94,7 +94,7 @@ def find_run(
         UserError: The run does not exist, is not finished or trained all weights; its adapters are
             missing; or its base has changed.
     """
-    from models.resolved import check_base
+    from models.resolved_settings import check_base
     from models.trained_runs import trained_settings
 
     runs = runs_folder(checkpoints, product, run)
@@ -121,12 +121,13 @@ def write_merged(
     merge: StudentMerge | RetrieverMerge, folder: Path, cfg: ExportModelCommand
 ) -> dict[str, float]:
     """Write a merged model, and return the comparison of its outputs with those of the trained
-    model (see `train.common.merge.compare`), which is empty with `verify=false`.
+    model (see `train.common.output_comparison.compare_outputs`), which is empty with
+    `verify=false`.
 
     Raises:
         UserError: The outputs differ too much, or the benchmark or its rationales are missing.
     """
-    from train.common.merge import compare
+    from train.common.output_comparison import compare_outputs
 
     if not cfg.verify:
         merge.write(folder, cfg.format)
@@ -137,7 +138,7 @@ def write_merged(
     log.info("merging")
     merge.write(folder, cfg.format)
     log.info("running the merged %s", cfg.product)
-    measured = compare(trained, merge.merged_outputs(folder, items))
+    measured = compare_outputs(trained, merge.merged_outputs(folder, items))
     for name, value in measured.items():
         # Unlike >, "not <=" also refuses NaN.
         if name.endswith("_difference") and not value <= merge.max_difference:

@@ -25,7 +25,7 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
     from models import compat, distributed
     from models.fingerprints import weights_digest
-    from models.resolved import data_digest
+    from models.resolved_settings import data_digest
     from models.trained_runs import product_folder
     from train.common.checkpoints import newest_checkpoint
     from train.on_policy.continuation import (

@@ -16,7 +16,7 @@ from models.student.answer_parser import parse_choice
 from teacher.numbers.detection import find_numbers
 from teacher.predicates.facts import Relation, RelationalPredicates
 from teacher.predicates.relations import VALUES, normalize_relation
-from teacher.reading.grounding import Claim
+from teacher.reading.claims import Claim
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.reasons import CONTRADICTED, SUPPORTED, ResponseReasons, read_response
 

@@ -28,14 +28,14 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
     from models import compat, distributed, loading
     from models.checks import check_adapters
-    from models.lora_kernels import use_fast_layers
-    from models.resolved import data_digest, resolve_run
+    from models.fast_layers import use_fast_layers
+    from models.resolved_settings import data_digest, resolve_run
     from teacher.narrate import ensure_rationales
     from train.common import training_loop
     from train.common.checkpoints import newest_checkpoint
     from train.common.journal import run_metrics
     from train.student.dataset import load_datasets, tokenizer_corpus
-    from train.student.run import build_trainer
+    from train.student.trainer_setup import build_trainer
 
     compat.keep_freed_memory()
     # Check the batch now, because building the benchmark may take long.

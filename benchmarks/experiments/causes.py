@@ -34,7 +34,7 @@ from data.store import Store
 from evaluation.select import limit_items
 from models import loading
 from models.precision import resolve_precision
-from models.resolved import check_base
+from models.resolved_settings import check_base
 from models.student.answer_parser import parse_choice
 from models.student.collator import Collator
 from models.student.generation import generate

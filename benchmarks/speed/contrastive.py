@@ -41,13 +41,13 @@ from data.build import ensure_benchmark
 from data.records import RetrievalQuery
 from data.render.frame_cache import FrameReader
 from models import compat
-from models.lora_kernels import use_fast_layers
+from models.fast_layers import use_fast_layers
 from models.precision import resolve_precision
 from models.retriever import embedder
 from models.retriever.embedder import Retriever
 from train.retriever.batches import QueryBatchSampler
-from train.retriever.run import build_trainer
 from train.retriever.trainer import NUMBER, numbered_rows
+from train.retriever.trainer_setup import build_trainer
 
 TINY = ["retriever=tiny", "train.mini_batch=16", "train.reuse_features=false"]
 

@@ -44,15 +44,15 @@ from conf.schema import SftCommand
 from data.build import ensure_benchmark
 from models import compat, loading
 from models.attention import flash_attention
-from models.lora_kernels import use_fast_layers
+from models.fast_layers import use_fast_layers
 from models.precision import resolve_precision
 from models.student.collator import Collator, encode, pad
 from models.student.prompts import Sample
 from teacher.narrate import ensure_rationales
 from train.student.dataset import load_datasets, tokenizer_corpus
 from train.student.length_sampler import LengthSampler
-from train.student.run import build_trainer
 from train.student.trainer import token_mean
+from train.student.trainer_setup import build_trainer
 
 MALLOC = {
     "MALLOC_MMAP_THRESHOLD_": str(1 << 30),

@@ -19,7 +19,7 @@ from conf.errors import UserError
 from conf.schema import RetrieverConfig
 from data.records import FrameRef, sample_prefix_frames
 from data.render.frame_cache import FrameReader
-from evaluation.embedders.base import Query
+from evaluation.embedders.embedder import Query
 from models.loading import DTYPES, explain_unloadable
 
 EmbedClips = Callable[[list[np.ndarray]], np.ndarray]

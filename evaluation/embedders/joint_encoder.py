@@ -11,8 +11,8 @@ from conf.schema import RetrieverConfig
 from data.parallel import batched
 from data.records import FrameRef
 from data.render.frame_cache import FrameReader
-from evaluation.embedders.base import Encoder, Query
 from evaluation.embedders.cache import pad_rows
+from evaluation.embedders.embedder import Encoder, Query
 from models.compat import keep_freed_memory
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 

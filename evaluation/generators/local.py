@@ -21,7 +21,7 @@ from models import loading
 from models.compat import keep_freed_memory
 from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
 from models.memory import explain_out_of_memory
-from models.resolved import check_base
+from models.resolved_settings import check_base
 from models.student.collator import Collator
 from models.student.generation import generate, sampling_processors
 from models.student.responses import THOUGHT_TAG, response_token_limit

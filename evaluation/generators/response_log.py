@@ -91,7 +91,7 @@ class ResponseLog:
     in the file and are not used. Texts are parsed and scored again when they are read.
 
     Args:
-        settings: By mode, what `evaluation.generators.base.response_settings` returns.
+        settings: By mode, what `evaluation.generators.generator.response_settings` returns.
         subjects: Subjects whose responses are read.
     """
 

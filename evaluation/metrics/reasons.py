@@ -12,7 +12,7 @@ from data.records import SelectionItem
 from evaluation.metrics.intervals import Interval, SceneBootstrap
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.relations import Bounds
-from teacher.reading.grounding import Claim
+from teacher.reading.claims import Claim
 from teacher.validation.reasons import (
     CONTRADICTED,
     PARTS,

@@ -19,8 +19,8 @@ from conf.runs import lock_folder
 from conf.schema import StudentConfig, TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
-from evaluation.embedders.base import Embedder
-from evaluation.generators.base import Generator, response_settings
+from evaluation.embedders.embedder import Embedder
+from evaluation.generators.generator import Generator, response_settings
 from evaluation.generators.response_log import (
     ModelResponse,
     ResponseLog,

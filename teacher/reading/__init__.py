@@ -1,4 +1,5 @@
-"""Reads the claims of a rationale with a fixed vocabulary, and compares them with the predicates.
+"""Reads the claims of a rationale with a fixed list of phrases, and compares them with the
+predicates.
 
 The steps are text -> tags -> clauses -> claims -> verdicts. For "The red cube is near the left.":
 
@@ -10,7 +11,7 @@ The steps are text -> tags -> clauses -> claims -> verdicts. For "The red cube i
    `CandidateReader` (reader, topics) about the candidates.
 3. The methods record claims. Here, the kind is "region", the subject "red metal cube" (if only
    one object is a red cube), and the value "near the left".
-4. `grounding` compares a claim with the predicates at the moment that the clause is about: the
+4. `claims` compares a claim with the predicates at the moment that the clause is about: the
    cut (the last frame that the predicates treat as observed), the target, or between them. The
    verdict is "supported", "contradicted", or "unknown" if the predicates do not tell or if they
    contradict a claim that may have been misread (see `certainty`).

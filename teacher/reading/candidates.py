@@ -4,7 +4,7 @@ and which candidate agrees with the target."""
 from __future__ import annotations
 
 from teacher.predicates.relations import KINDS
-from teacher.reading.grounding import TARGET
+from teacher.reading.claims import TARGET
 from teacher.reading.tagging import BOUNDARIES, RelationPhrase, Tag
 from teacher.reading.topics import TopicReader
 

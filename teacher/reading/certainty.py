@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import dropwhile
 
-from teacher.reading.grounding import Claim
+from teacher.reading.claims import Claim
 from teacher.reading.tagging import BOUNDARIES, Sentence, Tag
 
 PLAIN_WORDS = """
@@ -37,7 +37,8 @@ PAIRED = {"meeting", "course", "close", "time", "close region", "place of either
 """Kinds of claims about a pair of objects."""
 NEEDS_NO_SUBJECT = {"region", "direction", "displaced", "close region", "place of either"}
 """Kinds of claims about an unknown object that are contradicted if they are false of every object
-(`truth` in grounding). "No pair is on a collision course" needs no object and is always certain."""
+(`truth` in `teacher.reading.claims`). "No pair is on a collision course" needs no object and is
+always certain."""
 NAMING = {"lack", "gone", "adds", "extra", "misplace", "no_contact"}
 """Tags before an object that a candidate lacks, adds or displaces."""
 CLOSING = {"stop", "semicolon", "break", "which", "show", "lack", "adds", "extra", "candidate"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET, IndexedPredicates
+from teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET, IndexedPredicates
 from teacher.reading.reader import Names, Reader
 from teacher.reading.tagging import BOUNDARIES, Tag
 

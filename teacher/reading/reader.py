@@ -7,7 +7,7 @@ from collections.abc import Container, Sequence
 
 from teacher.predicates.relations import EXTENTS
 from teacher.reading.certainty import CertaintyCheck
-from teacher.reading.grounding import CUT, EITHER, Claim, IndexedPredicates
+from teacher.reading.claims import CUT, EITHER, Claim, IndexedPredicates
 from teacher.reading.tagging import Noun, RelationPhrase, Sentence, Tag
 
 MAX_OBJECTS = 9

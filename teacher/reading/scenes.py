@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from teacher.predicates.relations import CHANGES, KINDS
-from teacher.reading.grounding import BETWEEN, CUT, EITHER, TARGET
+from teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
 from teacher.reading.pairs import RELATIONS
 from teacher.reading.phrases import COARSE
 from teacher.reading.subjects import SubjectReader

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from teacher.reading.grounding import TARGET, Claim, IndexedPredicates
+from teacher.reading.claims import TARGET, Claim, IndexedPredicates
 from teacher.reading.reader import Names, Reader
 from teacher.reading.tagging import BOUNDARIES, Tag
 

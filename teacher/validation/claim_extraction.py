@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from teacher.predicates.facts import Predicates
 from teacher.reading.candidates import CandidateReader
-from teacher.reading.grounding import CUT, EITHER, TARGET, Claim, IndexedPredicates
+from teacher.reading.claims import CUT, EITHER, TARGET, Claim, IndexedPredicates
 from teacher.reading.scenes import SceneReader
 from teacher.reading.tagging import Sentence, Tag, find_tags
 from teacher.sections import split_sections

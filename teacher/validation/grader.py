@@ -13,7 +13,7 @@ from teacher.deciding import choose_statements
 from teacher.narrator import NARRATOR_VERSION
 from teacher.predicates.facts import RelationalPredicates
 from teacher.prompts import PROMPT_VERSION
-from teacher.reading.grounding import VERDICTS
+from teacher.reading.claims import VERDICTS
 from teacher.sections import GRAMMAR_VERSION
 from teacher.servers.responses import Response
 from teacher.sufficiency import measure_sufficiency

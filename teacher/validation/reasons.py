@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from teacher.predicates.facts import RelationalPredicates
-from teacher.reading.grounding import Claim
+from teacher.reading.claims import Claim
 from teacher.sections import split_sections
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims

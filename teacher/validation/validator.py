@@ -10,7 +10,7 @@ from data.records import LETTERS, SelectionItem
 from teacher.candidate_letters import find_letters
 from teacher.numbers.detection import find_numbers
 from teacher.predicates.facts import Predicates
-from teacher.reading.grounding import Claim
+from teacher.reading.claims import Claim
 from teacher.sections import HEADING, SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 

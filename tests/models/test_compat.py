@@ -19,7 +19,7 @@ from torch import nn
 from transformers import AttentionInterface, AttentionMaskInterface, Trainer, TrainingArguments
 
 from models import attention, compat
-from models.lora_kernels import use_fast_layers
+from models.fast_layers import use_fast_layers
 
 CHANGED = "a library changed this hook; correct models/compat.py or the version bounds:"
 

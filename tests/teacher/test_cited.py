@@ -11,10 +11,10 @@ import pytest
 from conf.schema import TeacherConfig
 from data.records import LETTERS
 from teacher.cited import PREFIXES, CitationError, cited_schema, compose_rationale, list_facts
+from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
 from teacher.predicates.relations import Bounds
 from teacher.prompts import build_messages
-from teacher.rationale_log import read_rationales
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale

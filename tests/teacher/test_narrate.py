@@ -10,8 +10,8 @@ import pytest
 from conf.schema import TeacherConfig
 from conf.schema.servers import RelationBounds
 from data.records import Rationale
+from teacher.journal import Journal, read_rationales
 from teacher.narrate import ensure_rationales, narrate_store
-from teacher.rationale_log import Journal, read_rationales
 from teacher.sections import GRAMMAR, GRAMMAR_VERSION
 from teacher.vocabulary import name_vocabulary
 from tests.teacher import synthetic

@@ -17,8 +17,8 @@ import pytest
 
 from conf.schema import ServeCommand, TeacherConfig
 from teacher import serve
+from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
-from teacher.rationale_log import read_rationales
 from teacher.sections import GRAMMAR_VERSION
 from teacher.server_narrator import request_fields
 from teacher.servers.pool import ServerPool

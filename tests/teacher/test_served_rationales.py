@@ -10,10 +10,10 @@ import pytest
 
 from conf.schema import TeacherConfig
 from teacher.cited import compose_rationale, list_facts
+from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
 from teacher.narrator import write_rationale
 from teacher.prompts import build_messages
-from teacher.rationale_log import read_rationales
 from teacher.vocabulary import choose_vocabulary, describe_item
 from tests.teacher.memory_store import make_store
 from tests.teacher.test_cited import cite_all

@@ -12,7 +12,7 @@ from huggingface_hub import ModelCard, ModelCardData
 from conf.multirun.table import AT_START_SUFFIX
 from conf.schema import ContrastiveCommand, SftCommand
 from models.fingerprints import is_hub_model
-from models.resolved import read_resolved
+from models.resolved_settings import read_resolved
 from train.common.journal import BEST_STEP
 
 
@@ -25,12 +25,9 @@ def model_card(
 ) -> ModelCard:
     """Return the card of an export.
 
-    Args:
-        name: Name of the training run.
-        settings: Settings of the training run.
-        folder: Folder of the training run.
-        format: bf16, fp32 or adapter.
-        measured: What `train.common.merge.compare` returned; empty without a comparison.
+    Args: name: Name of the training run. settings: Settings of the training run. folder: Folder of
+    the training run. format: bf16, fp32 or adapter. measured: What
+    `train.common.output_comparison.compare_outputs` returned; empty without a comparison.
     """
     student = isinstance(settings, SftCommand)
     product = "student" if student else "retriever"

@@ -33,8 +33,8 @@ from train.student.held_out_answers import HeldOutAnswers
 from train.student.lazy_samples import StudentDataset
 from train.student.length_sampler import LengthSampler
 from train.student.metrics import LetterAccuracy
-from train.student.run import student_arguments
 from train.student.trainer import StudentTrainer, TrainerCollator, token_mean
+from train.student.trainer_setup import student_arguments
 
 log = logging.getLogger(__name__)
 

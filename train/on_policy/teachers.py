@@ -16,7 +16,7 @@ from conf.errors import UserError
 from conf.schema import DistillCommand, SftCommand, TeacherServerConfig
 from models import loading
 from models.distributed import rank_device
-from models.resolved import check_base
+from models.resolved_settings import check_base
 from models.student.collator import IGNORED, Collator, Encoded, encode
 from models.student.prompts import Sample
 from models.trained_runs import product_folder, trained_settings

@@ -19,7 +19,7 @@ from models.retriever.embedder import (
     load_retriever,
     load_trained,
 )
-from train.common.merge import ModelOutputs, require_benchmark
+from train.common.output_comparison import ModelOutputs, require_benchmark
 from train.retriever.batches import split_queries
 
 MAX_QUERIES = 64

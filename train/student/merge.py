@@ -13,7 +13,7 @@ from conf.schema import SftCommand
 from models import compat, loading
 from models.student.collator import Collator, letter_ids
 from teacher.narrate import JOURNAL_FILE, ensure_rationales
-from train.common.merge import ModelOutputs, require_benchmark
+from train.common.output_comparison import ModelOutputs, require_benchmark
 from train.student.dataset import load_datasets
 from train.student.lazy_samples import StudentDataset
 from train.student.metrics import LetterAccuracy

@@ -28,8 +28,8 @@ from conf.schema import (
 from data.records import FPS, FRAMES, LETTERS, FrameRef, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from evaluation import retrieve, similarity
-from evaluation.embedders.base import EMBEDDINGS
 from evaluation.embedders.dual_encoder import unit_rows
+from evaluation.embedders.embedder import EMBEDDINGS
 from evaluation.embedders.joint_encoder import load_encoder
 from evaluation.embedders.languagebind import LanguageBindVideo, spread
 from evaluation.metrics.selection import choose_letters, credit_choices

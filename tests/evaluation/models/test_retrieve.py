@@ -20,7 +20,7 @@ from data.render.frame_cache import FrameReader
 from data.store import open_store
 from evaluation import retrieve
 from evaluation.embedders import joint_encoder
-from evaluation.embedders.base import EMBEDDINGS, Embedder, open_embedders
+from evaluation.embedders.embedder import EMBEDDINGS, Embedder, open_embedders
 from models.retriever import embedder
 from tests.evaluation.metrics.reference import matrix_metrics, ranking_metrics
 from tests.evaluation.models.conftest import RETRIEVER, new_run, save_retriever

@@ -16,7 +16,7 @@ from conf.entry import Run
 from conf.schema import SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import FrameReader
 from evaluation import select
-from evaluation.generators.base import item_sample, response_settings
+from evaluation.generators.generator import item_sample, response_settings
 from evaluation.generators.openai_server import ServedModel, restore_thought, served_origin
 from evaluation.generators.response_log import ResponseLog, collect_responses, score_response
 from evaluation.generators.response_schema import instruction, schema

@@ -24,7 +24,7 @@ from conf.schema import (
 )
 from data.store import Store, open_store
 from evaluation import two_stage
-from evaluation.embedders.base import Embedder, open_embedders
+from evaluation.embedders.embedder import Embedder, open_embedders
 from evaluation.embedders.joint_encoder import load_encoder
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.results import retrieval_results

@@ -15,7 +15,7 @@ from conf.files import read_json_lines
 from conf.schema import LoraConfig, SelectCommand, ServerConfig, StudentConfig
 from data.render.frame_cache import FrameReader
 from evaluation import select
-from evaluation.generators.base import item_sample
+from evaluation.generators.generator import item_sample
 from evaluation.generators.openai_server import request_fields
 from evaluation.generators.response_schema import schema
 from models import loading

@@ -16,8 +16,7 @@ from hydra.core.config_store import ConfigStore
 from conf.errors import UserError
 from conf.runs import rank
 from train import contrastive, sft
-from train.student import dataset
-from train.student import run as student_run
+from train.student import dataset, trainer_setup
 
 TRAINERS = {"sft": sft.main, "contrastive": contrastive.main}
 VALIDATION_ITEMS = 3
@@ -63,7 +62,7 @@ def main() -> None:
         if rank() == 0 and run["checkpoint"]:
             shutil.copytree(run["checkpoint"], Path(run["folder"]) / Path(run["checkpoint"]).name)
         if rank() == run["failing_rank"]:
-            student_run.token_mean = fail
+            trainer_setup.token_mean = fail
         sys.argv[1:] = run["overrides"]
         TRAINERS[run["trainer"]]()
 

@@ -21,7 +21,7 @@ from transformers.trainer_callback import TrainerControl, TrainerState
 from conf import trackers
 from conf.entry import Run
 from conf.schema import SelectCommand, SftCommand
-from evaluation.generators.base import item_sample
+from evaluation.generators.generator import item_sample
 from evaluation.generators.local import LocalModel
 from evaluation.generators.response_log import ResponseLog, collect_responses
 from models import compat

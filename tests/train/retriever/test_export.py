@@ -22,13 +22,13 @@ from conf.schema import (
     LoraConfig,
 )
 from models import compat, loading
-from models.resolved import resolve_run
+from models.resolved_settings import resolve_run
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
 from tests.children import run_child
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import export
-from train.common.merge import require_benchmark
+from train.common.output_comparison import require_benchmark
 
 METRICS = {"recall@10_at_start": 0.25, "recall@10": 0.5}
 

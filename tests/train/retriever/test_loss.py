@@ -20,7 +20,7 @@ from torch.nn.functional import cross_entropy, normalize
 from torch.nn.utils.rnn import pad_sequence
 
 from conf.schema import LateConfig, LoraConfig, RetrieverConfig
-from models.lora_kernels import use_fast_layers
+from models.fast_layers import use_fast_layers
 from models.retriever.embedder import (
     Retriever,
     embed,

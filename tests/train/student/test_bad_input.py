@@ -29,11 +29,11 @@ from conf.schema import (
     StudentConfig,
 )
 from evaluation import select
-from models import loading, resolved
+from models import loading, resolved_settings
 from models.retriever import embedder
 from models.tiny_qwen3_vl import build_model
+from teacher.journal import Journal
 from teacher.narrate import JOURNAL_FILE, ensure_rationales
-from teacher.rationale_log import Journal
 from tests.user_errors import raises_user_error
 from train import sft
 from train.common.checkpoints import newest_checkpoint
@@ -84,13 +84,13 @@ def test_adapters_of_another_base_are_refused(
     with raises_user_error("other-base", contains=("64", "128")):
         loading.load_trained(over, "fp32", trained / "student")
     with raises_user_error("other-base", contains=str(trained)):
-        resolved.check_base(trained, over)
+        resolved_settings.check_base(trained, over)
     shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
     with raises_user_error("other-base", contains="checkpoint-1"):
         sft.main.__wrapped__(replace(settings, student=over), Run("run", tmp_path))
     # A base may be moved to another folder.
     shutil.copytree(saved_base, tmp_path / "moved")
-    resolved.check_base(trained, replace(over, model=str(tmp_path / "moved")))
+    resolved_settings.check_base(trained, replace(over, model=str(tmp_path / "moved")))
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from conf.schema import (
 )
 from evaluation import select
 from models import compat, loading
-from models.resolved import resolve_run
+from models.resolved_settings import resolve_run
 from models.student.collator import encode
 from models.student.prompts import selection_sample
 from models.trained_runs import run_title, trained_settings
@@ -37,8 +37,8 @@ from tests.children import run_child
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import export
-from train.common.merge import ModelOutputs, compare
 from train.common.model_card import model_card
+from train.common.output_comparison import ModelOutputs, compare_outputs
 from train.student.merge import StudentMerge
 
 METRICS = {"answer_loss_at_start": 2.5, "answer_loss": 0.375}
@@ -271,14 +271,14 @@ def test_differences_are_relative_to_the_values_or_their_scale() -> None:
 
     before = outputs([3.0, 0.0], [0.0, 4.0])
     after = outputs([3.0, 1.0], [0.0, 4.0], choices=(0, 2))
-    assert compare(before, after) == pytest.approx(
+    assert compare_outputs(before, after) == pytest.approx(
         {"logit_difference": 0.2, "letter_agreement": 0.5}
     )
-    assert compare(before, before) == {"logit_difference": 0.0, "letter_agreement": 1.0}
+    assert compare_outputs(before, before) == {"logit_difference": 0.0, "letter_agreement": 1.0}
     scaled = outputs([3.0, 0.0], [0.0, 4.0], logit=[torch.tensor([2.0])])
-    assert compare(scaled, after)["logit_difference"] == pytest.approx(0.25)
+    assert compare_outputs(scaled, after)["logit_difference"] == pytest.approx(0.25)
     broken = outputs([math.nan, 0.0], [0.0, 4.0])
-    assert math.isnan(compare(before, broken)["logit_difference"])
+    assert math.isnan(compare_outputs(before, broken)["logit_difference"])
 
 
 def set_rank_to_zero(config: Path) -> None:

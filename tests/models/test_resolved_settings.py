@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from conf.schema import RetrieverConfig, StudentConfig
 from models.fingerprints import model_id, pin_revisions
 from models.precision import resolve_precision
-from models.resolved import (
+from models.resolved_settings import (
     RESOLVED,
     check_base,
     data_digest,

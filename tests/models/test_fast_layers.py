@@ -12,7 +12,7 @@ from torch import nn
 
 from conf.schema import LoraConfig
 from models import loading
-from models.lora_kernels import AddedInPlace, PatchProduct, use_fast_layers
+from models.fast_layers import AddedInPlace, PatchProduct, use_fast_layers
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
 from tests.tiny_models import randomize_adapters

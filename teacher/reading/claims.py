@@ -1,4 +1,4 @@
-"""Claims, and their check against the predicates of an item."""
+"""Claims of a rationale, and their verdicts from the predicates of an item."""
 
 from __future__ import annotations
 

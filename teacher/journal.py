@@ -1,4 +1,4 @@
-"""Files of a teacher's responses: a journal of all of them, and a table of accepted rationales."""
+"""The journal of a teacher's responses (rationales.jsonl), and the table of accepted rationales."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from evaluation.metrics.results import UNTRAINED
 from models.checks import check_modules, check_widths
 from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
 from models.precision import resolve_precision
-from models.resolved import check_base
+from models.resolved_settings import check_base
 from models.trained_runs import product_folder, resolve_model, run_title
 
 EMBEDDINGS = "embeddings"

@@ -29,7 +29,7 @@ class ModelOutputs:
     scales: dict[str, list[torch.Tensor]] = field(default_factory=dict)
 
 
-def compare(before: ModelOutputs, after: ModelOutputs) -> dict[str, float]:
+def compare_outputs(before: ModelOutputs, after: ModelOutputs) -> dict[str, float]:
     """Return the root mean square of the differences between values, relative to that of their
     scales (`<name>_difference`), and the share of equal choices (`<name>_agreement`)."""
     measured: dict[str, float] = {}
