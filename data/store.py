@@ -31,7 +31,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -48,6 +48,9 @@ from data.records import (
 from data.render import RENDERERS
 from data.tracks.selection.distractors import BUILDERS_VERSIONS
 from data.world.physics import GENERATOR_VERSION
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 MANIFEST = "manifest.json"
 CHECKED = "checked.json"
@@ -131,13 +134,13 @@ def load_scene(path: Path) -> Scene:
         return Scene(**header, **{name: file[name] for name in Scene.ARRAYS})
 
 
-def save_rows(rows: list[dict[str, Any]], path: Path) -> None:
-    """Write rows as a parquet file."""
+def save_rows(rows: list[dict[str, Any]], path: Path, schema: pa.Schema | None = None) -> None:
+    """Write rows as a parquet file; by default, their types determine its schema."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     sink = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist(rows), sink, compression="zstd")
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema), sink, compression="zstd")
     write_atomically(path, sink.getvalue())
 
 

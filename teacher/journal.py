@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 from collections.abc import Iterable
@@ -14,7 +13,7 @@ from typing import Any
 from conf.errors import UserError
 from conf.runs import wait_for_lock
 from data.records import Rationale
-from data.store import write_atomically
+from data.store import save_rows
 from teacher.sections import SECTIONS
 
 DIGEST = "sha256"
@@ -108,7 +107,6 @@ def read_rationales(path: Path) -> list[Rationale]:
 def save_accepted(rationales: list[Rationale], path: Path) -> None:
     """Write accepted rationales to a parquet file, atomically."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     # All columns but these are text. The counts of claims have no column: a struct needs the same
     # fields in every file, but some kinds of claims may not occur.
@@ -119,7 +117,4 @@ def save_accepted(rationales: list[Rationale], path: Path) -> None:
     types["sections"] = pa.struct([(name, pa.string()) for name in SECTIONS])
     names = [f.name for f in fields(Rationale) if f.name != "claims"]
     schema = pa.schema([(name, types.get(name, pa.string())) for name in names])
-    table = pa.Table.from_pylist([vars(r) for r in rationales], schema=schema)
-    buffer = io.BytesIO()
-    pq.write_table(table, buffer, compression="zstd")
-    write_atomically(path, buffer.getvalue())
+    save_rows([vars(r) for r in rationales], path, schema)

@@ -91,7 +91,7 @@ def read_cases(store: Store) -> Iterator[Case]:
         decision = choose_statements(predicates)
         if not decision.statements:
             continue
-        candidates = [Places.of(store.scene(c.scene_id), c.frame) for c in item.candidates]
+        candidates = [Places.from_frame(store.scene(c.scene_id), c.frame) for c in item.candidates]
         yield Case(item, decision, candidates, predicates.paths)
 
 

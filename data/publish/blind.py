@@ -64,7 +64,7 @@ class BlindModel(nn.Module):
         return self.score(self.across(hidden.reshape(batch, count, -1))).squeeze(-1)
 
 
-def blind_accuracies(
+def score_blind_models(
     items: Sequence[SelectionItem], store: Store, seed: int
 ) -> dict[str, np.ndarray]:
     """Train both blind models, and return for each item of the test split whether they are right.

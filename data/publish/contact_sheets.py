@@ -34,7 +34,7 @@ HEADING_FIELDS = ("framing", "gap", "horizon", "group", "window_family", "diffic
 
 
 @dataclass(frozen=True)
-class Cell:
+class CaptionedFrame:
     """A frame with the lines of its caption."""
 
     image: Image.Image
@@ -47,8 +47,8 @@ class Row:
     """The heading of an item or query, frames of its prefix, and its candidates."""
 
     heading: str
-    prefix: Sequence[Cell]
-    candidates: Sequence[Cell]
+    prefix: Sequence[CaptionedFrame]
+    candidates: Sequence[CaptionedFrame]
 
 
 def draw_sheet(rows: Sequence[Row]) -> bytes:
@@ -115,7 +115,7 @@ class SheetRows:
             )
             caption = f"{_describe_frame(item, candidate)}, {distance:.0f} px from {nearest}"
             source, is_answer = f"{letter}: {candidate.source}", letter == item.letter
-            cells.append(self._cell(candidate, source, caption, is_answer=is_answer))
+            cells.append(self._caption_frame(candidate, source, caption, is_answer=is_answer))
         heading = f"{item.item_id}    {', '.join(details)}\n{item.question}"
         return Row(heading, self._prefix(item), cells)
 
@@ -126,7 +126,7 @@ class SheetRows:
         object, at the target's moment.
         """
         caption = _describe_frame(query, query.target)
-        cells = [self._cell(query.target, "target", caption, is_answer=True)]
+        cells = [self._caption_frame(query.target, "target", caption, is_answer=True)]
         negatives = list(query.hard_negatives)
         if query.removed_object is not None:
             scene = self._store.scene(query.scene_id)
@@ -134,20 +134,22 @@ class SheetRows:
             removed = [o.noun_phrase for o in scene.objects].index(query.removed_object)
             shift = removal_displacement(scene, counterfactual, removed)[query.target.frame]
             caption = f"other objects differ by {shift:.0f} px"
-            cells.insert(0, self._cell(negatives.pop(0), "factual", caption))
+            cells.insert(0, self._caption_frame(negatives.pop(0), "factual", caption))
         for frame in negatives:
             distance = f"{self._displacement(query.target, frame):.0f} px away"
             caption = f"{_describe_frame(query, frame)}, {distance}"
-            cells.append(self._cell(frame, "wrong time", caption))
+            cells.append(self._caption_frame(frame, "wrong time", caption))
         heading = f"{query.query_id}    {query.split}, anchor {query.anchor}\n{query.question}"
         return Row(heading, self._prefix(query), cells)
 
-    def _prefix(self, record: SelectionItem | RetrievalQuery) -> list[Cell]:
+    def _prefix(self, record: SelectionItem | RetrievalQuery) -> list[CaptionedFrame]:
         frames = sample_prefix_frames(record.prefix_start, record.prefix_stop, PREFIX_FRAMES)
-        return [self._cell(FrameRef(record.scene_id, f), f"frame {f}") for f in frames]
+        return [self._caption_frame(FrameRef(record.scene_id, f), f"frame {f}") for f in frames]
 
-    def _cell(self, frame: FrameRef, *caption: str, is_answer: bool = False) -> Cell:
-        return Cell(self._frames.image(frame.scene_id, frame.frame), caption, is_answer)
+    def _caption_frame(
+        self, frame: FrameRef, *caption: str, is_answer: bool = False
+    ) -> CaptionedFrame:
+        return CaptionedFrame(self._frames.image(frame.scene_id, frame.frame), caption, is_answer)
 
     def _displacement(self, first: FrameRef, second: FrameRef) -> float:
         scenes = self._store.scene(first.scene_id), self._store.scene(second.scene_id)

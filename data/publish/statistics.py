@@ -56,17 +56,17 @@ def measure_shortcuts(items: list[SelectionItem], store: Store, blind: bool) -> 
     """Return the accuracy of each shortcut on the items of the test split, by category."""
     blind_right = {}
     if blind:
-        from data.publish.blind import blind_accuracies
+        from data.publish.blind import score_blind_models
 
-        blind_right = blind_accuracies(items, store, store.manifest["seed"])
+        blind_right = score_blind_models(items, store, store.manifest["seed"])
     progress = tqdm(items, desc="scoring shortcuts", unit="item")
     config = store.manifest["config"]
     scores = np.stack([shortcuts.item_scores(item, store.scene, config) for item in progress])
     answers = np.array([item.answer for item in items])
     right = pd.DataFrame(
-        shortcuts.simple_accuracies(scores, answers), columns=list(shortcuts.SIMPLE)
+        shortcuts.score_simple_strategies(scores, answers), columns=list(shortcuts.SIMPLE)
     )
-    right[LOGISTIC] = shortcuts.logistic_accuracies(items, scores, answers)
+    right[LOGISTIC] = shortcuts.score_logistic_model(items, scores, answers)
     for name, values in blind_right.items():
         right[name] = values
     right["category"] = [list(_categories(item)) for item in items]

@@ -37,8 +37,8 @@ from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota, named_rng, shuffle_candidates
 from data.tracks.retrieval import counterfactual, future
 from data.tracks.selection import event, time, window
+from data.tracks.selection.balanced_subset import RESERVE, choose_items
 from data.tracks.selection.distractors import BUILDERS_VERSIONS, Family, Timing
-from data.tracks.selection.pooling import add_reserve, choose_items
 from data.tracks.shortcuts import item_scores, order_target_first
 from data.world.physics import GENERATOR_VERSION
 
@@ -180,10 +180,12 @@ def builder_name(builder: int | None) -> str:
 
 def _with_reserve(cfg: BenchmarkConfig, name: str, quota: Quota) -> Quota:
     """Return how many items or queries a job makes, of which those of the quota are chosen."""
+    factor = 1.0
     if _is_query_cell(name):
-        return Quota(*(math.ceil(QUERY_RESERVE * n) for n in astuple(quota)))
-    is_balanced = cfg.distractors == "balanced" and name != MATCHED_ANCHOR
-    return add_reserve(quota) if is_balanced else quota
+        factor = QUERY_RESERVE
+    elif cfg.distractors == "balanced" and name != MATCHED_ANCHOR:
+        factor = RESERVE
+    return Quota(*(math.ceil(factor * n) for n in astuple(quota)))
 
 
 def _is_query_cell(name: str) -> bool:

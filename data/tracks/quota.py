@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from data.records import SPLITS, Scene, SelectionItem
-from data.tracks.selection.balanced import BalancedPicker, Picker
+from data.tracks.selection.balanced_items import BalancedPicker, Picker
 from data.tracks.selection.distractors import DistractorPicker, Family
 
 if TYPE_CHECKING:

@@ -1,8 +1,8 @@
 """Shortcuts: strategies that answer selection items without predicting the motion.
 
 A simple strategy chooses the candidate with the lowest or the highest value of one score (see
-`data.tracks.selection.balance.SCORES`). A logistic model combines all scores; it is trained on the
-items of the training split, for each family.
+`data.tracks.selection.shortcut_scores.SCORES`). A logistic model combines all scores; it is trained
+on the items of the training split, for each family.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from PIL import Image
 
 from data.records import FrameRef, Scene, SelectionItem
 from data.render.frame_cache import render_frames
-from data.tracks.selection.balance import (
+from data.tracks.selection.balanced_items import IMAGE_SIZE
+from data.tracks.selection.shortcut_scores import (
     SCORES,
     CandidateFrames,
     compare_candidates,
     rank_shares,
 )
-from data.tracks.selection.balanced import IMAGE_SIZE
 
 SIMPLE = tuple(f"{score}, {end}" for score in SCORES for end in ("lowest", "highest"))
 """Names of the simple strategies."""
@@ -41,7 +41,7 @@ def item_scores(
     frames = [FrameRef(item.scene_id, item.prefix_stop), *item.candidates]
     states = [(scene_of(f.scene_id), f.frame) for f in frames]
     images = np.stack([_small_image(*state, config) for state in states])
-    compared = CandidateFrames.of(states, [f.frame for f in frames], images)
+    compared = CandidateFrames.compare(states, [f.frame for f in frames], images)
     return compared.scores(np.array([[1, 2, 3, 4]]))[:, 0]
 
 
@@ -55,8 +55,9 @@ def _small_image(scene: Scene, frame: int, config: Mapping[str, Any]) -> np.ndar
     return np.asarray(Image.fromarray(pixels).resize(IMAGE_SIZE))
 
 
-def simple_accuracies(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
-    """Return for each item how right each simple strategy is, (N, 2 S).
+def score_simple_strategies(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Return the score of each simple strategy on each item, (N, 2 S): 1 if it chooses the target,
+    otherwise 0.
 
     If the target is among m candidates with the best score, the strategy scores 1 / m.
 
@@ -99,7 +100,7 @@ def fit_logistic(features: np.ndarray, answers: np.ndarray) -> np.ndarray:
     return minimize(loss, np.zeros(features.shape[-1]), jac=True, method="L-BFGS-B").x
 
 
-def logistic_accuracies(
+def score_logistic_model(
     items: Sequence[SelectionItem], scores: np.ndarray, answers: np.ndarray
 ) -> np.ndarray:
     """Return for each item whether the logistic model of its family is right, (N,): NaN for items

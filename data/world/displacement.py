@@ -10,7 +10,7 @@ from data.records import Scene, SceneObject
 from data.world.visibility import is_hidden
 
 MODEL_SIZE = 336
-"""Side in px of the square image in which displacements are measured."""
+"""Side (px) of the square image in which displacements are measured: the models' input size."""
 DIAGONAL = MODEL_SIZE * 2**0.5
 
 

@@ -38,11 +38,11 @@ STARTS = {"slide": slide, "throw": throw, "strike": strike}
 """Functions that sample the initial states of objects, by `start.kind` of the world."""
 ATTEMPTS = 300
 """Number of samples after which a world is refused because none was suitable."""
-NEAREST = 0.3
+MIN_PART_DEPTH = 0.3
 """Minimum depth (simulator units) of a part, which the renderer cannot clip."""
-DEEPEST = -0.05
-"""Height (simulator units) of the lowest corner that a part may have."""
-LOWEST = -0.1
+MIN_CORNER_HEIGHT = -0.05
+"""Minimum height (simulator units) of a part's corners."""
+MIN_CENTRE_HEIGHT = -0.1
 """Height (simulator units) below which a centre has fallen through the floor."""
 
 TOO_MANY = "objects collide too often"
@@ -100,13 +100,13 @@ def check_view(world: WorldConfig, camera: Camera) -> None:
             code="impossible-world",
         )
     for name, box in zip(world.parts, world_boxes(world), strict=True):
-        if camera.project(box.corners)[1].min() < NEAREST:
+        if camera.project(box.corners)[1].min() < MIN_PART_DEPTH:
             raise UserError(
                 f"world {world.name}: benchmark.world.parts.{name} is not entirely in front of the "
                 "camera: move it or the camera",
                 code="impossible-world",
             )
-        if (lowest := box.corners[:, 2].min()) < DEEPEST:
+        if (lowest := box.corners[:, 2].min()) < MIN_CORNER_HEIGHT:
             raise UserError(
                 f"world {world.name}: benchmark.world.parts.{name} reaches {-lowest:.2f} below the "
                 "floor, where it would be drawn over it: raise the z of its position",
@@ -132,7 +132,7 @@ def check_sample(sample: Sample, world: WorldConfig) -> None:
         raise RejectedError(OVERLAP)
     # Objects that fall through the floor often miss all others, so that this is checked before the
     # collisions. NaN counts as fallen.
-    if not (motion.positions[..., 2] > LOWEST).all():
+    if not (motion.positions[..., 2] > MIN_CENTRE_HEIGHT).all():
         raise RejectedError(FALLEN)
     if not motion.collisions:
         raise RejectedError(NO_COLLISION)

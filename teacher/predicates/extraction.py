@@ -8,6 +8,7 @@ from math import dist
 import numpy as np
 
 from data.records import LETTERS, Candidate, Scene, SelectionItem
+from data.world.displacement import MODEL_SIZE
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
@@ -28,7 +29,6 @@ from teacher.predicates.motion import (
     object_speed,
 )
 from teacher.predicates.places import (
-    IMAGE_SIZE,
     close_pairs,
     compass_direction,
     object_region,
@@ -124,7 +124,7 @@ def _describe_views(
 ) -> tuple[tuple[Relation, ...], dict[str, float], tuple[View, ...]]:
     """Return the relations at the cut, the paths of the objects, and the views of the
     candidates."""
-    earlier = Places.of(scene, cut)
+    earlier = Places.from_frame(scene, cut)
     views = []
     for letter, candidate in zip(LETTERS, item.candidates, strict=True):
         other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
@@ -133,7 +133,7 @@ def _describe_views(
             _object_facts(scene, k, cut, other, index.get(key), candidate.frame)
             for k, key in enumerate(scene.object_keys)
         )
-        later = Places.of(other, candidate.frame)
+        later = Places.from_frame(other, candidate.frame)
         at_rest = {o.object for o in objects if o.extent == "stays"}
         relations = find_relations(later, bounds)
         relations |= find_changes(earlier, later, at_rest, bounds)
@@ -205,7 +205,7 @@ def _candidate_facts(
         visible = j is not None and object_sight(other, frame, j) == "shown"
         if expected != visible:
             difference = Difference(name, "missing" if expected else "extra")
-            ranked.append(((True, True, float(IMAGE_SIZE)), difference))
+            ranked.append(((True, True, float(MODEL_SIZE)), difference))
         elif i is not None and j is not None:
             shift = square_position(other, frame, j) - square_position(scene, target, i)
             distance = float(np.hypot(*shift))

@@ -5,15 +5,20 @@ from __future__ import annotations
 from math import dist, inf
 
 from teacher.predicates.facts import REGIONS, Relation
-from teacher.predicates.relations import VALUES, Bounds, Places, between_margin
+from teacher.predicates.relations import (
+    EXTREMES,
+    VALUES,
+    Bounds,
+    Places,
+    between_margin,
+    find_covering,
+)
 
 FAINT = 0.01
 """Margin of a statement that is true or false because an object is hidden or missing. It is assumed
 to be small: a reader may overlook this, or take another object for the missing one."""
-CELLS = {value: (x, y) for y, row in enumerate(REGIONS) for x, value in enumerate(row)}
+REGION_INDICES = {value: (x, y) for y, row in enumerate(REGIONS) for x, value in enumerate(row)}
 """Column and row of each region."""
-EXTREMES = {"leftmost": (0, 1), "rightmost": (0, -1), "topmost": (1, 1), "lowest": (1, -1)}
-"""Axis and sign that make the smallest coordinate that of the extreme object."""
 
 
 def measure_margin(statement: Relation, places: Places, bounds: Bounds) -> float:
@@ -55,7 +60,7 @@ def measure_margin(statement: Relation, places: Places, bounds: Bounds) -> float
 def _region_margin(place: tuple[float, float], region: str) -> float:
     """Return the distance from the nearest side of the region's cell; the image's edge is none."""
     distances = []
-    for coordinate, cell in zip(place, CELLS[region], strict=True):
+    for coordinate, cell in zip(place, REGION_INDICES[region], strict=True):
         distances += [
             coordinate - cell / 3 if cell > 0 else inf,
             (cell + 1) / 3 - coordinate if cell < 2 else inf,
@@ -101,10 +106,8 @@ def _nearer_margin(a: str, b: str, c: str, value: str, places: Places, bounds: B
 
 
 def _cover_margin(a: str, b: str, value: str, places: Places, bounds: Bounds) -> float:
-    front, back = (a, b) if value == "in front of" else (b, a)
-    lower = places.image[front][1] > places.image[back][1]
-    is_close = dist(places.image[a], places.image[b]) < bounds.cover_distance
-    return FAINT if lower and is_close and places.fraction[back] < bounds.covered else -FAINT
+    front = a if value == "in front of" else b
+    return FAINT if find_covering(places, a, b, bounds) == front else -FAINT
 
 
 def _image_scale(places: Places, *pairs: tuple[str, str]) -> float:

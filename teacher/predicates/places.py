@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data.records import Scene
+from data.world.displacement import MODEL_SIZE
 from data.world.visibility import MIN_VISIBLE
 from teacher.predicates.facts import COMPASS, OUT_OF_VIEW, REGIONS, Closeness
 
-IMAGE_SIZE = 336
-"""Side (px) of the square image in which displacements are measured: the models' input size."""
 CONTACT = 0.4
 """Ground-plane distance (simulator units) at which two objects of scale 1 touch; it grows with the
 mean scale of the objects."""
@@ -49,7 +48,7 @@ def region_at(place: ArrayLike) -> str:
 
 def square_position(scene: Scene, frame: int, index: int) -> np.ndarray:
     """Return the center (x, y) of an object in px of the square image."""
-    return scene.image_positions[frame, index] * IMAGE_SIZE / np.asarray(scene.image_size)
+    return scene.image_positions[frame, index] * MODEL_SIZE / np.asarray(scene.image_size)
 
 
 def object_sight(scene: Scene, frame: int, index: int) -> str:

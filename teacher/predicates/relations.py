@@ -27,14 +27,19 @@ from math import hypot, inf
 from typing import NamedTuple
 
 from data.records import Scene
+from data.world.displacement import MODEL_SIZE
 from teacher.predicates.facts import Relation
-from teacher.predicates.places import CONTACT, IMAGE_SIZE, object_sight
+from teacher.predicates.places import CONTACT, object_sight
 
 OPPOSITES = {
     "left of": "right of", "above": "below", "in front of": "behind",
 }  # fmt: skip
 OPPOSITES |= {value: key for key, value in OPPOSITES.items()}
 """The value of a relation of two objects if they change places; other values stay."""
+EDGES = ("left", "right", "top", "bottom")
+EXTREMES = {"leftmost": (0, 1), "rightmost": (0, -1), "topmost": (1, 1), "lowest": (1, -1)}
+"""Axis of each extreme, and the sign with which the coordinate of the extreme object is the
+smallest."""
 VALUES = {
     "side": ("left of", "aligned with", "right of"),
     "height": ("above", "level with", "below"),
@@ -42,10 +47,10 @@ VALUES = {
     "cover": ("in front of", "behind"),
     "between": ("between",),
     "nearer": ("nearer to", "as near to"),
-    "extreme": ("leftmost", "rightmost", "topmost", "lowest"),
+    "extreme": tuple(EXTREMES),
     "passing": ("moves past", "crosses in front of", "crosses behind"),
     "arrival": ("comes between",),
-    "edge": tuple(f"reaches the {edge} edge" for edge in ("left", "right", "top", "bottom")),
+    "edge": tuple(f"reaches the {edge} edge" for edge in EDGES),
 }
 """The values of each kind of relation."""
 KINDS = {value: kind for kind, values in VALUES.items() for value in values}
@@ -54,7 +59,6 @@ CHANGES = ("passing", "arrival", "edge")
 """Kinds of relations that describe a change from the cut to the target."""
 SYMMETRIC = {"side", "height", "gap", "cover"}
 """Kinds that are true of two objects in either order, with the opposite value."""
-EDGES = ("left", "right", "top", "bottom")
 EXTENTS = ("slightly", "clearly", "far")
 """How far off an object is in a candidate."""
 DISPLACED, CLEARLY = 12.0, 40.0
@@ -88,10 +92,10 @@ class Bounds(NamedTuple):
     edge: float = 0.06
     """Distance from the image's edge, as a share of its width or height, below which an object has
     reached the edge."""
-    displaced: float = DISPLACED / IMAGE_SIZE
+    displaced: float = DISPLACED / MODEL_SIZE
     """Distance of an object in a candidate from its place at the target, as a share of the image,
     from which it is "slightly off"."""
-    clearly: float = CLEARLY / IMAGE_SIZE
+    clearly: float = CLEARLY / MODEL_SIZE
     """Distance, as above, from which it is "clearly off"."""
     far: float = 0.25
     """Distance, as above, from which it is "far off"."""
@@ -153,7 +157,7 @@ class Places(NamedTuple):
     fraction: dict[str, float]
 
     @classmethod
-    def of(cls, scene: Scene, frame: int) -> Places:
+    def from_frame(cls, scene: Scene, frame: int) -> Places:
         """Return the places of the visible objects of a frame."""
         image = (scene.image_positions[frame] / scene.image_size).tolist()
         ground = (scene.positions[frame, :, :2] / CONTACT).tolist()
@@ -191,7 +195,7 @@ def find_relations(places: Places, bounds: Bounds) -> set[Relation]:
             Relation("height", (a, b), height),
             Relation("gap", (a, b), closeness if gap < bounds.near else "apart from"),
         }
-        if (covering := _covering(places, a, b, bounds)) is not None:
+        if (covering := find_covering(places, a, b, bounds)) is not None:
             value = "in front of" if covering == a else "behind"
             found.add(Relation("cover", (a, b), value))
     for a in names:
@@ -249,7 +253,7 @@ def _compare(one: float, other: float, bound: float, words: tuple[str, str, str]
     return words[0] if one < other else words[2]
 
 
-def _covering(places: Places, a: str, b: str, bounds: Bounds) -> str | None:
+def find_covering(places: Places, a: str, b: str, bounds: Bounds) -> str | None:
     """Return which of two objects hides a part of the other; None if neither does.
 
     An object lower in the image is nearer to the camera.
@@ -281,7 +285,7 @@ def between_margin(
 def _find_extremes(image: Mapping[str, tuple[float, float]], bounds: Bounds) -> Iterator[Relation]:
     if len(image) < 2:
         return
-    for value, axis, sign in zip(VALUES["extreme"], (0, 0, 1, 1), (1, -1, 1, -1), strict=True):
+    for value, (axis, sign) in EXTREMES.items():
         first, second, *_ = sorted((sign * place[axis], name) for name, place in image.items())
         if second[0] - first[0] >= bounds.level:
             yield Relation("extreme", (first[1],), value)

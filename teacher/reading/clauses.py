@@ -65,7 +65,7 @@ class ClauseReader(PairReader):
         self._cross_boundary()
 
     def end(self) -> None:
-        self.end_relation()
+        self.end_pair_event()
         if [tag.name for tag in self.sentence.tags[-2:]] == ["not", "stop"]:
             # "They look set to meet, but they do not."
             self.claims = [c for c in self.claims if c.kind != "meeting"]
@@ -79,7 +79,7 @@ class ClauseReader(PairReader):
 
     def on_comma(self, tag: Tag) -> None:
         if not self.is_incomplete():
-            self.end_relation()
+            self.end_pair_event()
             # "Neither the cube, which moves, nor the sphere": a denied claim about both follows.
             self.hypothetical |= self.has_neither and self.has_which
             self._cross_boundary()
@@ -91,7 +91,7 @@ class ClauseReader(PairReader):
                 self._open_clause()
 
     def on_semicolon(self, tag: Tag) -> None:
-        self.end_relation()
+        self.end_pair_event()
         self._cross_boundary()
         self.has_verb = bool(self.subjects)
         self._open_clause()
@@ -100,7 +100,7 @@ class ClauseReader(PairReader):
 
     def on_and(self, tag: Tag) -> None:
         if not self.is_incomplete():
-            self.end_relation()
+            self.end_pair_event()
             self.negated = self.describes_path = False
             self.after_boundary = True
             # "Near the left and near the right, the red cube ..." continues a list.

@@ -39,5 +39,5 @@ def _read_phrases() -> dict[str, list[Phrase]]:
     return {first: sorted(found, key=lambda p: -len(p[0])) for first, found in phrases.items()}
 
 
-VOCABULARY = _read_phrases()
+PHRASES_BY_FIRST_WORD = _read_phrases()
 """All phrases by their first word, the longest first."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from teacher.predicates.relations import CHANGES, KINDS
 from teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
-from teacher.reading.pairs import RELATIONS
+from teacher.reading.pairs import PAIR_TAGS
 from teacher.reading.phrases import COARSE
 from teacher.reading.subjects import SubjectReader
 from teacher.reading.tagging import BOUNDARIES, COLUMNS, MIDDLE, ROWS, RelationPhrase, Tag
@@ -23,10 +23,10 @@ class SceneReader(SubjectReader):
     """Reads sentences about the scene, and records claims about the subject of each clause."""
 
     def on_region(self, tag: Tag, when: str = "") -> None:
-        relation = self.relation
-        if relation:
-            if relation.kind == "close":
-                self.add_close_region(relation, tag)
+        event = self.pair_event
+        if event:
+            if event.kind == "close":
+                self.add_close_region(event, tag)
             return
         previous, following = self.near(-1).name, self.near(1).name
         if self.negated and self._is_kept(tag):
@@ -74,7 +74,7 @@ class SceneReader(SubjectReader):
         return self.near(1).name == "past" or self.near(1).words == "before"
 
     def on_relation(self, tag: Tag) -> None:
-        if self.relation:
+        if self.pair_event:
             return
         phrase = tag.value
         assert isinstance(phrase, RelationPhrase)
@@ -102,7 +102,7 @@ class SceneReader(SubjectReader):
 
     def on_direction(self, tag: Tag) -> None:
         previous, following = self.near(-1), self.near(1)
-        if self.relation or previous.words == "from" or following.words in ("of", "from"):
+        if self.pair_event or previous.words == "from" or following.words in ("of", "from"):
             return
         if self.negated and previous.name not in DENYING:
             return
@@ -118,7 +118,7 @@ class SceneReader(SubjectReader):
         moving = self.mentions_motion or following in ("moves", "moving", "across")
         # "The red cube is quick."
         moving |= self.near(-1).name == "be" and following in BOUNDARIES
-        if not moving or self.relation or following in RELATIONS:
+        if not moving or self.pair_event or following in PAIR_TAGS:
             return
         self.add_claim("speed", str(tag.value), not self.negated, CUT, tag)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from teacher.reading.clauses import ClauseReader
-from teacher.reading.pairs import RELATIONS
+from teacher.reading.pairs import PAIR_TAGS
 from teacher.reading.reader import MAX_OBJECTS, Names
 from teacher.reading.tagging import BOUNDARIES, Tag
 
@@ -24,10 +24,10 @@ class SubjectReader(ClauseReader):
 
     def on_object(self, tag: Tag) -> None:
         previous = self.near(-1)
-        relation = self.relation
-        if relation and self.is_incomplete():
+        event = self.pair_event
+        if event and self.is_incomplete():
             names = self.read_list(2)
-            relation.partners += names
+            event.partners += names
             self.antecedents = names[-1:]
             return
         if self._is_complement(previous):
@@ -35,7 +35,7 @@ class SubjectReader(ClauseReader):
             return
         self.had_verb |= self.has_verb
         if self._is_relative(previous):
-            self.end_relation()
+            self.end_pair_event()
             self.antecedents = self.read_list()
             self.in_where_clause = previous.name != "which"
             # In "the red cube, which the blue sphere hits", either may be the subject.
@@ -52,8 +52,8 @@ class SubjectReader(ClauseReader):
         self.antecedents = names[-1:]
         self.in_with_phrase = previous.name == "with"
         self.complement = self.is_pronoun = self.gapped = False
-        if relation and not relation.subjects:
-            relation.subjects = subjects
+        if event and not event.subjects:
+            event.subjects = subjects
         # "Near the top, the cube and the sphere are close" states the place of the pair only.
         end = self.next_of({"comma", "semicolon", "break", "stop", "close"})
         self._apply_pending(places=end.name != "close")
@@ -90,7 +90,7 @@ class SubjectReader(ClauseReader):
         return previous.name in BEFORE_COMPLEMENT or previous.words in ASIDE
 
     def _read_complement(self) -> None:
-        """Read a noun phrase that is not the subject, such as the partners of a relation."""
+        """Read a noun phrase that is not the subject, such as the partners of a pair event."""
         start, previous = self.cursor, self.near(-1)
         # "Meets the red cube, and the sphere ...": the sphere begins a clause.
         names = self.read_list(1 if self._is_clause_next() else MAX_OBJECTS)
@@ -98,8 +98,8 @@ class SubjectReader(ClauseReader):
             # "Meets the red cube and the sphere stays": the sphere is a new subject.
             self.cursor = start
             names = self.read_list(1)
-        if self.relation and not self.relation.partners:
-            self.relation.partners = names
+        if self.pair_event and not self.pair_event.partners:
+            self.pair_event.partners = names
         elif previous.name == "with":
             self.companions = names
         if previous.name != "contrast":
@@ -109,7 +109,7 @@ class SubjectReader(ClauseReader):
     def on_which(self, tag: Tag) -> None:
         self.has_which = True
         if self.near(-1).name == "object" or self.near(-2).name == "object":
-            self.end_relation()
+            self.end_pair_event()
             listed = self.subjects[self.list_start :]
             several = len(listed) > 1 and not self.complement
             if several and self.near(1).words in ("both", "are"):
@@ -165,19 +165,19 @@ class SubjectReader(ClauseReader):
         return bool(opening & {"break", "maybe", "by"}) and "object" not in opening
 
     def _read_pronoun_complement(self, previous: Tag) -> None:
-        """Read a pronoun that is not a subject, such as the partner of a relation."""
-        relation = self.relation
+        """Read a pronoun that is not a subject, such as the partner of a pair event."""
+        event = self.pair_event
         self.complement = True
-        if relation and not relation.partners:
-            relation.partners = [None]
+        if event and not event.partners:
+            event.partners = [None]
             if previous.name == "between":
                 pair = self.find_both()
-                relation.partners = pair if len(pair) == 2 else [None, None]
+                event.partners = pair if len(pair) == 2 else [None, None]
 
     def on_unnamed(self, tag: Tag) -> None:
         if self._is_complement(self.near(-1)):
-            if self.relation:
-                self.relation.partners = [None]
+            if self.pair_event:
+                self.pair_event.partners = [None]
             return
         if tag.words.endswith("scene") and self.near(-1).name in ("word", "across", "moves"):
             # "Has crossed the scene": the scene is not an object.
@@ -197,8 +197,8 @@ class SubjectReader(ClauseReader):
     on_no_other = on_unnamed
 
     def on_none(self, tag: Tag) -> None:
-        if self.near(-1).name in RELATIONS | {"by", "with"}:
-            self.relation = None
+        if self.near(-1).name in PAIR_TAGS | {"by", "with"}:
+            self.pair_event = None
             return
         self.subjects, self.denied_subject, self.has_verb, self.pending = [], True, False, []
 

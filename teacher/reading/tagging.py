@@ -14,7 +14,7 @@ from typing import NamedTuple
 from data.records import COLORS, LETTERS, MATERIALS, SHAPES
 from teacher.predicates.facts import REGIONS
 from teacher.predicates.relations import KINDS
-from teacher.reading.phrases import COARSE, VOCABULARY
+from teacher.reading.phrases import COARSE, PHRASES_BY_FIRST_WORD
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")
 ARTICLES = {"the", "a", "an", "its", "their", "that", "this", "some", "any", "another", "such"}
@@ -223,7 +223,7 @@ def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
         return found
     if word in REGION_STARTS and (found := _find_region(words, i)):
         return found
-    for phrase, name, value in VOCABULARY.get(word, ()):
+    for phrase, name, value in PHRASES_BY_FIRST_WORD.get(word, ()):
         if tuple(words[i : i + len(phrase)]) == phrase:
             if phrase[-1] == "right" and words[i + len(phrase)] in ("of", "against"):
                 # "Is right of the red cube" does not say that something is right.

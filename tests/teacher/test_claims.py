@@ -26,7 +26,7 @@ from benchmarks.experiments.mutations import (
 from conf.schema import TeacherConfig
 from teacher.narrator import write_rationale
 from teacher.predicates.relations import Bounds, describe_distance
-from teacher.reading.phrases import VOCABULARY
+from teacher.reading.phrases import PHRASES_BY_FIRST_WORD
 from teacher.sections import SECTIONS
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
@@ -205,7 +205,7 @@ def test_false_relation_is_contradicted(rationales, kind):
 def test_extraction_never_raises_and_is_deterministic():
     rng = Random(0)
     words = [
-        *VOCABULARY,
+        *PHRASES_BY_FIRST_WORD,
         RED,
         BLUE,
         "the red cube",

@@ -159,7 +159,7 @@ def test_changes_of_an_object_that_passes_another() -> None:
 
 def random_places(seed: int) -> Places:
     scene = synthetic.random_scene(np.random.default_rng(seed))
-    return Places.of(scene, 60)
+    return Places.from_frame(scene, 60)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -192,8 +192,8 @@ def test_relations_are_normalized_and_orders_are_total(seed: int) -> None:
 def test_objects_that_look_alike_have_no_relations() -> None:
     scene = synthetic.scene([(0, 0), (0.5, 0.5), (-0.5, 0.3)], [(0, 0)] * 3)
     twins = replace(scene, objects=(scene.objects[0], scene.objects[0], scene.objects[2]))
-    assert len(Places.of(scene, 0).image) == 3
-    assert list(Places.of(twins, 0).image) == [scene.objects[2].noun_phrase]
+    assert len(Places.from_frame(scene, 0).image) == 3
+    assert list(Places.from_frame(twins, 0).image) == [scene.objects[2].noun_phrase]
 
 
 def test_bounds_of_words_are_settings() -> None:

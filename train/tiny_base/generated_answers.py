@@ -91,8 +91,9 @@ def _read_outcome(
     if question.instead is not None:
         shown[item.answer] = question.instead
     scene = sampler.frames.scene
-    target = Places.of(scene(item.scene_id), item.target_frame).image.get(outcome["name"])
-    places = [Places.of(scene(c.scene_id), c.frame).image.get(outcome["name"]) for c in shown]
+    name = outcome["name"]
+    target = Places.from_frame(scene(item.scene_id), item.target_frame).image.get(name)
+    places = [Places.from_frame(scene(c.scene_id), c.frame).image.get(name) for c in shown]
     distances = [dist(target, place) if target and place else inf for place in places]
     chosen = distances[LETTERS.index(outcome["letter"])] if outcome["letter"] in LETTERS else inf
     return [("outcome", True), ("choice", chosen == min(distances) < inf)]

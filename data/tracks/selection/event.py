@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from data.records import Candidate, Scene, SelectionItem
-from data.tracks.selection.balanced import Picker
+from data.tracks.selection.balanced_items import Picker
 from data.tracks.selection.distractors import (
     Family,
     Pool,

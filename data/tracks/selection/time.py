@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from data.records import SELECTION_SECOND, Scene, SelectionItem
-from data.tracks.selection.balanced import Picker
+from data.tracks.selection.balanced_items import Picker
 from data.tracks.selection.distractors import (
     Family,
     Pool,

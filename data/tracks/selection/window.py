@@ -17,7 +17,7 @@ import numpy as np
 
 from conf.schema.benchmark import WINDOW_DIFFICULTIES, WINDOW_FAMILIES, WINDOW_HORIZONS
 from data.records import Scene, SelectionItem
-from data.tracks.selection.balanced import Picker
+from data.tracks.selection.balanced_items import Picker
 from data.tracks.selection.distractors import (
     Family,
     Pool,

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from data.publish import blind
-from data.publish.blind import BlindModel, blind_accuracies, encode_items, is_right, train_model
+from data.publish.blind import BlindModel, encode_items, is_right, score_blind_models, train_model
 from data.publish.statistics import measure_shortcuts
 from data.render.frame_cache import render_frames
 from data.store import Store
@@ -71,7 +71,7 @@ def test_statistics_report_blind_models(
     items = micro_store.selection()
     items = [i for split in ("train", "test") for i in [i for i in items if i.split == split][:8]]
     table = measure_shortcuts(items, micro_store, blind=True)
-    first = blind_accuracies(items, micro_store, seed=0)
+    first = score_blind_models(items, micro_store, seed=0)
     for name, right in first.items():
         assert np.isnan(right).tolist() == [item.split == "train" for item in items]
         counted = (table[name] * table["items"])[["event", "time", "window"]].sum()
@@ -81,4 +81,4 @@ def test_statistics_report_blind_models(
 def test_split_without_items_is_refused(micro_store: Store) -> None:
     items = [item for item in micro_store.selection() if item.split == "test"]
     with raises_user_error("empty-split", contains="both splits"):
-        blind_accuracies(items, micro_store, seed=0)
+        score_blind_models(items, micro_store, seed=0)

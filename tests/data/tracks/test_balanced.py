@@ -17,8 +17,8 @@ from data.parallel import Workers
 from data.records import ALTERNATIVE, SelectionItem, original_scene_id
 from data.store import Store, built_files
 from data.tracks.quota import shuffle_candidates
-from data.tracks.selection import balanced
-from data.tracks.selection.pooling import choose_items
+from data.tracks.selection import balanced_items
+from data.tracks.selection.balanced_subset import choose_items
 from data.tracks.shortcuts import (
     item_scores,
     order_target_first,
@@ -154,12 +154,14 @@ def test_candidates_differ_visibly(store: Store, items: list[SelectionItem]) -> 
 def test_hard_distractors_are_nearer_to_the_target_than_easy_ones() -> None:
     places = np.random.default_rng(0).uniform(0, 100, (14, 2))
     displacement = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    choices = balanced._choices(moments=1, futures=12)
-    halves = [balanced._of_difficulty(choices, displacement, nearest) for nearest in (True, False)]
+    choices = balanced_items._choices(moments=1, futures=12)
+    halves = [
+        balanced_items._of_difficulty(choices, displacement, nearest) for nearest in (True, False)
+    ]
     near, far = (displacement[1, half[:, 1:]].max(axis=-1) for half in halves)
     assert near.max() <= far.min()
     assert len(near) == len(far) == len(choices) / 2
-    assert balanced._of_difficulty(choices, displacement, None) is choices
+    assert balanced_items._of_difficulty(choices, displacement, None) is choices
 
 
 @pytest.mark.slow

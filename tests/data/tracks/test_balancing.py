@@ -6,7 +6,8 @@ from collections import Counter
 
 import numpy as np
 
-from data.tracks.selection.balance import (
+from data.tracks.selection.balanced_subset import choose_items, item_deviations
+from data.tracks.selection.shortcut_scores import (
     LIMIT,
     SCORES,
     TOLERANCE,
@@ -14,11 +15,10 @@ from data.tracks.selection.balance import (
     compare_candidates,
     rank_shares,
 )
-from data.tracks.selection.pooling import choose_items, item_deviations
 from data.tracks.shortcuts import (
     fit_logistic,
-    logistic_accuracies,
-    simple_accuracies,
+    score_logistic_model,
+    score_simple_strategies,
 )
 
 
@@ -90,7 +90,7 @@ def test_choice_from_a_pool_fills_quotas_and_removes_a_joint_shortcut() -> None:
 def test_simple_strategies_score_shares_of_ties() -> None:
     scores = np.zeros((2, len(SCORES), 4))
     scores[:, 0] = [3.0, 1.0, 2.0, 2.0]
-    right = simple_accuracies(scores, np.array([1, 0]))
+    right = score_simple_strategies(scores, np.array([1, 0]))
     np.testing.assert_allclose(right[:, :2], [[1, 0], [0, 1]])
     np.testing.assert_allclose(right[:, 2:], 0.25)
 
@@ -114,7 +114,7 @@ def test_logistic_model_finds_a_shortcut_and_nothing_without_one() -> None:
             self.split = split
 
     items = [Item("train" if k < 800 else "test") for k in range(1200)]
-    right = logistic_accuracies(items, scores, answers)
+    right = score_logistic_model(items, scores, answers)
     assert np.isnan(right[:800]).all()
-    simple = simple_accuracies(scores, answers)[800:].mean(axis=0)
+    simple = score_simple_strategies(scores, answers)[800:].mean(axis=0)
     assert np.mean(right[800:]) > simple.max() + 0.05 > 0.4

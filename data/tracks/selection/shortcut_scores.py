@@ -51,7 +51,7 @@ class CandidateFrames:
     single: np.ndarray
 
     @classmethod
-    def of(
+    def compare(
         cls, frames: Sequence[tuple[Scene, int]], moments: Sequence[int], images: np.ndarray
     ) -> CandidateFrames:
         """Compare frames, given as scenes and indices, whose images are (M, H, W, 3) uint8.

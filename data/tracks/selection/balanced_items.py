@@ -1,9 +1,9 @@
 """Makes selection items that only a prediction solves: distractors are alternative futures.
 
-The candidates are the target and frames of other futures of the scene (`data.tracks.selection.
-futures`), chosen so that no score without prediction reveals the target (`data.tracks.selection.
-balance`). In the time family, two candidates show the right moment and two a wrong one, and two
-show the scene's own future and two another one.
+The candidates are the target and frames of other futures of the scene
+(`data.tracks.selection.futures`), chosen so that no score without prediction reveals the target
+(`data.tracks.selection.shortcut_scores`). In the time family, two candidates show the right moment
+and two a wrong one, and two show the scene's own future and two another one.
 
 A subtype keeps the question, prefix and target of its cell. The distractors of the cells named
 `match` and of hard items are those nearest to the target; those of the cells named `cross` and of
@@ -21,7 +21,6 @@ import numpy as np
 
 from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
 from data.render import get_renderer
-from data.tracks.selection.balance import SCORES, Balance, CandidateFrames
 from data.tracks.selection.distractors import DistractorPicker, Timing, new_item
 from data.tracks.selection.futures import (
     Group,
@@ -33,6 +32,7 @@ from data.tracks.selection.futures import (
     scene_with_states,
     simulate_futures,
 )
+from data.tracks.selection.shortcut_scores import SCORES, Balance, CandidateFrames
 from data.world.displacement import frame_displacements
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class BalancedPicker:
         if not len(choices):
             return self._drop()
         states = [(frames, k) for k in range(frames.frames)]
-        compared = CandidateFrames.of(states, frame_moments, self._render(frames))
+        compared = CandidateFrames.compare(states, frame_moments, self._render(frames))
         best = self.balance.choose(compared.scores(choices))
         if best is None:
             return self._drop()

@@ -1,10 +1,10 @@
 """Chooses the items of balanced cells so that no combination of scores reveals the targets.
 
-The ranks of a cell's targets are even (`data.tracks.selection.balance`), but even ranks do not
-suffice: targets with the highest score may lead by a smaller margin than distractors do, and then a
-combination of scores reveals them. Small deviations of the cells also add up over a family. So each
-cell makes more items than its quota (`RESERVE`), and `choose_items` chooses among the items of a
-whole family.
+The ranks of a cell's targets are even (`data.tracks.selection.shortcut_scores`), but even ranks do
+not suffice: targets with the highest score may lead by a smaller margin than distractors do, and
+then a combination of scores reveals them. Small deviations of the cells also add up over a family.
+So each cell makes more items than its quota (`RESERVE`), and `choose_items` chooses among the items
+of a whole family.
 
 If the sums of the targets' relative scores are zero, the best logistic model of these scores is the
 one that ignores them, since the gradient of its likelihood is zero there. The sums are measured in
@@ -16,12 +16,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple
 
 import numpy as np
 
-from conf.schema import Quota
-from data.tracks.selection.balance import compare_candidates, rank_shares
+from data.tracks.selection.shortcut_scores import compare_candidates, rank_shares
 
 RESERVE = 1.15
 """Factor on the quota of a balanced cell: the number of items from which its items are chosen."""
@@ -31,11 +29,6 @@ RIDGE = 0.01
 """Added to the variances of the relative scores: some of them are constant, or depend on others."""
 SWEEPS = 30
 """Maximum number of times that each chosen item is exchanged for a better one of its cell."""
-
-
-def add_reserve(quota: Quota) -> Quota:
-    """Return the number of items that a balanced cell makes, for its quota."""
-    return Quota(*(math.ceil(RESERVE * n) for n in astuple(quota)))
 
 
 def choose_items(
