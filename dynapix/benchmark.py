@@ -127,8 +127,8 @@ class Lazy(Sequence, Generic[Record]):
 
 
 @dataclass(frozen=True, repr=False)
-class Clip:
-    """The observed part of a scene: the base class of `Item` and `Query`.
+class PrefixQuestion:
+    """A prefix with a question: the base class of `Item` and `Query`.
 
     Attributes:
         record: The row of the benchmark's table.
@@ -165,7 +165,7 @@ class Clip:
         return f"<{type(self).__name__} {self.record.name}: {self.question}>"
 
 
-class Item(Clip):
+class Item(PrefixQuestion):
     """A selection item: an observed clip, a question and four candidate frames, one of which is
     right."""
 
@@ -202,7 +202,7 @@ class Item(Clip):
         return self.record.subtype
 
 
-class Query(Clip):
+class Query(PrefixQuestion):
     """A retrieval query: an observed clip and a question that a frame of the database answers."""
 
     record: RetrievalQuery

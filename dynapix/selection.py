@@ -25,7 +25,7 @@ from models.student.answer_parser import parse_choice
 
 TEXT = "text"
 """Mode of results whose predictions are letters or texts."""
-SYSTEMATIC = 8
+MIN_FAILURES_TO_STOP = 8
 """An evaluation stops if at least this many items, and all items so far, have failed."""
 
 
@@ -154,7 +154,7 @@ def _shorten(prediction: Any) -> str:
 
 
 def _stop_if_all_failed(outcomes: Sequence[Outcome], total: int) -> None:
-    if len(outcomes) >= min(SYSTEMATIC, total) and all(o.failed for o in outcomes):
+    if len(outcomes) >= min(MIN_FAILURES_TO_STOP, total) and all(o.failed for o in outcomes):
         raise UserError(
             f"all of the first {len(outcomes)} items failed; {outcomes[0].item_id}: "
             f"{outcomes[0].reason}",

@@ -89,11 +89,11 @@ def mask_one_token_more(encode: Callable[..., Encoded]) -> Callable[..., Encoded
     return masked
 
 
-def permute_candidates(conversation: Callable[..., Sample]) -> Callable[..., Sample]:
+def permute_candidates(build: Callable[..., Sample]) -> Callable[..., Sample]:
     """Show the candidates' images in another order than that of their letters."""
 
     def permuted(*args: Any, **settings: Any) -> Sample:
-        sample = conversation(*args, **settings)
+        sample = build(*args, **settings)
         seed = [ord(letter) for letter in sample.sample_id]
         order = np.random.default_rng(seed).permutation(len(sample.images))
         return replace(sample, images=[sample.images[k] for k in order])
@@ -142,7 +142,7 @@ SABOTAGES = {
         replaced=((collator, "encode", mask_one_token_more),)
     ),
     "candidates' images permuted": Sabotage(
-        replaced=((prompts, "conversation", permute_candidates),)
+        replaced=((prompts, "build_sample", permute_candidates),)
     ),
     "frames in reverse": Sabotage(replaced=((prompts, "load_clip", reverse_frames),)),
     "timestamps all zero": Sabotage(replaced=((prompts, "load_clip", stop_clock),)),

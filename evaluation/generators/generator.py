@@ -12,7 +12,7 @@ from evaluation.generators.response_log import RECORD_MODES, SampleOf, SaveRespo
 from evaluation.generators.response_schema import instruction as record_instruction
 from evaluation.generators.response_schema import schema
 from models.precision import resolve_precision
-from models.student.prompts import Sample, instruction, selection_sample
+from models.student.prompts import Sample, choose_instruction, selection_sample
 from models.student.responses import response_token_limit
 
 PROMPT_VERSION = 1
@@ -71,7 +71,7 @@ def open_generator(
 def item_instruction(mode: str, regime: str) -> str:
     """Return the instruction that ends a prompt in `mode`. The training regime determines which
     sections of a rationale the instruction requests."""
-    return record_instruction() if mode in RECORD_MODES else instruction(mode, regime)
+    return record_instruction() if mode in RECORD_MODES else choose_instruction(mode, regime)
 
 
 def item_sample(

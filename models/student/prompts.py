@@ -103,7 +103,7 @@ def answer_line(letter: str) -> str:
     return f"Answer: {letter}"
 
 
-def instruction(mode: str, regime: str) -> str:
+def choose_instruction(mode: str, regime: str) -> str:
     """Return the instruction with which a prompt of this mode and regime ends."""
     if mode in TEXT_INSTRUCTIONS:
         return TEXT_INSTRUCTIONS[mode]
@@ -119,7 +119,9 @@ def instruction(mode: str, regime: str) -> str:
     )
 
 
-def response(rationale: str, matches: Sequence[str], letter: str, mode: str, regime: str) -> str:
+def build_response(
+    rationale: str, matches: Sequence[str], letter: str, mode: str, regime: str
+) -> str:
     """Return the response on which a regime trains a student in a mode.
 
     Args:
@@ -167,9 +169,9 @@ def selection_sample(
     parts: list[str | np.ndarray] = [item.question]
     for letter, c in zip(LETTERS, item.candidates, strict=True):
         parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
-    parts.append(f"\n{text or instruction(mode, regime)}")
+    parts.append(f"\n{text or choose_instruction(mode, regime)}")
     clip = load_clip(item.scene_id, visible, frames) if visible else None
-    return conversation(f"{item.item_id} ({mode})", parts, response, clip)
+    return build_sample(f"{item.item_id} ({mode})", parts, response, clip)
 
 
 def facts_sample(
@@ -177,8 +179,8 @@ def facts_sample(
 ) -> Sample:
     """Return the conversation about a selection item whose facts are given as text instead of its
     frames."""
-    parts = [f"{item.question}\nFacts:\n{facts}\n{instruction(mode, regime)}"]
-    return conversation(f"{item.item_id} ({mode}, facts)", parts, response)
+    parts = [f"{item.question}\nFacts:\n{facts}\n{choose_instruction(mode, regime)}"]
+    return build_sample(f"{item.item_id} ({mode}, facts)", parts, response)
 
 
 def text_sample(
@@ -189,10 +191,10 @@ def text_sample(
     name, text = f"{subject.name} ({mode})", f"\n{TEXT_INSTRUCTIONS[mode]}"
     if isinstance(subject, FrameRef):
         pixels = frames.array(subject.scene_id, subject.frame)
-        return conversation(name, [pixels, text], None)
+        return build_sample(name, [pixels, text], None)
     visible = sample_prefix_frames(subject.prefix_start, subject.prefix_stop, frame_count)
     clip = load_clip(subject.scene_id, visible, frames)
-    return conversation(name, [subject.question, text], None, clip)
+    return build_sample(name, [subject.question, text], None, clip)
 
 
 def load_clip(scene_id: str, indices: list[int], frames: FrameReader) -> Clip:
@@ -201,7 +203,7 @@ def load_clip(scene_id: str, indices: list[int], frames: FrameReader) -> Clip:
     return Clip(frames.stack(scene_id, indices), sorted(indices), scene.fps, scene.frames)
 
 
-def conversation(
+def build_sample(
     sample_id: str,
     parts: Sequence[str | np.ndarray],
     response: str | None,

@@ -16,7 +16,7 @@ import dynapix
 from data.render.frame_cache import FrameReader
 from data.store import MANIFEST
 from dynapix.__main__ import COMMANDS, overview
-from dynapix.selection import SYSTEMATIC
+from dynapix.selection import MIN_FAILURES_TO_STOP
 from evaluation.metrics.selection import Choices, selection_report
 from evaluation.reporting.tables import selection_table
 from tests.dynapix.models import always_a, nearest
@@ -169,7 +169,7 @@ def test_items_that_fail_are_kept_and_count_as_wrong(bench, bad, reason) -> None
 
     with raises_user_error("invalid-prediction", contains=(reason, bench.selection[0].item_id)):
         dynapix.evaluate(bench.selection, always_fails, progress=False)
-    assert len(calls) == SYSTEMATIC
+    assert len(calls) == MIN_FAILURES_TO_STOP
 
 
 def test_results_are_compared_on_the_same_items(bench) -> None:

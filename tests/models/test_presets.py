@@ -36,7 +36,7 @@ from data.render.frame_cache import FrameReader
 from models import loading
 from models.parameter_counts import check_parameter_counts, count_parameters
 from models.student.collator import Collator, encode
-from models.student.prompts import Clip, Sample, conversation, response, selection_sample
+from models.student.prompts import Clip, Sample, build_response, build_sample, selection_sample
 from teacher.narrate import ensure_rationales
 from teacher.validation.claim_extraction import MAX_SENTENCE_TAGS
 from tests.user_errors import raises_user_error
@@ -283,7 +283,7 @@ def test_frames_are_resized_to_320_px_and_have_their_true_times(
 def media(size: int, count: int) -> Sample:
     """Return a sample with a video of `count` black frames and an image that is one of them."""
     video = np.zeros((count, size, size, 3), np.uint8)
-    return conversation("black", [video[0]], None, Clip(video, list(range(count))))
+    return build_sample("black", [video[0]], None, Clip(video, list(range(count))))
 
 
 def test_a_video_of_default_size_is_shrunk_where_an_image_is_not(processor) -> None:
@@ -321,7 +321,7 @@ def test_the_longest_rationale_fits_and_the_audit_needs_no_weights(
     more = " ".join((words * MAX_SENTENCE_TAGS)[: MAX_SENTENCE_TAGS - len(words)])
     rationale = f"{more}\n{longest.rationale}"
     assert len(rationale.split()) == MAX_SENTENCE_TAGS
-    target = response(rationale, longest.matches, longest.item.letter, "reasoning", regime)
+    target = build_response(rationale, longest.matches, longest.item.letter, "reasoning", regime)
     frames = FrameReader(micro_store, cfg.image_size)
     sample = selection_sample(longest.item, "reasoning", regime, frames, cfg.frames, target)
     text = audit_student(adapted(preset), released, cfg, sample, Collator(released, cfg.max_length))

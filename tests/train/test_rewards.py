@@ -7,7 +7,7 @@ import pytest
 from conf.schema import TeacherConfig
 from data.records import LETTERS, SelectionItem
 from data.store import Store
-from models.student.prompts import answer_line, response
+from models.student.prompts import answer_line, build_response
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.facts import REGIONS, RelationalPredicates
 from teacher.vocabulary import describe_item
@@ -24,7 +24,9 @@ def described(micro_store: Store) -> list[tuple[SelectionItem, RelationalPredica
 
 def narrate(item: SelectionItem, predicates: RelationalPredicates) -> str:
     lines = write_match_lines(predicates, item)
-    return response(write_rationale(predicates, item, 0), lines, item.letter, "reasoning", "cot")
+    return build_response(
+        write_rationale(predicates, item, 0), lines, item.letter, "reasoning", "cot"
+    )
 
 
 def total(text: str, item: SelectionItem, predicates: RelationalPredicates) -> float:

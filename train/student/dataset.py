@@ -14,10 +14,10 @@ from models.student.prompts import (
     MODES,
     Sample,
     answer_line,
+    build_response,
+    choose_instruction,
     facts_sample,
     has_matches,
-    instruction,
-    response,
     selection_sample,
 )
 from teacher.candidate_letters import relabel_text, reorder_candidates
@@ -61,11 +61,18 @@ class SupervisedItem:
 
     @property
     def response(self) -> str:
-        return response(self.rationale, self.matches, self.item.letter, self.mode, self.regime)
+        return build_response(
+            self.rationale, self.matches, self.item.letter, self.mode, self.regime
+        )
 
     @property
     def text(self) -> str:
-        parts = (self.item.question, self.facts, instruction(self.mode, self.regime), self.response)
+        parts = (
+            self.item.question,
+            self.facts,
+            choose_instruction(self.mode, self.regime),
+            self.response,
+        )
         return " ".join(filter(None, parts))
 
     def lazy_sample(
@@ -212,7 +219,7 @@ def prompt_corpus(items: Sequence[SelectionItem], others: Sequence[str] = ()) ->
     ]
     # Timestamps as prompts have them, with every digit.
     clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
-    instructions = [instruction(mode, "cot") for mode in MODES]
+    instructions = [choose_instruction(mode, "cot") for mode in MODES]
     roles = ["user", "assistant"]
     prompts = [*item_questions, *letters, *instructions, *others, *roles]
     return [*prompts * 20, *clock]

@@ -31,7 +31,7 @@ import numpy as np
 
 from data.records import Candidate, Scene, SelectionItem
 from data.world.displacement import frame_displacements
-from models.student.prompts import response
+from models.student.prompts import build_response
 from teacher.deciding import Decision, choose_statements
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.extraction import extract_predicates
@@ -212,7 +212,7 @@ def ask_narrate(p: RelationalPredicates, item: SelectionItem, rng: np.random.Gen
     predicates = p if rng.random() < 0.5 else p.without_relations()
     rationale = write_rationale(predicates, item, int(rng.integers(2**31)))
     lines = write_match_lines(predicates, item)
-    answer = response(rationale, lines, item.letter, "reasoning", "cot")
+    answer = build_response(rationale, lines, item.letter, "reasoning", "cot")
     return Question(NARRATE, answer, clip=False, candidates=False)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from data.records import LETTERS, SelectionItem, original_scene_id, sample_prefix_frames
 from data.render.frame_cache import FrameReader
-from models.student.prompts import Sample, conversation, load_clip
+from models.student.prompts import Sample, build_sample, load_clip
 from teacher.predicates.motion import find_cut
 from train.tiny_base.oracle_targets import (
     ObjectTarget,
@@ -73,7 +73,7 @@ def make_sample(
             parts += [f"\nCandidate {letter}: ", frames.array(c.scene_id, c.frame)]
         targets += compare_images(images)
     parts.append(f"\n{question.text}")
-    sample = conversation(item.item_id, parts, question.answer, clip)
+    sample = build_sample(item.item_id, parts, question.answer, clip)
     sample = replace(sample, false_spans=question.false_spans)
     return OracleSample(sample, tuple(targets), last, observed, future, question.predicts_target)
 

@@ -25,7 +25,7 @@ from evaluation.generators.generator import item_sample
 from evaluation.generators.local import LocalModel
 from evaluation.generators.response_log import ResponseLog, collect_responses
 from models import compat
-from models.student.prompts import conversation
+from models.student.prompts import build_sample
 from tests.user_errors import raises_user_error
 from train import sft
 from train.common.callbacks import MetricsBar
@@ -161,7 +161,7 @@ class Writer(nn.Module):
 
 def held_out(responses: list[str]) -> StudentDataset:
     def lazy(k: int, response: str) -> LazySample:
-        return LazySample(response, 0, lambda _: conversation(f"item-{k}", ["Which?"], response))
+        return LazySample(response, 0, lambda _: build_sample(f"item-{k}", ["Which?"], response))
 
     return StudentDataset([lazy(k, response) for k, response in enumerate(responses)])
 

@@ -11,7 +11,7 @@ from data.records import LETTERS
 from data.store import Store
 from models.student.answer_parser import parse_choice
 from models.student.collator import encode
-from models.student.prompts import answer_line, instruction
+from models.student.prompts import answer_line, choose_instruction
 from models.tiny_qwen3_vl import build_processor
 from teacher.narrate import ensure_rationales
 from teacher.predicates.extraction import extract_predicates
@@ -56,7 +56,7 @@ def test_both_modes_are_trained_with_the_same_answer(micro_store, regime) -> Non
     assert {i.item_id for i in micro_store.selection("train")} == answers.keys()
     for s in by_mode["reasoning"]:
         assert parse_choice(s.response).letter == answers[s.item.item_id].item.letter
-        assert instruction(s.mode, regime) != instruction("answer", regime)
+        assert choose_instruction(s.mode, regime) != choose_instruction("answer", regime)
 
 
 def test_permuted_responses_are_correct(micro_store) -> None:

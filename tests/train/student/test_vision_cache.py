@@ -12,7 +12,7 @@ from torch import nn
 from conf.entry import Run
 from models.loading import load_student
 from models.student.collator import Collator
-from models.student.prompts import Clip, Sample, conversation, selection_sample
+from models.student.prompts import Clip, Sample, build_sample, selection_sample
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import sft
@@ -109,7 +109,7 @@ def test_digests_depend_on_the_pixels_only(micro_store, frames, student_cfg, pro
 
     def digests(images, clip=()):
         clip = Clip(np.asarray(clip), list(range(len(clip)))) if len(clip) else None
-        return pair_digests([conversation("", images, None, clip)])
+        return pair_digests([build_sample("", images, None, clip)])
 
     assert len(set(digests([one, two, one]))) == 2
     assert digests([one]) == digests([one.copy()]) != digests([two])
