@@ -107,7 +107,7 @@ releases:
 	@test -d "$(RELEASES)/movi_a" && test -d "$(RELEASES)/physion" || { echo "error: make paper needs the releases \
 	$(RELEASES)/movi_a and $(RELEASES)/physion: give their parent folder as RELEASES=FOLDER"; exit 1; }
 
-hours: setup ## Estimate the GPU hours of make paper from measured rates
+hours: setup ## Estimate the GPU hours of the training runs of make paper
 	@$(PY) benchmarks.speed.hours --student $(STUDENT) --retriever $(RETRIEVER)
 
 # One thread per process, because the tests run in several processes and start others.

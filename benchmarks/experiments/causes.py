@@ -9,11 +9,12 @@ Each row gives the student a longer part of the true rationale:
     scene                 what can be seen at the end of the prefix: perception
     motion                how the objects move until the target, too: a part of foresight
     prediction            what will be true at the target, too: foresight
-    candidate analysis    what each candidate shows, and which of them agrees, too: the student only
-                          has to copy the letter (a section that students of the regime
+    candidate analysis    what each candidate shows, too: the student has to compare it with the
+                          prediction or, in the paper's vocabulary, to copy the letter of the
+                          candidate that agrees (a section that students of the regime
                           cot_no_candidate_analysis have not seen)
 
-The true rationale states what decides the item, so every part also gives away which objects matter.
+The true rationale states what decides the item, so every part also reveals which objects matter.
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ percent, with 95% intervals over scenes and seeds, and minutes of CPU time of al
 variant needs, those of the student and the teacher included ("-" if one was interrupted). The
 second table has differences: those from the student compare the runs of each seed, since these
 runs continue this student. The third one describes the responses: the share of their claims that
-the oracle supports; answers that follow from the response; responses that state a number; different
-sequences of four words, as a share of all; and, of the claims about the prefix and the prediction,
+the oracle supports; answers that follow from the response; responses that state a number; distinct
+4-grams, as a share of all 4-grams; and, of the claims about the prefix and the prediction,
 the share about objects that are out of view at the cut.
 """
 
@@ -210,7 +210,7 @@ def print_responses(results: pd.DataFrame) -> None:
     """Print what the responses of each variant are like, in percent."""
     print_header(
         "", "claims per response", "supported", "answer follows", "right for true reasons",
-        "with numbers", "different sequences of four words", "about objects out of view",
+        "with numbers", "distinct 4-grams", "about objects out of view",
     )  # fmt: skip
     for variant in VARIANTS:
         rows = results[(results.variant == variant) & results.follows.notna()]
@@ -222,15 +222,16 @@ def print_responses(results: pd.DataFrame) -> None:
             rows.follows.astype(float).mean(),
             rows.true_reasons.astype(float).mean(),
             rows.numbers.mean(),
-            rows.groupby("seed").text.apply(share_of_different_sequences).mean(),
+            rows.groupby("seed").text.apply(share_of_distinct_4grams).mean(),
             rows.unseen_claims.sum() / (rows.prefix_claims + rows.prediction_claims).sum(),
         )
         cells = [f"{100 * share:.1f}" for share in shares]
         print_row(variant, f"{claims / len(rows):.1f}", *cells)
 
 
-def share_of_different_sequences(texts: pd.Series) -> float:
-    """Return the number of different sequences of four words, as a share of all in the texts."""
+def share_of_distinct_4grams(texts: pd.Series) -> float:
+    """Return the number of distinct 4-grams (sequences of four words), as a share of all in the
+    texts."""
     words = [re.findall(r"[\w-]+", text.lower()) for text in texts]
     sequences = [tuple(w[k : k + 4]) for w in words for k in range(len(w) - 3)]
     return len(set(sequences)) / len(sequences) if sequences else 0.0

@@ -1,5 +1,5 @@
-"""Draws two pictures from a student's responses: an item that it solves beside one that it does
-not, with its own words (`docs/item.webp`), and the solved one as an animation
+"""Draws two pictures from a student's responses: an item that it answers correctly beside one that
+it does not, with its responses (`docs/item.webp`), and the first of them as an animation
 (`docs/reasoning.webp`).
 
     python -m benchmarks.experiments.pictures checkpoints/select/model-checkpoints-sft-exp-cot

@@ -1,7 +1,7 @@
 """Measures what a student predicts in its rationales: whether its predictions are true, and whether
 they single out the target.
 
-    python -m benchmarks.experiments.predictions checkpoints/select/exp-cot
+    python -m benchmarks.experiments.predictions checkpoints/select/model-checkpoints-sft-exp-cot
 
 The argument is a run of `evaluation.select` with answers in reasoning mode. The columns are, in %
 of the items of a family:

@@ -62,7 +62,7 @@ class Variant:
     """Train with plain sentence-transformers instead of our trainer."""
     tokens: int | None = None
     """Maximum tokens of a plain mini-batch; by default, `train.mini_batch` limits its inputs."""
-    helped: bool = False
+    our_settings: bool = False
     """Give plain sentence-transformers this project's attention and memory settings."""
 
 
@@ -70,7 +70,7 @@ PLAIN = "plain sentence-transformers"
 VARIANTS = {
     PLAIN: Variant(plain=True),
     "plain, by tokens": Variant(plain=True, tokens=3072),
-    "plain, helped": Variant(plain=True, helped=True),
+    "plain, our attention and memory settings": Variant(plain=True, our_settings=True),
     OURS: Variant(),
     "ours, inputs loaded in advance": Variant(("workers=2",)),
     "ours, vision features reused": Variant(("reuse_features=true",)),
@@ -114,8 +114,8 @@ def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
     changes = [f"train.{change}" for change in variant.overrides]
     overrides = [*overrides, *changes, f"train.max_steps={steps + 1}"]
     cfg = compose("train.contrastive", ContrastiveCommand, overrides)
-    helped = variant.helped or not variant.plain
-    if helped:
+    ours = variant.our_settings or not variant.plain
+    if ours:
         compat.keep_freed_memory()
     set_seed(SEED)
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
@@ -123,7 +123,7 @@ def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
     frames = FrameReader(store, cfg.retriever.image_size)
     with tempfile.TemporaryDirectory() as folder:
         model = embedder.load_retriever(cfg.retriever, cfg.train.precision, [], Path(folder))
-        if not helped:
+        if not ours:
             model[0].model.set_attn_implementation("sdpa")
         if variant.plain:
             trainer = build_plain_trainer(cfg, model, queries, frames, Path(folder), variant.tokens)

@@ -86,7 +86,7 @@ def list_runs(student: str, retriever: str) -> list[TrainingRun]:
 
 def format_table(runs: list[TrainingRun], rates: list[Rate]) -> str:
     """Format the hours of each run on each GPU, and the commands that measure missing rates."""
-    head = f"{'on one GPU':<40}{'samples':>9}{'a second':>10}{'hours':>8}  measured on"
+    head = f"{'on one GPU':<40}{'samples':>9}{'samples/s':>10}{'hours':>8}  measured on"
     lines: list[str] = []
     missing: dict[tuple[str, str, str], list[str]] = {}
     for run in runs:
