@@ -145,9 +145,12 @@ def is_motion_known(text: str, position: int, predicates: Predicates) -> bool:
 
 
 def replace_colors(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """Replace the colour of an object so that the name fits no object in the predicates."""
+    """Replace the colour of an object so that the name fits no object in the predicates.
+
+    "Candidate A shows no red metal cube" is left as it is: it is true of any other object, too.
+    """
     known = str(asdict(predicates))
-    for match in re.finditer(rf"\b({'|'.join(COLORS)})( (?:metal|rubber) \w+)", text):
+    for match in re.finditer(rf"(?<!\bno )\b({'|'.join(COLORS)})( (?:metal|rubber) \w+)", text):
         free = [color for color in COLORS if f"{color}{match[2]}" not in known]
         if free and not match[2].endswith("s"):
             yield replace_match(text, match, rng.choice(free) + match[2])

@@ -160,9 +160,12 @@ class IndexedPredicates:
         if not claim.subjects:
             return self._truth_of_any_shown(claim, differences.values())
         name = claim.subjects[0]
-        if claim.kind == "region" and self._is_shown_at(letter, name, claim.value):
-            # The differences leave out an object that is in another region only by a little.
-            return True
+        if claim.kind == "region" and (region := self._find_region(letter, name)) is not None:
+            difference = differences.get(name)
+            # The differences leave out an object that is in another region only by a little, and
+            # they have no region of an object that the target does not show.
+            if claim.value == region or (difference and difference.kind == "extra"):
+                return _same(claim.value, region)
         if claim.kind == "displaced" and claim.value in ("", *EXTENTS):
             extent = self._find_extent(letter, name)
             if extent is not None:
@@ -182,10 +185,12 @@ class IndexedPredicates:
         difference = self.differences[letter].get(name)
         return None if difference is None else difference.extent
 
-    def _is_shown_at(self, letter: str, name: str, region: str) -> bool:
-        """Return whether the view of a candidate shows an object in a region."""
+    def _find_region(self, letter: str, name: str) -> str | None:
+        """Return the region where the view of a candidate shows an object; None if it does not show
+        it, or if the predicates have no views or several objects of this name."""
         objects = self.views[letter].objects if letter in self.views else ()
-        return any(o.object == name and o.target_region == region for o in objects)
+        regions = [o.target_region for o in objects if o.object == name]
+        return regions[0] if len(regions) == 1 else None
 
     def _truth_of_any(self, claim: Claim) -> bool | None:
         """Return False if a claim is false of every object, as "it is near the top" if no object is
