@@ -158,7 +158,7 @@ class Writer:
         moving = self.order(movers[: self.detail.analysed])
         parts += [self.travel(o, o.object in struck) for o in moving]
         if not movers:
-            parts.append("the objects remain where they are")
+            parts.append(self.say("all_stay"))
         elif any(o.extent == "stays" for o in ranked) and len(movers) <= self.detail.analysed:
             parts.append(self.say("others_stay"))
         if self.padded:
@@ -174,10 +174,9 @@ class Writer:
             statement = "leaves"
         elif o.enters:
             statement = "enters"
-        elif o.speed not in (None, "stationary"):
-            statement = "travels"
         else:
-            statement = "changes_once_struck" if struck and o.speed else "changes"
+            is_pushed = struck and o.speed == "stationary"
+            statement = "changes_once_struck" if is_pushed else "changes"
         return self.say(statement, o=o, toward=toward_phrase(o.travel))
 
     def prediction(self) -> list[str]:

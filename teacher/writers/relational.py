@@ -83,6 +83,7 @@ class RelationalWriter(Writer):
             key=lambda s: (s.kind == "sight", s.kind in SYMMETRIC, s.kind != "region"),
         )
         self.place_of_target = decision.place
+        self.is_decided = not decision.rivals
         # The objects of the deciding statements come first in every section.
         self.ranked = sorted(self.ranked, key=lambda o: o.object not in named)
         self.view_of = {view.letter: view for view in facts.views}
@@ -189,7 +190,9 @@ class RelationalWriter(Writer):
         named = {name for s in self.statements for name in s.objects}
         if any(o.extent not in ("stays", "unseen") for o in self.ranked):
             still = [o for o in self.ranked if o.object in named and o.extent == "stays"]
-            parts[-1:-1] = [f"the {o.object} remains where it is" for o in still]
+            parts[-1:-1] = [
+                self.say("stays" if o.speed == "stationary" else "hardly_moves", o=o) for o in still
+            ]
         changes = [
             r
             for r in self.facts.target.relations
@@ -251,7 +254,12 @@ class RelationalWriter(Writer):
     def outcome(self) -> list[str]:
         if not self.statements:
             return super().outcome()
-        return [self.conclusion(self.facts.views), self.say("answer", answer=self.facts.answer)]
+        closest = self.place_of_target and self.find_closest(self.facts.views)
+        conclusion = [self.conclusion(self.facts.views)]
+        if closest and not self.is_decided:
+            # "Only candidate A agrees" would be false: the same is said of another candidate.
+            return conclusion
+        return [*conclusion, self.say("answer", answer=self.facts.answer)]
 
     def conclusion(self, views: Sequence[View]) -> str:
         """Return which candidate shows the object of the first statement closest to its place or,
