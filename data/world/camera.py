@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import radians, tan
 from typing import TYPE_CHECKING, Any
 
@@ -66,8 +66,18 @@ class Camera:
         centre = np.array([self.width / 2, self.height / 2])
         return centre + self.focal * local[..., :2] / clamped[..., None], depth
 
+    @property
+    def pixel_rays(self) -> np.ndarray:
+        """(H, W, 3) world directions through the centres of all pixels."""
+        return _pixel_rays(self)
+
     def rays(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return world directions (..., 3), not normalised, through the centres of pixels."""
         x = (columns + 0.5 - self.width / 2) / self.focal
         y = (rows + 0.5 - self.height / 2) / self.focal
         return np.stack([x, y, np.ones_like(x)], axis=-1) @ self.axes
+
+
+@lru_cache(maxsize=2)
+def _pixel_rays(camera: Camera) -> np.ndarray:
+    return camera.rays(*np.meshgrid(np.arange(camera.width), np.arange(camera.height)))

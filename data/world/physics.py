@@ -9,7 +9,7 @@ import ctypes
 import os
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -36,6 +36,10 @@ CONTACT_FREE_FRAMES = 5
 """A pair collides again only if more frames than this without contact precede."""
 TOUCHING = 0.02
 """Distance (simulator units) below which bodies touch at the start."""
+
+
+Contacts = Mapping[tuple[int, int], Sequence[int]]
+"""The frames in which each pair of objects is in contact, in order."""
 
 
 @dataclass(frozen=True)
@@ -113,12 +117,18 @@ class Simulator:
         self._bullet = connect()
 
     def simulate(
-        self, bodies: Sequence[Body], world: WorldConfig, frames: int | None = None
+        self,
+        bodies: Sequence[Body],
+        world: WorldConfig,
+        frames: int | None = None,
+        is_rejected: Callable[[Contacts], bool] = lambda contacts: False,
     ) -> Motion:
         """Simulate bodies in a world. Equal arguments give bit-identical results.
 
         Args:
             frames: Number of frames; that of the world by default.
+            is_rejected: Whether the contacts so far make the motion useless. The simulation then
+                stops, and the result is the motion up to this frame.
         """
         fixed = self._reset(world)
         handles = [self._add_body(body, world) for body in bodies]
@@ -134,26 +144,32 @@ class Simulator:
         in_air = {k for k, body in enumerate(bodies) if body.height is not None}
         contacts: dict[tuple[int, int], list[int]] = defaultdict(list)
         landings = []
+        step, list_contacts = self._bullet.stepSimulation, self._bullet.getContactPoints
         for frame in range(1, frames):
+            touching = False
             # Bullet also lists points of pairs that have separated; contacts have a normal force.
             for _ in range(world.physics.substeps):
-                self._bullet.stepSimulation()
-                for point in self._bullet.getContactPoints():
+                step()
+                for point in list_contacts():
                     if point[1] not in fixed and point[2] not in fixed and point[9] > 0:
                         pair = sorted(map(handles.index, point[1:3]))
                         contacts[tuple(pair)].append(frame)
+                        touching = True
                 for k in list(in_air):
                     points = chain.from_iterable(
-                        self._bullet.getContactPoints(surface, handles[k]) for surface in fixed
+                        list_contacts(surface, handles[k]) for surface in fixed
                     )
                     if any(point[9] > 0 for point in points):
                         in_air.remove(k)
                         landings.append(Landing(frame, k))
             recorded[frame] = self._state(handles)
+            if touching and is_rejected(contacts):
+                recorded = recorded[: frame + 1]
+                break
         return Motion(
             recorded,
             first_contacts((at, pair) for pair, times in contacts.items() for at in times),
-            _has_repeated(contacts),
+            has_repeated(contacts),
             touching_at_start=False,
             landings=tuple(landings),
         )
@@ -277,12 +293,8 @@ def shared_simulator() -> Simulator:
     return Simulator()
 
 
-def _has_repeated(contacts: Mapping[tuple[int, int], Sequence[int]]) -> bool:
-    """Return whether any pair has a second, separate contact.
-
-    Args:
-        contacts: The frames in which each pair is in contact, in order.
-    """
+def has_repeated(contacts: Contacts) -> bool:
+    """Return whether any pair has a second, separate contact."""
     return any(
         after - before > CONTACT_FREE_FRAMES + 1
         for frames in contacts.values()

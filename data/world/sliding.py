@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data.world.camera import Camera
-from data.world.physics import Body, Motion, shared_simulator
+from data.world.physics import Body, Contacts, Motion, has_repeated, shared_simulator
 from data.world.shapes import BOUNDING_RADIUS, half_height
 from data.world.starts import (
     OVERLAP,
@@ -107,12 +108,19 @@ class _Slide:
         # A body at rest usually stays clear of the others, and then need not be simulated with
         # them.
         combined = None if is_colliding else self._combine(motion, body)
-        result = combined or shared_simulator().simulate(extended, self.world)
-        most = self.world.start.max_collisions
+        most = self.world.start.max_collisions or math.inf
+
+        def is_rejected(contacts: Contacts) -> bool:
+            collides = any(len(bodies) in pair for pair in contacts)
+            return has_repeated(contacts) or len(contacts) > most or (collides and not is_colliding)
+
+        result = combined or shared_simulator().simulate(
+            extended, self.world, is_rejected=is_rejected
+        )
         fits = (
             not result.touching_at_start
             and not result.repeated_pair
-            and (most is None or len(result.collisions) <= most)
+            and len(result.collisions) <= most
             and any(len(bodies) in c.objects for c in result.collisions) == is_colliding
         )
         return (extended, result) if fits else None

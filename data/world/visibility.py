@@ -70,18 +70,21 @@ def compute_visibility(
 
     # Rays are needed only for objects at the border of the image or behind something.
     for f, i in np.argwhere(~outside & (~inside | behind)):
-        columns, rows = _pixels_around(centre[f, i], half_side[f, i], camera)
-        rays = camera.rays(columns, rows)
+        rays = _rays_around(centre[f, i], half_side[f, i], camera)
         own = intersect(f, i, rays)
         covered = np.isfinite(own)
-        visible = covered.copy()
+        in_view[f, i] = covered.any()
+        if not covered.any():
+            fraction[f, i] = 0.0
+            continue
+        rays, own = rays[covered], own[covered]
+        visible = np.ones(len(own), dtype=bool)
         for j in np.flatnonzero(hides[f, i]):
             visible &= ~(intersect(f, j, rays) < own)
         for box, may_hide in zip(parts, part_hides, strict=True):
             if may_hide[f, i]:
                 visible &= ~(box.intersect(eye, rays) < own)
-        in_view[f, i] = covered.any()
-        fraction[f, i] = visible.sum() / covered.sum() if covered.any() else 0.0
+        fraction[f, i] = visible.sum() / len(own)
     return in_view, fraction
 
 
@@ -126,12 +129,10 @@ def _box_may_hide(
     return overlap & (np.linalg.norm(positions - eye, axis=-1) + radius > nearest)
 
 
-def _pixels_around(
-    centre: np.ndarray, half_side: float, camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
+def _rays_around(centre: np.ndarray, half_side: float, camera: Camera) -> np.ndarray:
+    """Return rays (P, 3) through evenly spaced pixels of a square, as far as it is in the image."""
     left, top = np.maximum(np.floor(centre - half_side), 0).astype(int)
     right = min(int(centre[0] + half_side) + 1, camera.width)
     bottom = min(int(centre[1] + half_side) + 1, camera.height)
     stride = max(1, round(STRIDE * camera.magnification))
-    columns, rows = np.meshgrid(np.arange(left, right, stride), np.arange(top, bottom, stride))
-    return columns.ravel().astype(float), rows.ravel().astype(float)
+    return camera.pixel_rays[top:bottom:stride, left:right:stride].reshape(-1, 3)

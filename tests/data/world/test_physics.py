@@ -13,7 +13,7 @@ from conf.schema import PartConfig, PhysicsConfig, WorldConfig
 from conf.schema.world import ByMaterial, ObjectsConfig
 from data.records import FPS, Scene, SceneObject
 from data.world.parts import part_box, surface_height
-from data.world.physics import Body, _has_repeated, shared_simulator
+from data.world.physics import Body, has_repeated, shared_simulator
 from data.world.sampling import sample_scene
 from data.world.shapes import RADIUS
 from tests.children import run_child
@@ -77,8 +77,8 @@ def test_collision_of_two_spheres_conserves_momentum() -> None:
 
 
 def test_contacts_within_the_gap_are_one_collision() -> None:
-    assert not _has_repeated({(0, 1): [10, 11, 16]})
-    assert _has_repeated({(0, 1): [10, 17]})
+    assert not has_repeated({(0, 1): [10, 11, 16]})
+    assert has_repeated({(0, 1): [10, 17]})
 
 
 @pytest.mark.parametrize("index", range(4))
