@@ -10,10 +10,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from difflib import SequenceMatcher
 from importlib.resources import files
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 import yaml
 from hydra import compose as hydra_compose
@@ -83,10 +83,25 @@ def config_name(command: str) -> str:
 def compose(command: str, schema: type, overrides: list[str]) -> Any:
     """Compose the settings of one run as an instance of `schema`. Raises SettingsError."""
     with open_hydra(command, schema):
-        cfg = compose_config(command, overrides)
+        cfg = compose_config(command, [allow_new_key(o, schema) for o in overrides])
         with open_dict(cfg):
             del cfg["hydra"]
         return validate_settings(cfg, schema)
+
+
+def allow_new_key(override: str, schema: type) -> str:
+    """Return an override with which Hydra accepts a new key of a dict of values, such as
+    `benchmark.selection.observation.window`: `++KEY=VALUE` instead of `KEY=VALUE`."""
+    key = override.partition("=")[0]
+    for name in key.split("."):
+        hint = get_type_hints(schema).get(name)
+        if get_origin(hint) is dict and not is_dataclass(get_args(hint)[1]):
+            return f"++{override}"
+        groups = [t for t in (hint, *get_args(hint)) if is_dataclass(t)]
+        if not groups:
+            return override
+        schema = groups[0]
+    return override
 
 
 def preflight(command: str, schema: type, overrides: list[str]) -> None:

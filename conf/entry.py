@@ -21,7 +21,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from conf.compose import config_name, preflight, register, validate_settings
+from conf.compose import allow_new_key, config_name, preflight, register, validate_settings
 from conf.errors import SettingsError, UserError
 from conf.failures import report_failures
 from conf.files import write_json
@@ -59,6 +59,7 @@ def command(name: str, schema: type) -> Callable[[Main], Callable[[], None]]:
 def _start(name: str, schema: type, main: Main) -> None:
     """Read the command line: print the help, run a sweep, or check all settings and start Hydra."""
     register(name, schema)
+    sys.argv[1:] = [allow_new_key(argument, schema) for argument in sys.argv[1:]]
     args = get_args_parser().parse_args()
     if args.help:
         _print(help_text(name, schema, args.overrides))
