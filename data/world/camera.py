@@ -66,11 +66,6 @@ class Camera:
         centre = np.array([self.width / 2, self.height / 2])
         return centre + self.focal * local[..., :2] / clamped[..., None], depth
 
-    @property
-    def pixel_rays(self) -> np.ndarray:
-        """(H, W, 3) world directions through the centres of all pixels."""
-        return _pixel_rays(self)
-
     def rays(self, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return world directions (..., 3), not normalised, through the centres of pixels."""
         x = (columns + 0.5 - self.width / 2) / self.focal
@@ -79,5 +74,6 @@ class Camera:
 
 
 @lru_cache(maxsize=2)
-def _pixel_rays(camera: Camera) -> np.ndarray:
+def pixel_rays(camera: Camera) -> np.ndarray:
+    """Return world directions (H, W, 3), not normalised, through the centres of all pixels."""
     return camera.rays(*np.meshgrid(np.arange(camera.width), np.arange(camera.height)))

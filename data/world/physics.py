@@ -63,17 +63,17 @@ class Motion:
     Attributes:
         states: (F, N, 13) positions, quaternions, linear and angular velocities as in `Scene`.
         collisions: First contacts of pairs.
-        repeated_pair: Whether any pair collides more than once.
         touching_at_start: Whether any two bodies, or a body and a part, touch at the first frame.
             Such a motion is not simulated: it has the first frame only.
         landings: Landings, on the floor or on a part, of bodies that start in the air.
+        is_rejected: Whether the simulation stopped because the caller rejected its contacts.
     """
 
     states: np.ndarray
     collisions: tuple[Collision, ...]
-    repeated_pair: bool
     touching_at_start: bool
     landings: tuple[Landing, ...] = ()
+    is_rejected: bool = False
 
     @property
     def positions(self) -> np.ndarray:
@@ -137,13 +137,13 @@ class Simulator:
             for a, b in chain(combinations(handles, 2), product(handles, fixed[1:]))
         ):
             states = self._state(handles)[None]
-            return Motion(states, (), repeated_pair=False, touching_at_start=True)
+            return Motion(states, (), touching_at_start=True)
         frames = frames or world.physics.frames
         recorded = np.zeros((frames, len(bodies), 13))
         recorded[0] = self._state(handles)
         in_air = {k for k, body in enumerate(bodies) if body.height is not None}
         contacts: dict[tuple[int, int], list[int]] = defaultdict(list)
-        landings = []
+        landings, rejected = [], False
         step, list_contacts = self._bullet.stepSimulation, self._bullet.getContactPoints
         for frame in range(1, frames):
             touching = False
@@ -163,15 +163,15 @@ class Simulator:
                         in_air.remove(k)
                         landings.append(Landing(frame, k))
             recorded[frame] = self._state(handles)
-            if touching and is_rejected(contacts):
+            if touching and (rejected := is_rejected(contacts)):
                 recorded = recorded[: frame + 1]
                 break
         return Motion(
             recorded,
             first_contacts((at, pair) for pair, times in contacts.items() for at in times),
-            has_repeated(contacts),
             touching_at_start=False,
             landings=tuple(landings),
+            is_rejected=rejected,
         )
 
     def branch(

@@ -117,13 +117,10 @@ class _Slide:
         result = combined or shared_simulator().simulate(
             extended, self.world, is_rejected=is_rejected
         )
-        fits = (
-            not result.touching_at_start
-            and not result.repeated_pair
-            and len(result.collisions) <= most
-            and any(len(bodies) in c.objects for c in result.collisions) == is_colliding
-        )
-        return (extended, result) if fits else None
+        if result.touching_at_start or result.is_rejected:
+            return None
+        collides = any(len(bodies) in c.objects for c in result.collisions)
+        return (extended, result) if collides == is_colliding else None
 
     def _combine(self, motion: Motion, body: Body) -> Motion | None:
         """Add the motion of a body that touches no other body; return None if it may touch one.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from data.records import Scene, SceneObject
-from data.world.camera import Camera
+from data.world.camera import Camera, pixel_rays
 from data.world.parts import Box
 from data.world.shapes import BOUNDING_RADIUS, intersect_object
 
@@ -135,4 +135,4 @@ def _rays_around(centre: np.ndarray, half_side: float, camera: Camera) -> np.nda
     right = min(int(centre[0] + half_side) + 1, camera.width)
     bottom = min(int(centre[1] + half_side) + 1, camera.height)
     stride = max(1, round(STRIDE * camera.magnification))
-    return camera.pixel_rays[top:bottom:stride, left:right:stride].reshape(-1, 3)
+    return pixel_rays(camera)[top:bottom:stride, left:right:stride].reshape(-1, 3)

@@ -174,9 +174,10 @@ class Writer:
             statement = "leaves"
         elif o.enters:
             statement = "enters"
+        elif struck and o.speed == "stationary":
+            statement = "changes_once_struck"
         else:
-            is_pushed = struck and o.speed == "stationary"
-            statement = "changes_once_struck" if is_pushed else "changes"
+            statement = "changes"
         return self.say(statement, o=o, toward=toward_phrase(o.travel))
 
     def prediction(self) -> list[str]:

@@ -254,12 +254,11 @@ class RelationalWriter(Writer):
     def outcome(self) -> list[str]:
         if not self.statements:
             return super().outcome()
-        closest = self.place_of_target and self.find_closest(self.facts.views)
-        conclusion = [self.conclusion(self.facts.views)]
-        if closest and not self.is_decided:
-            # "Only candidate A agrees" would be false: the same is said of another candidate.
-            return conclusion
-        return [*conclusion, self.say("answer", answer=self.facts.answer)]
+        parts = [self.conclusion(self.facts.views)]
+        # "Only candidate A agrees" would be false if the same is said of another candidate.
+        if self.is_decided or self.find_closest(self.facts.views) is None:
+            parts.append(self.say("answer", answer=self.facts.answer))
+        return parts
 
     def conclusion(self, views: Sequence[View]) -> str:
         """Return which candidate shows the object of the first statement closest to its place or,

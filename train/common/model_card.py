@@ -25,9 +25,13 @@ def model_card(
 ) -> ModelCard:
     """Return the card of an export.
 
-    Args: name: Name of the training run. settings: Settings of the training run. folder: Folder of
-    the training run. format: bf16, fp32 or adapter. measured: What
-    `train.common.output_comparison.compare_outputs` returned; empty without a comparison.
+    Args:
+        name: Name of the training run.
+        settings: Settings of the training run.
+        folder: Folder of the training run.
+        format: bf16, fp32 or adapter.
+        measured: What `train.common.output_comparison.compare_outputs` returned; empty without a
+            comparison.
     """
     student = isinstance(settings, SftCommand)
     product = "student" if student else "retriever"
