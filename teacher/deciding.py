@@ -37,7 +37,8 @@ class Decision:
 
     Attributes:
         statements: Statements that exclude as many distractors as possible. The first one says
-            where an object is if any object is in view both at the cut and at the target.
+            where an object is if any object is in view both at the cut and at the target. The last
+            ones are changes since the cut, if nothing else excludes a distractor.
         rivals: Letters of the distractors of which all statements about the target's frame are
             true.
     """
@@ -71,6 +72,9 @@ def choose_statements(
     errors count `RELATION_FACTOR` times. The probabilities of these events are multiplied, as if
     they were independent.
 
+    A change since the cut is harder to read off one frame than a state. So changes are chosen only
+    for the distractors that no other statement excludes.
+
     Args:
         shown: The frames that the reader sees, if they are not the item's candidates. The target is
             not one of them.
@@ -90,11 +94,30 @@ def choose_statements(
     )
     excludes = excludes.reshape(len(statements), len(wrong))
     possible = excludes.any(axis=0)
-    rivals = tuple(v.letter for v, excluded in zip(wrong, possible, strict=True) if not excluded)
     place = _choose_place(predicates, shown)
     left = possible & [place is None or place in view.statements for view in wrong]
-    chosen = _choose_set(holds, excludes[:, left]) if left.any() else ()
-    return Decision((*filter(None, [place]), *(statements[k] for k in chosen)), rivals)
+    chosen = [statements[k] for k in _choose_set(holds, excludes[:, left])] if left.any() else []
+    alike = [view for view, excluded in zip(wrong, possible, strict=True) if not excluded]
+    changes, rivals = _choose_changes(target, alike)
+    statements = (*filter(None, [place]), *chosen, *changes)
+    return Decision(statements, tuple(view.letter for view in rivals))
+
+
+def _choose_changes(
+    target: View, distractors: Sequence[View]
+) -> tuple[list[Relation], Sequence[View]]:
+    """Choose changes that are true of the target, each of which excludes as many of the remaining
+    distractors as possible. Also return the distractors that no change excludes."""
+    changes = [s for s in sorted(target.statements) if s.kind in CHANGES]
+    chosen: list[Relation] = []
+    while distractors and changes:
+        change = max(changes, key=lambda s: sum(s not in v.statements for v in distractors))
+        left = [view for view in distractors if change in view.statements]
+        if len(left) == len(distractors):
+            break
+        chosen.append(change)
+        distractors = left
+    return chosen, distractors
 
 
 def _choose_place(predicates: RelationalPredicates, shown: Sequence[View]) -> Relation | None:

@@ -14,7 +14,7 @@ from teacher.predicates.facts import Predicates, RelationalPredicates
 from teacher.writers.paper import Detail, Writer, join_sentences
 from teacher.writers.relational import RelationalWriter
 
-NARRATOR_VERSION = "15"
+NARRATOR_VERSION = "16"
 SHORT, LONG, RELATIONAL_LONG = 110, 250, 235
 """A rationale with more than LONG words, or RELATIONAL_LONG in the relational vocabulary, is
 written again with less detail, one of fewer than SHORT words with more. RELATIONAL_LONG keeps

@@ -120,7 +120,7 @@ def describe_sufficiency(figures: Figures) -> str:
     mean, ones, _ = figures["sufficiency"].get("all", (float("nan"),) * 3)
     return (
         f"sufficiency {mean:.3f} ({ones:.1%} decide their item; {figures['undecided']} items that "
-        "the target's frame does not decide)"
+        "no statement decides)"
     )
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from conf.schema import TeacherConfig
     from data.store import Store
 
-VERSIONS = {"paper": "1", "relational": "6"}
+VERSIONS = {"paper": "1", "relational": "7"}
 """Version of each vocabulary. It changes whenever the same item gives other predicates or other
 deciding statements."""
 

@@ -263,11 +263,11 @@ def replace_edges(text: str, predicates: Predicates, rng: Random) -> Iterator[Mu
 
 
 def replace_passed(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """In "a moves past b" or "a crosses behind b", replace b by an object that a does not pass."""
+    """In "a passes b" or "a crosses behind b", replace b by an object that a does not pass."""
     if not isinstance(predicates, RelationalPredicates):
         return
     passed = {r.objects for r in predicates.target.statements if r.kind == "passing"}
-    verbs = "moves past|crosses in front of|crosses behind"
+    verbs = "passes|crosses in front of|crosses behind"
     for match in re.finditer(rf"({OBJECT}) (?:{verbs}) (?=({OBJECT}))", text, re.IGNORECASE):
         mover, other = (name[len("the ") :] for name in match.groups())
         free = [n for n in predicates.paths if n not in (mover, other) and (mover, n) not in passed]

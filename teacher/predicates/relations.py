@@ -11,7 +11,7 @@ A relation has a kind, objects and a value:
 | between | a, b, c | between: a is between b and c |
 | nearer | a, b, c | nearer to: a is nearer to b than to c; as near to: as near to b as to c |
 | extreme | a | leftmost, rightmost, topmost, lowest |
-| passing | a, b | moves past, crosses in front of, crosses behind |
+| passing | a, b | passes, crosses in front of, crosses behind |
 | arrival | a, b, c | comes between |
 | edge | a | reaches the left edge, and right, top and bottom |
 
@@ -48,7 +48,7 @@ VALUES = {
     "between": ("between",),
     "nearer": ("nearer to", "as near to"),
     "extreme": tuple(EXTREMES),
-    "passing": ("moves past", "crosses in front of", "crosses behind"),
+    "passing": ("passes", "crosses in front of", "crosses behind"),
     "arrival": ("comes between",),
     "edge": tuple(f"reaches the {edge} edge" for edge in EDGES),
 }
@@ -296,7 +296,7 @@ def _passing_side(earlier: Places, later: Places, a: str, b: str, bounds: Bounds
     lower = [places.image[a][1] - places.image[b][1] for places in (earlier, later)]
     if min(lower) >= bounds.level:
         return "crosses in front of"
-    return "crosses behind" if max(lower) <= -bounds.level else "moves past"
+    return "crosses behind" if max(lower) <= -bounds.level else "passes"
 
 
 def _edges(place: tuple[float, float], bounds: Bounds) -> set[str]:

@@ -68,8 +68,9 @@ REGION_TAGS = {"to": "into", "towards": "toward"} | {w: w for w in ("into", "fro
 PRONOUNS = {"it", "them"}
 """Pronouns for the other object of a relation."""
 PLACED = {
-    *("is", "are", "be", "was", "were", "been", "not", "as", "stays", "remains", "lies", "sits"),
-    *("rests", "stands", "stay", "remain", "lie", "sit", "rest", "stand"),
+    *("is", "are", "be", "was", "were", "been", "will", "not", "as"),
+    *("stays", "remains", "lies", "sits", "rests", "stands"),
+    *("stay", "remain", "lie", "sit", "rest", "stand"),
 }
 """Words before an ambiguous phrase that make it a relation."""
 AMBIGUOUS = {"between", "in", "comes", "come", "coming", "moves", "against"}

@@ -32,6 +32,11 @@ PHRASES = yaml.safe_load((files("teacher") / "templates" / "relations.yaml").rea
 POSSESSIVE = {"is": "has", "will be": "will have"}
 """For each verb, the one to use if the other object is named before the relation: "the cube *has*
 the sphere left of it"."""
+CHANGE_VERBS = {
+    "passes": ("pass", "passing"), "crosses": ("cross", "crossing"),
+    "comes": ("come", "coming"), "reaches": ("reach", "reaching"),
+}  # fmt: skip
+"""Infinitive and participle of the first word of each phrase for a change."""
 
 
 def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> RelationalPredicates:
@@ -125,10 +130,28 @@ class RelationalWriter(Writer):
         """Return a clause; `verb` is a key of `POSSESSIVE`."""
         if relation.kind in SYMMETRIC:
             return f"the {relation.objects[0]} {POSSESSIVE[verb]} {self.other(relation)}"
+        if relation.kind in CHANGES:
+            return f"the {relation.objects[0]} {self.change(relation, verb)}"
         return f"the {relation.objects[0]} {verb} {self.place(relation)}"
 
-    def attribute(self, relation: Relation) -> str:
-        """Return what follows the subject in `shown` if the relation is true."""
+    def change(self, relation: Relation, verb: str) -> str:
+        """Return what an object does, such as "reaches the left edge".
+
+        Args:
+            verb: The key of `POSSESSIVE` that a state would have, or "with" for a participle.
+        """
+        first, rest = self.place(relation).split(" ", 1)
+        infinitive, participle = CHANGE_VERBS[first]
+        verbs = {"is": first, "will be": f"will {infinitive}", "with": participle}
+        return f"{verbs[verb]} {rest}"
+
+    def attribute(self, relation: Relation, true: bool = True) -> str:
+        """Return what follows the subject in `shown`, for a relation that is true or false."""
+        if relation.kind in CHANGES:
+            said = self.change(relation, "with")
+            return said if true else f"not {said}"
+        if not true:
+            return f"not {self.place(relation)}"
         if relation.kind in SYMMETRIC:
             return f"with {self.other(relation)}"
         return self.place(relation)
@@ -146,7 +169,7 @@ class RelationalWriter(Writer):
             if s.kind == "sight":
                 part = f"no {s.objects[0]}"
             else:
-                said = self.attribute(s) if true else f"not {self.place(s)}"
+                said = self.attribute(s, true)
                 part = said if s.objects[0] == subject else f"the {s.objects[0]} {said}"
                 # In "between the cube and the sphere and with the cylinder left of it", "it" would
                 # be the sphere.

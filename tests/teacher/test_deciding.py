@@ -12,7 +12,15 @@ import pytest
 from conf.schema import TeacherConfig
 from teacher.deciding import UNSEEN_DISTANCE, choose_statements, measure_separation
 from teacher.narrator import FULL, write_match_lines, write_rationale
-from teacher.predicates.relations import CHANGES, Bounds, describe_distance, normalize_relation
+from teacher.predicates.facts import Relation
+from teacher.predicates.relations import (
+    CHANGES,
+    KINDS,
+    VALUES,
+    Bounds,
+    describe_distance,
+    normalize_relation,
+)
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
@@ -30,17 +38,17 @@ def test_deciding_statements_are_a_place_and_a_smallest_set() -> None:
     for _, predicates in random_cases(60, BOUNDS):
         decision = choose_statements(predicates)
         wrong = [v for v in predicates.views if v.letter != predicates.answer]
-        excluded = {
-            frozenset(v.letter for v in wrong if s not in v.statements)
+        by_statement = {
+            s: frozenset(v.letter for v in wrong if s not in v.statements)
             for s in predicates.target.statements
-            if s.kind not in CHANGES
         }
+        excluded = {e for s, e in by_statement.items() if s.kind not in CHANGES}
         possible = frozenset().union(*excluded)
-        assert set(decision.rivals) == {v.letter for v in wrong} - possible
-        chosen = [
-            frozenset(v.letter for v in wrong if s not in v.statements) for s in decision.statements
-        ]
-        assert frozenset().union(*chosen) == possible
+        chosen = [by_statement[s] for s in decision.statements]
+        assert frozenset().union(*chosen) == frozenset().union(*by_statement.values())
+        assert set(decision.rivals) == {v.letter for v in wrong}.difference(*chosen)
+        if any(s.kind in CHANGES for s in decision.statements):
+            continue
         by_place = chosen[0] if decision.place else frozenset()
         suffices = (
             size
@@ -141,6 +149,39 @@ def test_every_relational_rationale_is_accepted_and_sufficient() -> None:
         lengths["relational"].append(len(text.split()))
     paper = [len(write_rationale(p, i, seed=3).split()) for i, p in random_cases(250)]
     assert np.mean(lengths["relational"]) < np.mean(paper)
+
+
+@pytest.mark.parametrize("value", [value for kind in CHANGES for value in VALUES[kind]])
+def test_a_change_decides_what_no_state_decides(value: str) -> None:
+    item, predicates = next(
+        case for case in random_cases(60, BOUNDS) if len(case[1].target.places.image) > 2
+    )
+    target = predicates.target
+    names = sorted(target.places.image)
+    kind = KINDS[value]
+    objects = tuple(names[: {"edge": 1, "passing": 2, "arrival": 3}[kind]])
+    change = Relation(kind, objects, value)
+    states = tuple(r for r in target.relations if r.kind not in CHANGES)
+    views = tuple(
+        replace(
+            target,
+            letter=view.letter,
+            relations=(*states, change) if view is target else states,
+        )
+        for view in predicates.views
+    )
+    predicates = replace(predicates, views=views)
+    decision = choose_statements(predicates)
+    assert decision.statements == (*filter(None, [decision.place]), change)
+    assert not decision.rivals
+    text = write_rationale(predicates, item, 0)
+    claims = extract_claims(text, predicates)
+    stated = [c for c in claims if (c.kind, c.subjects, c.value) == (kind, objects, value)]
+    assert {c.candidate: c.affirmed for c in stated if c.candidate} == {
+        view.letter: view.letter == predicates.answer for view in views
+    }
+    assert {c.verdict for c in stated} == {"supported"}, text
+    assert measure_sufficiency(text, claims, predicates) == 1
 
 
 def test_motion_analyses_mention_the_deciding_objects_that_stay() -> None:

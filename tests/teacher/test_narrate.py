@@ -282,7 +282,7 @@ def test_undecided_item_is_narrated_marked_and_counted(tmp_path):
     assert not by_item["item-1"].undecided
     assert by_item["item-1"].sufficiency == 1
     assert narration.figures["undecided"] == 1
-    assert "1 items that the target's frame does not decide" in str(narration)
+    assert "1 items that no statement decides" in str(narration)
 
 
 def test_insufficient_rationales_are_set_aside_with_the_reason(tmp_path):

@@ -140,7 +140,7 @@ def test_edges_follow_their_bound(place: tuple[float, float], edges: set[str]) -
 def test_changes_of_an_object_that_passes_another() -> None:
     earlier = places(a=(0.2, 0.5), b=(0.5, 0.5), c=(0.9, 0.5))
     for height, value in (
-        (0.5, "moves past"),
+        (0.5, "passes"),
         (0.6, "crosses in front of"),
         (0.4, "crosses behind"),
     ):
