@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import dist
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from math import dist, hypot
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from teacher.predicates.places import (
     compass_direction,
     object_region,
     object_sight,
-    square_position,
+    square_displacement,
 )
 from teacher.predicates.relations import (
     CLEARLY,
@@ -60,7 +61,8 @@ def extract_facts(
     if cut is None:
         return None
     objects = tuple(
-        _object_facts(scene, i, cut, scene, i, target) for i in range(len(scene.objects))
+        ObjectFacts(**_cut_fields(scene, i, cut), **_target_fields(scene, i, cut, scene, i, target))
+        for i in range(len(scene.objects))
     )
     contacts = [c.objects for c in scene.collisions if cut < c.frame <= target]
     return Facts(
@@ -102,7 +104,7 @@ def extract_predicates(
     if bounds is None:
         return Predicates(**vars(facts), candidates=candidates)
     cut = find_cut(scene, item.prefix_start, item.prefix_stop)
-    observed, paths, views = _describe_views(item, scene, scene_of, cut, bounds)
+    observed, paths, views = _describe_views(item, facts.objects, scene, scene_of, cut, bounds)
     order = np.argsort(scene.image_positions[cut, :, 0], kind="stable")
     return RelationalPredicates(
         **vars(facts),
@@ -117,21 +119,25 @@ def extract_predicates(
 
 def _describe_views(
     item: SelectionItem,
+    seen: Sequence[ObjectFacts],
     scene: Scene,
     scene_of: Callable[[str], Scene],
     cut: int,
     bounds: Bounds,
 ) -> tuple[tuple[Relation, ...], dict[str, float], tuple[View, ...]]:
-    """Return the relations at the cut, the paths of the objects, and the views of the
-    candidates."""
+    """Return the relations at the cut, the paths of the objects, and the views of the candidates.
+
+    Args:
+        seen: The facts of the scene's objects, with the item's target.
+    """
     earlier = Places.from_frame(scene, cut)
     views = []
     for letter, candidate in zip(LETTERS, item.candidates, strict=True):
         other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
         index = {key: k for k, key in enumerate(other.object_keys)}
         objects = tuple(
-            _object_facts(scene, k, cut, other, index.get(key), candidate.frame)
-            for k, key in enumerate(scene.object_keys)
+            replace(o, **_target_fields(scene, k, cut, other, index.get(key), candidate.frame))
+            for k, (o, key) in enumerate(zip(seen, scene.object_keys, strict=True))
         )
         later = Places.from_frame(other, candidate.frame)
         at_rest = {o.object for o in objects if o.extent == "stays"}
@@ -145,10 +151,27 @@ def _describe_views(
     return tuple(sorted(find_relations(earlier, bounds))), paths, tuple(views)
 
 
-def _object_facts(
+def _cut_fields(scene: Scene, index: int, cut: int) -> dict[str, str | None]:
+    """Return the fields of `ObjectFacts` that describe an object at the cut."""
+    sight = object_sight(scene, cut, index)
+    speed = heading = None
+    if sight != OUT_OF_VIEW:
+        speed = object_speed(scene, index, cut)
+        heading = object_heading(scene, index, motion_start(scene, index, cut), cut)
+    return {
+        "object": scene.objects[index].noun_phrase,
+        "region": object_region(scene, cut, index),
+        "sight": sight,
+        "speed": speed,
+        "heading": heading,
+    }
+
+
+def _target_fields(
     scene: Scene, index: int, cut: int, other: Scene, other_index: int | None, target: int
-) -> ObjectFacts:
-    """Return the facts of an object at the cut of `scene` and at frame `target` of `other`.
+) -> dict[str, str | None]:
+    """Return the fields of `ObjectFacts` that describe an object at frame `target` of `other`, and
+    its displacement since the cut of `scene`.
 
     Args:
         other_index: The object's index in `other`; None if that scene lacks it.
@@ -158,32 +181,24 @@ def _object_facts(
     if other_index is not None:
         target_sight = object_sight(other, target, other_index)
         target_region = object_region(other, target, other_index)
-    speed = heading = travel = None
-    if sight != OUT_OF_VIEW:
-        speed = object_speed(scene, index, cut)
-        heading = object_heading(scene, index, motion_start(scene, index, cut), cut)
+    travel = None
     if sight == OUT_OF_VIEW == target_sight:
         extent = "unseen"
     elif other_index is None:
         extent = "moves across"
     else:
-        shift = square_position(other, target, other_index) - square_position(scene, cut, index)
-        distance = float(np.hypot(*shift))
+        shift = square_displacement(scene, cut, index, other, target, other_index)
+        distance = hypot(*shift)
         extent = "stays"
         if distance >= STAYS:
             extent = "shifts slightly" if distance < SHIFTS else "moves across"
             travel = compass_direction(shift)
-    return ObjectFacts(
-        object=scene.objects[index].noun_phrase,
-        region=object_region(scene, cut, index),
-        sight=sight,
-        speed=speed,
-        heading=heading,
-        target_region=target_region,
-        target_sight=target_sight,
-        extent=extent,
-        travel=travel,
-    )
+    return {
+        "target_region": target_region,
+        "target_sight": target_sight,
+        "extent": extent,
+        "travel": travel,
+    }
 
 
 def _candidate_facts(
@@ -207,8 +222,8 @@ def _candidate_facts(
             difference = Difference(name, "missing" if expected else "extra")
             ranked.append(((True, True, float(MODEL_SIZE)), difference))
         elif i is not None and j is not None:
-            shift = square_position(other, frame, j) - square_position(scene, target, i)
-            distance = float(np.hypot(*shift))
+            shift = square_displacement(scene, target, i, other, frame, j)
+            distance = hypot(*shift)
             region = object_region(other, frame, j)
             if region != object_region(scene, target, i):
                 bound, difference = BORDER, Difference(name, "region", region=region)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from itertools import combinations
+from math import hypot
 
 import numpy as np
 
 from data.records import SPEED_BOUNDS, Scene
 from teacher.predicates.facts import SPEEDS, VERY_FAST, Meeting
-from teacher.predicates.places import CONTACT, compass_direction, mean_scale, square_position
+from teacher.predicates.places import CONTACT, compass_direction, mean_scale, square_displacement
 
 CUT_MARGIN = 12
 """Minimum number of frames from the cut to the next collision (paper, Rationale construction)."""
@@ -92,14 +93,12 @@ def object_heading(scene: Scene, index: int, since: int, frame: int) -> str | No
     if the object is stationary at `frame` or has not moved."""
     if object_speed(scene, index, frame) == "stationary":
         return None
-    return compass_direction(
-        square_position(scene, frame, index) - square_position(scene, since, index)
-    )
+    return compass_direction(square_displacement(scene, since, index, scene, frame, index))
 
 
 def object_speed(scene: Scene, index: int, frame: int) -> str:
     """Return the word for an object's speed at a frame."""
-    speed = float(np.linalg.norm(scene.velocities[frame, index]))
+    speed = hypot(*scene.velocities[frame, index].tolist())
     if speed < STATIONARY:
         return "stationary"
     words = zip(SPEEDS, scene.speed_bounds or SPEED_BOUNDS, strict=True)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
-
-import numpy as np
-from numpy.typing import ArrayLike
+from math import atan2, dist, hypot, pi
 
 from data.records import Scene
 from data.world.displacement import MODEL_SIZE
@@ -25,30 +24,46 @@ def mean_scale(scene: Scene, i: int, j: int) -> float:
     return (scene.object_scales[i] + scene.object_scales[j]) / 2
 
 
-def compass_direction(delta: np.ndarray) -> str | None:
+# Scenes have a few objects, and an item has four candidates. On so few numbers, Python's floats are
+# faster than arrays.
+
+
+def compass_direction(delta: Sequence[float]) -> str | None:
     """Return the compass word of a displacement in the image (x right, y down); None for zero."""
-    if np.hypot(*delta) < 1e-6:
+    if hypot(*delta) < 1e-6:
         return None
-    eighth = round(float(np.arctan2(delta[1], delta[0])) / (np.pi / 4))
-    return COMPASS[eighth % 8]
+    x, y = delta
+    return COMPASS[round(atan2(y, x) / (pi / 4)) % 8]
 
 
 def object_region(scene: Scene, frame: int, index: int) -> str:
     """Return the region of an object's center in a 3x3 grid, or "out of view"."""
     if not scene.in_view[frame, index]:
         return OUT_OF_VIEW
-    return region_at(scene.image_positions[frame, index] / scene.image_size)
+    (x, y), (width, height) = scene.image_positions[frame, index].tolist(), scene.image_size
+    return region_at((x / width, y / height))
 
 
-def region_at(place: ArrayLike) -> str:
+def region_at(place: Sequence[float]) -> str:
     """Return the region of a place (x, y) in shares of the image's width and height."""
-    column, row = np.clip(np.floor(np.multiply(place, 3)), 0, 2).astype(int)
+    column, row = (min(max(int(3 * share), 0), 2) for share in place)
     return REGIONS[row][column]
 
 
-def square_position(scene: Scene, frame: int, index: int) -> np.ndarray:
+def square_position(scene: Scene, frame: int, index: int) -> tuple[float, float]:
     """Return the center (x, y) of an object in px of the square image."""
-    return scene.image_positions[frame, index] * MODEL_SIZE / np.asarray(scene.image_size)
+    (x, y), (width, height) = scene.image_positions[frame, index].tolist(), scene.image_size
+    return x * MODEL_SIZE / width, y * MODEL_SIZE / height
+
+
+def square_displacement(
+    scene: Scene, frame: int, index: int, later: Scene, later_frame: int, later_index: int
+) -> tuple[float, float]:
+    """Return the displacement (x, y) of an object from a frame to another one, which may be of
+    another scene, in px of the square image."""
+    x, y = square_position(scene, frame, index)
+    later_x, later_y = square_position(later, later_frame, later_index)
+    return later_x - x, later_y - y
 
 
 def object_sight(scene: Scene, frame: int, index: int) -> str:
@@ -61,14 +76,14 @@ def object_sight(scene: Scene, frame: int, index: int) -> str:
 
 def close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
     """Return the pairs of objects in view that are very close at a frame."""
-    ground = scene.positions[target, :, :2]
-    places = scene.image_positions[target]
+    ground = scene.positions[target, :, :2].tolist()
+    places = (scene.image_positions[target] / scene.image_size).tolist()
     seen = [i for i in range(len(scene.objects)) if scene.in_view[target, i]]
     return tuple(
         Closeness(
             (scene.objects[i].noun_phrase, scene.objects[j].noun_phrase),
-            region_at((places[i] + places[j]) / 2 / scene.image_size),
+            region_at([(a + b) / 2 for a, b in zip(places[i], places[j], strict=True)]),
         )
         for i, j in combinations(seen, 2)
-        if np.linalg.norm(ground[i] - ground[j]) < VERY_CLOSE * mean_scale(scene, i, j)
+        if dist(ground[i], ground[j]) < VERY_CLOSE * mean_scale(scene, i, j)
     )
