@@ -267,7 +267,7 @@ class Result:
                         "mode": TEXT,
                         "item_id": o.item_id,
                         "text": o.text or "",
-                        "cut": False,
+                        "truncated": False,
                     }
                     for o in self.outcomes
                 ]

@@ -35,27 +35,27 @@ class JudgedResponse:
     Attributes:
         letter: The chosen letter, if any.
         target: The letter of the target.
-        cut: Whether the response was cut off at the token limit.
+        truncated: Whether the response was cut off at the token limit.
     """
 
     text: str
     letter: str | None
     target: str
     reasons: ResponseReasons
-    cut: bool
+    truncated: bool
 
 
 def judge_response(
-    text: str, cut: bool, item: SelectionItem, predicates: RelationalPredicates
+    text: str, truncated: bool, item: SelectionItem, predicates: RelationalPredicates
 ) -> JudgedResponse:
     """Return a response with its answer and its claims.
 
     Args:
         predicates: All predicates of the item.
     """
-    letter = parse_choice(text, cut=cut).letter
+    letter = parse_choice(text, truncated=truncated).letter
     reasons = read_response(text, letter, item.letter, predicates)
-    return JudgedResponse(text, letter, item.letter, reasons, cut)
+    return JudgedResponse(text, letter, item.letter, reasons, truncated)
 
 
 def reward_answer(response: JudgedResponse) -> float:
@@ -117,7 +117,7 @@ def reward_form(response: JudgedResponse) -> float:
     occur twice, otherwise 0. A response without sections has no form that it could miss."""
     headings = [name for name, _, _ in split_sections(response.text)]
     in_order = headings == [name for name in (*SECTIONS, "Answer") if name in headings]
-    return -float(response.cut or not in_order)
+    return -float(response.truncated or not in_order)
 
 
 REWARDS: dict[str, Callable[[JudgedResponse], float]] = {

@@ -126,7 +126,7 @@ class Student:
         limit = self._settings.student.max_new_tokens
         texts = generate(self._model, self._processor, inputs, limit, self._precision)
         for start, text in zip(given, texts, strict=True):
-            yield parse_choice(start + text.text, cut=text.cut).letter
+            yield parse_choice(start + text.text, truncated=text.truncated).letter
 
     def _sample(self, item: SelectionItem, given: str) -> Sample:
         regime, frame_count = self._settings.train.regime, self._settings.student.frames

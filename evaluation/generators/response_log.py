@@ -39,13 +39,13 @@ class ModelResponse:
 
     Attributes:
         item_id: Name of the item, query or frame.
-        cut: Whether generation stopped at the token limit.
+        truncated: Whether generation stopped at the token limit.
     """
 
     item_id: str
     mode: str
     text: str
-    cut: bool
+    truncated: bool
 
 
 @dataclass(frozen=True)
@@ -73,14 +73,14 @@ class Answer(ModelResponse):
 def score_response(subject: Subject, mode: str, generated: GeneratedText) -> ModelResponse:
     """Return the response to a subject. If the subject is a selection item, the letter is parsed
     and compared with the correct one."""
-    text, cut = generated.text, generated.cut
+    text, truncated = generated.text, generated.truncated
     if not isinstance(subject, SelectionItem):
-        return ModelResponse(subject.name, mode, text, cut)
-    parsed = parse_choice(text, cut=cut)
+        return ModelResponse(subject.name, mode, text, truncated)
+    parsed = parse_choice(text, truncated=truncated)
     letter, is_right = parsed.letter, parsed.letter == subject.letter
     reason = str(parsed.reason) if letter is None and parsed.reason else None
     valid = read_record(text) is not None if mode in RECORD_MODES else None
-    return Answer(subject.name, mode, text, cut, letter, reason, is_right, valid)
+    return Answer(subject.name, mode, text, truncated, letter, reason, is_right, valid)
 
 
 class ResponseLog:
@@ -129,7 +129,7 @@ class ResponseLog:
             try:
                 name, mode = row["item_id"], row["mode"]
                 if name in self._subject_of and row["key"] == self.keys.get(mode, ""):
-                    generated = GeneratedText(row["text"], row["cut"])
+                    generated = GeneratedText(row["text"], row["truncated"])
                     responses[name, mode] = score_response(self._subject_of[name], mode, generated)
             except (ValueError, TypeError, KeyError, AttributeError):
                 continue

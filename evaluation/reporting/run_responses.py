@@ -70,7 +70,7 @@ def read_responses(folder: Path, kind: str, report: SelectionReport) -> dict[str
                 variant = row["by"]
             elif "text" in row and row["key"] in variants:
                 variant = variants[row["key"]]
-                response = parse_response(str(row["text"]), bool(row["cut"]))
+                response = parse_response(str(row["text"]), bool(row["truncated"]))
             else:
                 continue
             responses.setdefault(variant, {})[row["item_id"]] = response
@@ -86,7 +86,7 @@ def nearest_candidates(scores: Sequence[float]) -> ItemResponse:
 
 
 def parse_response(text: str, truncated: bool) -> ItemResponse:
-    answer = parse_choice(text, cut=truncated)
+    answer = parse_choice(text, truncated=truncated)
     reason = answer.reason and str(answer.reason)
     return ItemResponse(text, answer.letter or "", reason, truncated)
 

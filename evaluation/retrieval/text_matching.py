@@ -134,7 +134,7 @@ def count_texts(responses: Sequence[ModelResponse]) -> dict[str, int]:
     return {
         "texts": len(texts),
         "  empty: a miss": sum(not _without_thought(text) for text in texts),
-        "  cut off at student.max_new_tokens": sum(response.cut for response in responses),
+        "  cut off at student.max_new_tokens": sum(response.truncated for response in responses),
         "  prediction and outcome alone": sum(bool(_future_sections(text)) for text in texts),
     }
 

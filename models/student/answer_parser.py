@@ -132,14 +132,15 @@ _SECOND_THOUGHT = re.compile(
 )
 
 
-def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedAnswer:
+def parse_choice(raw: str, letters: str = LETTERS, truncated: bool = False) -> ParsedAnswer:
     """Read the chosen letter from a response.
 
     Args:
         raw: The whole response. If the prompt ends with `<think>`, prepend the tag to the response;
             otherwise a thought that was cut off is read as an answer.
         letters: The letters of the candidates, upper case.
-        cut: Whether generation stopped at the token limit, so that the last word may be incomplete.
+        truncated: Whether generation stopped at the token limit, so that the last word may be
+            incomplete.
     """
     text = strip_thought(_INVISIBLE.sub("", unicodedata.normalize("NFKC", raw)))
     if text is None:
@@ -160,8 +161,8 @@ def parse_choice(raw: str, letters: str = LETTERS, cut: bool = False) -> ParsedA
     if flag is Reason.CUT_OFF:
         return ParsedAnswer(None, flag)
     # With "xx" appended, a last word that may have been cut off cannot be read as a letter.
-    answer = _read_prose(f"{prose}xx" if cut else prose, letters)
-    if cut and answer.reason is Reason.NO_ANSWER:
+    answer = _read_prose(f"{prose}xx" if truncated else prose, letters)
+    if truncated and answer.reason is Reason.NO_ANSWER:
         return ParsedAnswer(None, Reason.CUT_OFF)
     return answer
 

@@ -21,10 +21,10 @@ class GeneratedText:
     """A generated text.
 
     Attributes:
-        cut: Whether it was cut off at the token limit.
+        truncated: Whether it was cut off at the token limit.
         ids: Its token ids, with the one that ends it; empty if they are not known.
     """
 
     text: str
-    cut: bool = False
+    truncated: bool = False
     ids: tuple[int, ...] = ()

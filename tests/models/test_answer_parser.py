@@ -244,7 +244,7 @@ def test_any_text_gives_a_letter_of_the_item_or_a_reason():
      ("Answer: B\nThe", "B"), (FULL, "B"), (FULL[:40], "B")],
 )  # fmt: skip
 def test_an_incomplete_last_word_is_not_a_choice(raw, letter):
-    answer = parse_choice(raw, cut=True)
+    answer = parse_choice(raw, truncated=True)
     assert answer.letter == letter
     assert letter or answer.reason is CUT
 

@@ -89,4 +89,4 @@ def test_a_think_tag_that_the_prompt_opens_begins_the_text(
         model.eval(), thinker, Collator(thinker, 1500, thinking)([sample]), 4, "fp32"
     )
     assert response.text.startswith("<think>") == thinking
-    assert response.cut
+    assert response.truncated

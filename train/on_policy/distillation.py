@@ -100,7 +100,7 @@ class DistillationTrainer(StudentTrainer):
         if prompts:
             samples, seeds = [p.student for p in prompts], [p.seed for p in prompts]
             texts = self.responses.sample(self.model, samples, seeds)
-        letters = [parse_choice(t.text, cut=t.cut).letter for t in texts]
+        letters = [parse_choice(t.text, truncated=t.truncated).letter for t in texts]
         counted = [k for k, prompt in enumerate(prompts) if prompt.supervised]
         self._sampled += [
             (letters[k] == prompts[k].letter, letters[k] is not None, len(texts[k].ids))

@@ -206,7 +206,7 @@ class MediaGRPOTrainer(GRPOTrainer):
         texts = self.responses.sample(self.model, self._prompts, seeds)
         self.model.train(training)
         judged = [
-            judge_response(t.text, t.cut, j.item, j.predicates)
+            judge_response(t.text, t.truncated, j.item, j.predicates)
             for t, j in zip(texts, self._judged, strict=True)
         ]
         if training:

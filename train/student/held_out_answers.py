@@ -64,7 +64,7 @@ class HeldOutAnswers:
             texts = generate(model, self._processor, inputs, limit, train.precision)
         rows = []
         for sample, generated in zip(first, texts, strict=True):
-            parsed = parse_choice(generated.text, cut=generated.cut)
+            parsed = parse_choice(generated.text, truncated=generated.truncated)
             rows.append(
                 {
                     "step": step,

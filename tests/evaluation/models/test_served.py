@@ -128,7 +128,7 @@ def test_constrained_requests_have_the_schema_and_a_seed_per_item(
 def test_a_thought_is_not_parsed_as_the_answer(reply, thinking, text, items) -> None:
     generated = restore_thought(reply, thinking)
     assert generated.text == text
-    assert generated.cut == (reply.flaw == TRUNCATED)
+    assert generated.truncated == (reply.flaw == TRUNCATED)
     letter = score_response(items[0], "answer", generated).letter
     assert letter == (None if "</think>" not in text and thinking else text[-1])
 

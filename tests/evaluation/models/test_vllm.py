@@ -118,7 +118,7 @@ def test_constrained_responses_of_a_served_model_are_records(
     for row in [r for r in rows if r.get("mode") == "constrained"][1:]:
         found = parse_choice(row["text"])
         assert found.letter == row["letter"]
-        assert row["valid"] or (row["cut"] and found.reason is Reason.CUT_OFF)
+        assert row["valid"] or (row["truncated"] and found.reason is Reason.CUT_OFF)
         names = [f'"{name}"' for name in schema()["properties"] if f'"{name}"' in row["text"]]
         assert names == sorted(names, key=row["text"].index)
 

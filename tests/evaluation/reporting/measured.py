@@ -108,7 +108,7 @@ def select_run(
     write_report(report, folder, items[0].suite)
     keys = {"key": "k1", "mode": mode}
     lines = [{**keys, "asked": {"control": None, "seed": 0}}]
-    lines += [{**keys, "item_id": i.item_id, "text": respond(i), "cut": False} for i in items]
+    lines += [{**keys, "item_id": i.item_id, "text": respond(i), "truncated": False} for i in items]
     write_json_lines(folder / "answers.jsonl", lines)
     return folder
 

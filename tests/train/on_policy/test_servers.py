@@ -151,7 +151,7 @@ def test_vllm_samples_from_the_current_adapters(
     for _ in range(2):
         randomize_adapters(model, 0.6)
         texts = sampler.sample(model, prompts, range(6))
-        assert all(text.cut and len(text.ids) == 12 for text in texts)
+        assert all(text.truncated and len(text.ids) == 12 for text in texts)
         assert distance_from_greedy(model, processor, prompts, texts) < 0.05
         found.append(texts)
     assert distance_from_greedy(model, processor, prompts, found[0]) > 0.5
