@@ -11,7 +11,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -31,6 +31,17 @@ VERSION = "bullet-1"
 OVERSAMPLING = 2
 NEAR, FAR = 0.1, 50.0
 """Distances of the clipping planes, simulator units."""
+PART = 2**20
+"""Value of the mask at parts, which is no handle of an object."""
+
+
+class Layer(NamedTuple):
+    """What is drawn of some bodies: their pixels (H, W) uint32, depths (H, W), 1 where nothing is
+    drawn, and the handle of the body at each pixel (H, W), -1 where there is none."""
+
+    pixels: np.ndarray
+    depth: np.ndarray
+    mask: np.ndarray
 
 
 class BulletRenderer:
@@ -48,10 +59,7 @@ class BulletRenderer:
         self._floor = Floor(camera.sized(width, height), world)
         self._textures = self._load_textures()
         self._visuals: dict[tuple[SceneObject, float], int] = {}
-        self.part_handles = [
-            self._add_part(box, part.color)
-            for box, part in zip(world_boxes(world), world.parts.values(), strict=True)
-        ]
+        self._parts = self._draw_parts() if world.parts else None
         self._scene_id: str | None = None
         self._handles: list[int] = []
 
@@ -59,8 +67,7 @@ class BulletRenderer:
         """Render one frame as an RGB image."""
         self.pose(scene, frame)
         pixels, mask = self.capture()
-        opaque = pixels.view(np.uint32)[..., 0] | np.uint32(0xFF000000)
-        layers = np.where(mask >= 0, opaque, np.uint32(0))
+        layers = np.where(mask >= 0, pixels | np.uint32(0xFF000000), np.uint32(0))
         # RGBX, because Pillow would premultiply the colours of an RGBA image by alpha.
         fine = Image.frombuffer("RGBX", mask.shape[::-1], layers, "raw", "RGBX", 0, 1)
         *colors, cover = fine.reduce(OVERSAMPLING).split()
@@ -97,10 +104,19 @@ class BulletRenderer:
         """Render the objects and parts without a floor at OVERSAMPLING times the size.
 
         Returns:
-            Pixels (H, W, 4) uint8, and the mask (H, W) int32: the handle of an object or a part,
-            or -1.
+            Pixels (H, W) uint32, each four bytes RGBA, and the mask (H, W) int32: the handle of an
+            object, PART or -1.
         """
-        _, _, pixels, _, mask = self._bullet.getCameraImage(
+        pixels, depth, mask = self._draw()
+        if self._parts is not None:
+            hidden = self._parts.depth < depth
+            np.copyto(pixels, self._parts.pixels, where=hidden)
+            np.copyto(mask, PART, where=hidden)
+        return pixels, mask
+
+    def _draw(self) -> Layer:
+        """Draw the bodies of Bullet's world."""
+        _, _, pixels, depth, mask = self._bullet.getCameraImage(
             self._fine.width,
             self._fine.height,
             self._view_matrix,
@@ -113,7 +129,18 @@ class BulletRenderer:
             lightSpecularCoeff=0.6,
             renderer=self._bullet.ER_TINY_RENDERER,
         )
-        return pixels, mask
+        return Layer(pixels.view(np.uint32)[..., 0], depth, mask)
+
+    def _draw_parts(self) -> Layer:
+        """Draw the world's parts. They never move, so that one drawing serves all frames."""
+        handles = [
+            self._add_part(box, part.color)
+            for box, part in zip(world_boxes(self._world), self._world.parts.values(), strict=True)
+        ]
+        layer = self._draw()
+        for handle in handles:
+            self._bullet.removeBody(handle)
+        return layer
 
     def _load_textures(self) -> dict[str, int]:
         with tempfile.TemporaryDirectory() as folder:
@@ -145,10 +172,8 @@ class BulletRenderer:
         return handle
 
     def _add_part(self, box: Box, color: Sequence[float]) -> int:
-        visual = self._add_visual(box_mesh(box.half), color, shine=0.05)
-        handle = self._bullet.createMultiBody(
-            0, -1, visual, box.position.tolist(), box.quaternion.tolist()
-        )
+        visual = self._add_visual(box_mesh(np.array(box.half)), color, shine=0.05)
+        handle = self._bullet.createMultiBody(0, -1, visual, box.position, box.quaternion)
         self._set_texture(handle, "rubber")
         return handle
 

@@ -18,43 +18,42 @@ HIGH = 100.0
 """A height above all parts, simulator units."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Box:
-    """A box: its centre, its orientation (x y z w), and the halves of its edges (3,)."""
+    """A box: its centre, its orientation (x y z w), and the halves of its edges."""
 
-    position: np.ndarray
-    quaternion: np.ndarray
-    half: np.ndarray
+    position: tuple[float, ...]
+    quaternion: tuple[float, ...]
+    half: tuple[float, ...]
 
     @property
     def corners(self) -> np.ndarray:
         """(8, 3) corners in world coordinates."""
         signs = np.array(list(product((-1, 1), repeat=3)))
-        return self.position + (signs * self.half) @ rotation_matrix(self.quaternion).T
+        return np.array(self.position) + (signs * self.half) @ rotation_matrix(self.quaternion).T
 
     def intersect(self, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """Return each ray's parameter at its first intersection with the box; inf for none."""
-        return intersect_box(self.half, self.position, self.quaternion, eye, rays)
+        half, position = np.array(self.half), np.array(self.position)
+        return intersect_box(half, position, self.quaternion, eye, rays)
 
 
-def world_boxes(world: WorldConfig) -> list[Box]:
+def world_boxes(world: WorldConfig) -> tuple[Box, ...]:
     """Return the parts of a world as boxes, in the order of the settings."""
-    return [part_box(part) for part in world.parts.values()]
+    return tuple(part_box(part) for part in world.parts.values())
 
 
 def part_box(part: PartConfig) -> Box:
     """Return the box of a part: tilted about its y axis, and then turned about the vertical."""
     tilt, turn = np.radians([part.tilt, part.turn]) / 2
     # The product of the quaternions of the turn (about z) and the tilt (about y).
-    quaternion = np.array(
-        [
-            -np.sin(turn) * np.sin(tilt),
-            np.cos(turn) * np.sin(tilt),
-            np.sin(turn) * np.cos(tilt),
-            np.cos(turn) * np.cos(tilt),
-        ]
+    quaternion = (
+        float(-np.sin(turn) * np.sin(tilt)),
+        float(np.cos(turn) * np.sin(tilt)),
+        float(np.sin(turn) * np.cos(tilt)),
+        float(np.cos(turn) * np.cos(tilt)),
     )
-    return Box(np.array(part.position), quaternion, np.array(part.size) / 2)
+    return Box(tuple(part.position), quaternion, tuple(size / 2 for size in part.size))
 
 
 def surface_height(boxes: Sequence[Box], place: np.ndarray) -> float:

@@ -238,8 +238,8 @@ class Simulator:
 
     def _add_part(self, part: PartConfig) -> int:
         bullet, box = self._bullet, part_box(part)
-        form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=box.half.tolist())
-        handle = bullet.createMultiBody(0, form, -1, box.position.tolist(), box.quaternion.tolist())
+        form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=box.half)
+        handle = bullet.createMultiBody(0, form, -1, box.position, box.quaternion)
         bullet.changeDynamics(
             handle, -1, lateralFriction=part.friction, restitution=part.restitution
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -31,7 +32,7 @@ def compute_visibility(
     quaternions: np.ndarray,
     camera: Camera,
     scales: Sequence[float] | None = None,
-    parts: Sequence[Box] = (),
+    parts: tuple[Box, ...] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Determine by ray casting which objects are in view, and their visible fractions.
 
@@ -58,8 +59,10 @@ def compute_visibility(
     eye = np.asarray(camera.eye)
     hides = _may_hide(positions - eye, radius)
     hides &= ~outside[:, :, None] & ~outside[:, None, :]
-    part_hides = [_box_may_hide(box, low, high, positions, radius, camera) for box in parts]
-    behind = np.any([hides.any(-1), *part_hides], axis=0)
+    behind_part = np.zeros_like(inside)
+    for box in parts:
+        behind_part |= _box_may_hide(box, low, high, positions, radius, camera)
+    behind = hides.any(-1) | behind_part
 
     in_view = inside.copy()
     fraction = inside.astype(np.float64)
@@ -68,9 +71,22 @@ def compute_visibility(
         shape, scale = objects[k].shape, scales[k]
         return intersect_object(shape, scale, positions[f, k], quaternions[f, k], eye, rays)
 
+    stride = max(1, round(STRIDE * camera.magnification))
     # Rays are needed only for objects at the border of the image or behind something.
     for f, i in np.argwhere(~outside & (~inside | behind)):
-        rays = _rays_around(centre[f, i], half_side[f, i], camera)
+        window = _pixels_around(low[f, i], high[f, i], camera, stride)
+        hidden_by = np.flatnonzero(hides[f, i])
+        is_behind_part = False
+        if behind_part[f, i]:
+            part_distances = _part_distances(camera, parts)[window].reshape(-1)
+            # Distances are depths, since rays advance by 1 along the optical axis.
+            is_behind_part = part_distances.min() < depth[f, i] + radius[i]
+            if inside[f, i] and part_distances.max() < depth[f, i] - radius[i]:
+                fraction[f, i] = 0.0
+                continue
+            if inside[f, i] and not is_behind_part and not len(hidden_by):
+                continue
+        rays = pixel_rays(camera)[window].reshape(-1, 3)
         own = intersect(f, i, rays)
         covered = np.isfinite(own)
         in_view[f, i] = covered.any()
@@ -79,11 +95,10 @@ def compute_visibility(
             continue
         rays, own = rays[covered], own[covered]
         visible = np.ones(len(own), dtype=bool)
-        for j in np.flatnonzero(hides[f, i]):
+        for j in hidden_by:
             visible &= ~(intersect(f, j, rays) < own)
-        for box, may_hide in zip(parts, part_hides, strict=True):
-            if may_hide[f, i]:
-                visible &= ~(box.intersect(eye, rays) < own)
+        if is_behind_part:
+            visible &= ~(part_distances[covered] < own)
         fraction[f, i] = visible.sum() / len(own)
     return in_view, fraction
 
@@ -125,14 +140,25 @@ def _box_may_hide(
     pixels, _ = camera.project(box.corners)
     overlap = ((low <= pixels.max(axis=0)) & (high >= pixels.min(axis=0))).all(-1)
     eye = np.asarray(camera.eye)
-    nearest = np.linalg.norm(box.position - eye) - np.linalg.norm(box.half)
+    nearest = np.linalg.norm(np.subtract(box.position, eye)) - np.linalg.norm(box.half)
     return overlap & (np.linalg.norm(positions - eye, axis=-1) + radius > nearest)
 
 
-def _rays_around(centre: np.ndarray, half_side: float, camera: Camera) -> np.ndarray:
-    """Return rays (P, 3) through evenly spaced pixels of a square, as far as it is in the image."""
-    left, top = np.maximum(np.floor(centre - half_side), 0).astype(int)
-    right = min(int(centre[0] + half_side) + 1, camera.width)
-    bottom = min(int(centre[1] + half_side) + 1, camera.height)
-    stride = max(1, round(STRIDE * camera.magnification))
-    return pixel_rays(camera)[top:bottom:stride, left:right:stride].reshape(-1, 3)
+@lru_cache(maxsize=2)
+def _part_distances(camera: Camera, parts: tuple[Box, ...]) -> np.ndarray:
+    """Return the parameter of each pixel's ray at its first intersection with a part (H, W); inf
+    for none."""
+    rays = pixel_rays(camera)
+    eye, flat = np.asarray(camera.eye), rays.reshape(-1, 3)
+    first = [box.intersect(eye, flat) for box in parts]
+    return np.min(first, axis=0).reshape(rays.shape[:2])
+
+
+def _pixels_around(
+    low: np.ndarray, high: np.ndarray, camera: Camera, stride: int
+) -> tuple[slice, slice]:
+    """Return every `stride`-th row and column of a square, as far as it is in the image."""
+    left, top = (max(int(bound), 0) for bound in low)
+    right, bottom = int(high[0]) + 1, int(high[1]) + 1
+    rows = slice(top, min(bottom, camera.height), stride)
+    return rows, slice(left, min(right, camera.width), stride)

@@ -97,7 +97,8 @@ def crop(appearance: SceneObject, place: tuple[float, float], yaw: float) -> np.
         {"renderer": "bullet", "width": 192, "height": 128, "world": asdict(CLEVRER)}
     )
     renderer.pose(scene, 0)
-    pixels, mask = renderer.capture()
+    packed, mask = renderer.capture()
+    pixels = packed.view(np.uint8).reshape(*mask.shape, 4)
     is_object = (mask >= 0)[..., None]
     oversampled = np.dstack([pixels[..., :3] * is_object, is_object])
     averaged = oversampled.reshape(128, 2, 192, 2, 4).mean(axis=(1, 3))
