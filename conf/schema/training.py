@@ -242,12 +242,12 @@ def stage(steps: int, batch: int, lr: float) -> StageConfig:
 class BaseTrainConfig(Settings):
     vision: StageConfig = stage(3000, 16, 2e-3)
     """The vision tower learns to see objects in single pictures."""
-    motion: StageConfig = stage(1500, 8, 1e-3)
+    motion: StageConfig = stage(2000, 8, 1e-3)
     """The whole model learns where objects are and where they go."""
-    words: StageConfig = stage(5000, 8, 8e-4)
+    words: StageConfig = stage(3500, 8, 8e-4)
     """The model learns to answer questions in words."""
     weight_decay: float = setting(0.05, least=0)
-    """Weight decay of AdamW."""
+    """Weight decay of Muon and AdamW."""
     adam_beta2: float = setting(0.98, least=0, below=1)
     """Decay rate of AdamW's second moment."""
     max_grad_norm: float = setting(1.0, above=0)

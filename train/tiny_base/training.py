@@ -41,6 +41,7 @@ from train.common.journal import CURVES, JOURNAL, read_journal
 from train.tiny_base.collator import OracleCollator, letter_token_ids
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import OracleHeads
+from train.tiny_base.muon import Muon
 from train.tiny_base.oracle_targets import SPATIAL_WORDS, WORDS, OracleTargets
 from train.tiny_base.pointing import pointing_losses
 from train.tiny_base.probe import Probe
@@ -170,22 +171,31 @@ class BaseTrainer:
 
     def run(self) -> None:
         """Train through all stages, from the checkpoint if there is one."""
-        self.optimizer = self._new_optimizer()
+        self.optimizers = self._new_optimizers()
         self._load()
         for stage in STAGES[self.stage :]:
             self._run_stage(stage, getattr(self.cfg, stage))
             self.stage, self.step = self.stage + 1, 0
-            self.optimizer = self._new_optimizer()
+            self.optimizers = self._new_optimizers()
             self._save()
 
-    def _new_optimizer(self) -> torch.optim.AdamW:
+    def _new_optimizers(self) -> list[torch.optim.Optimizer]:
+        """Return Muon for the matrices of the layers, and AdamW for embeddings, biases, norms and
+        heads."""
+        named = self.model.named_parameters()
+        matrices = [p for name, p in named if p.dim() == 2 and "embed" not in name]
+        with_muon = {id(p) for p in matrices}
+        others = [p for p in self.parameters if id(p) not in with_muon]
         groups = [
-            {"params": [p for p in self.parameters if p.dim() > 1]},
+            {"params": [p for p in others if p.dim() > 1]},
             # Biases and the weights of norms do not decay.
-            {"params": [p for p in self.parameters if p.dim() <= 1], "weight_decay": 0.0},
+            {"params": [p for p in others if p.dim() <= 1], "weight_decay": 0.0},
         ]
-        betas = (0.9, self.cfg.adam_beta2)
-        return torch.optim.AdamW(groups, betas=betas, weight_decay=self.cfg.weight_decay)
+        decay, betas = self.cfg.weight_decay, (0.9, self.cfg.adam_beta2)
+        return [
+            Muon(matrices, weight_decay=decay),
+            torch.optim.AdamW(groups, betas=betas, weight_decay=decay),
+        ]
 
     def _run_stage(self, name: str, stage: StageConfig) -> None:
         # Words would make the vision tower worse at what it has learnt from dense targets.
@@ -218,8 +228,9 @@ class BaseTrainer:
         self.model.train()
         samples = self.sampler.make_batch(name, self.step, stage.batch)
         batch, targets = self.collate(samples)
-        for group in self.optimizer.param_groups:
-            group["lr"] = stage.lr * learning_rate_factor(self.step, stage.steps)
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = stage.lr * learning_rate_factor(self.step, stage.steps)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.cfg.precision == "bf16"):
             losses = LOSSES[name](self.model, self.heads, batch, targets)
         loss = sum(losses.values())
@@ -229,11 +240,13 @@ class BaseTrainer:
                 f"train.{name}.lr in another run (run=NAME)",
                 code="non-finite-loss",
             )
-        self.optimizer.zero_grad()
+        self.model.zero_grad()
+        self.heads.zero_grad()
         loss.backward()
         average_gradients(self.parameters)
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.cfg.max_grad_norm)
-        self.optimizer.step()
+        for optimizer in self.optimizers:
+            optimizer.step()
         return {k: v.item() for k, v in losses.items()}
 
     def _log(self, record: dict[str, float | str]) -> None:
@@ -250,7 +263,7 @@ class BaseTrainer:
             "tokenizer": self.tokenizer_digest,
             "model": self.model.state_dict(),
             "heads": self.heads.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "journal": (self.folder / JOURNAL).stat().st_size,
         }
         part = self.folder / f"{CHECKPOINT}.tmp"
@@ -275,7 +288,8 @@ class BaseTrainer:
         self.stage, self.step = state["stage"], state["step"]
         self.model.load_state_dict(state["model"])
         self.heads.load_state_dict(state["heads"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(saved)
         if rank() == 0:
             os.truncate(journal, state["journal"])
         log.info("resuming at step %d of stage %s", self.step, [*STAGES, "end"][self.stage])

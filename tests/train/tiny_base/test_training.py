@@ -91,7 +91,7 @@ def test_killed_run_resumes_as_if_it_had_never_stopped(
 
 def test_checkpoints_of_another_tokenizer_are_refused(cfg, micro_store: Store, tmp_path) -> None:
     trainer = start(cfg, micro_store, tmp_path)
-    trainer.optimizer = trainer._new_optimizer()
+    trainer.optimizers = trainer._new_optimizers()
     (tmp_path / "metrics.jsonl").touch()
     trainer._save()
     other = replace(cfg.student, architecture=replace(SIZES, vocabulary=400))
@@ -101,7 +101,7 @@ def test_checkpoints_of_another_tokenizer_are_refused(cfg, micro_store: Store, t
 
 def test_eyes_train_the_vision_tower_alone(cfg, micro_store: Store, tmp_path: Path) -> None:
     trainer = start(cfg, micro_store, tmp_path / "run")
-    trainer.optimizer = trainer._new_optimizer()
+    trainer.optimizers = trainer._new_optimizers()
     before = {name: w.clone() for name, w in trainer.model.state_dict().items()}
     trainer._train_step("vision", STAGE)
     changed = {n for n, w in trainer.model.state_dict().items() if not torch.equal(w, before[n])}
