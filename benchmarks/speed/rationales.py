@@ -48,8 +48,8 @@ def main() -> None:
             return result
 
         for item in store.selection("train"):
-            for scene in {item.scene_id, *(c.scene_id for c in item.candidates)}:
-                timed("loading scenes", store.scene, scene)
+            for scene_id in {item.scene_id, *(c.scene_id for c in item.candidates)}:
+                timed("loading scenes", store.scene, scene_id)
             predicates = timed("predicates", describe_item, item, store, cfg)
             if predicates is None:
                 continue

@@ -82,6 +82,7 @@ def compute_visibility(
             # Distances are depths, since rays advance by 1 along the optical axis.
             is_behind_part = part_distances.min() < depth[f, i] + radius[i]
             if inside[f, i] and part_distances.max() < depth[f, i] - radius[i]:
+                # Parts hide the object completely.
                 fraction[f, i] = 0.0
                 continue
             if inside[f, i] and not is_behind_part and not len(hidden_by):

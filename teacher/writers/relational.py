@@ -135,21 +135,21 @@ class RelationalWriter(Writer):
         return f"the {relation.objects[0]} {verb} {self.place(relation)}"
 
     def change(self, relation: Relation, verb: str) -> str:
-        """Return what an object does, such as "reaches the left edge".
+        """Return what an object does, with the verb in the present or the future.
 
         Args:
-            verb: The key of `POSSESSIVE` that a state would have, or "with" for a participle.
+            verb: "is" for "reaches the left edge", "will be" for "will reach the left edge".
         """
-        first, rest = self.place(relation).split(" ", 1)
-        infinitive, participle = CHANGE_VERBS[first]
-        verbs = {"is": first, "will be": f"will {infinitive}", "with": participle}
-        return f"{verbs[verb]} {rest}"
+        present, rest = self.place(relation).split(" ", 1)
+        infinitive, _ = CHANGE_VERBS[present]
+        return f"{present if verb == 'is' else f'will {infinitive}'} {rest}"
 
     def attribute(self, relation: Relation, true: bool = True) -> str:
         """Return what follows the subject in `shown`, for a relation that is true or false."""
         if relation.kind in CHANGES:
-            said = self.change(relation, "with")
-            return said if true else f"not {said}"
+            present, rest = self.place(relation).split(" ", 1)
+            _, participle = CHANGE_VERBS[present]
+            return f"{'' if true else 'not '}{participle} {rest}"
         if not true:
             return f"not {self.place(relation)}"
         if relation.kind in SYMMETRIC:
