@@ -2,8 +2,8 @@
 
 Muon replaces the momentum of a matrix by the nearest matrix with orthonormal rows or columns, so
 that an update changes all directions equally (K. Jordan et al., 2024,
-https://kellerjordan.github.io/posts/muon/). With it, the tiny base learns to see
-in about half as many steps as with AdamW.
+https://kellerjordan.github.io/posts/muon/). With it, the tiny base learns to see in about half as
+many steps as with AdamW.
 
 `torch.optim.Muon` does this in bf16. On processors without bf16 instructions, that takes 20 to 30
 times as long as in fp32.
