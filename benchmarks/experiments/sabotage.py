@@ -35,8 +35,8 @@ from models.student.collator import IGNORED, Encoded
 from models.student.prompts import Clip, Sample
 
 TRAINING = (
-    "+exp=cot", "teacher.predicates=relational", "benchmark=short", "train.epochs=3",
-    "train.evaluations=1", "train.generated_items=0",
+    "+exp=cot", "teacher.predicates=relational", "benchmark=short", "train.epochs=1",
+    "train.evaluations=1", "train.validation_items=8", "train.generated_items=0",
 )  # fmt: skip
 EVALUATION = ("benchmark=short", "modes=[reasoning]", "batch=64")
 CHANCE = 1 / len(LETTERS)
