@@ -47,8 +47,8 @@ from teacher.vocabulary import VERSIONS
 RECORD = Path(__file__).with_name("letters.parquet")
 BOTH = ("reasoning", "answer")
 RELATIONAL = "teacher.predicates=relational"
-EPOCHS = "train.epochs=1"
-"""One epoch of `comparison` has about as many steps as four of `tiny`."""
+STEPS = "train.max_steps=180", "train.evaluations=1"
+"""Every student is trained for the same number of steps."""
 ZERO_SHOT = "zero-shot"
 UNCHANGED = "none"
 CONTROLS = ("candidate_only", "shuffled_prefix", MATCHED_ANCHOR)
@@ -100,7 +100,7 @@ def main() -> None:
     parser.add_argument("--student", default="tiny")
     parser.add_argument("--variants", nargs="+", choices=[*VARIANTS], default=[*VARIANTS])
     args = parser.parse_args()
-    overrides = [f"student={args.student}", f"benchmark={args.benchmark}", EPOCHS]
+    overrides = [f"student={args.student}", f"benchmark={args.benchmark}", *STEPS]
     base = weights_digest(compose("train.sft", SftCommand, overrides).student.model)
     # Results of other settings, other items or other rationales are not reused.
     versions = {"builders": BUILDERS_VERSIONS, "narrator": NARRATOR_VERSION, "words": VERSIONS}
@@ -114,7 +114,7 @@ def main() -> None:
         name, seed = job
         variant, student = VARIANTS[name], f"student={args.student}"
         folder = experiment.run_name(*job)
-        training = variant.training and [*variant.training, f"seed={seed}", student, EPOCHS]
+        training = variant.training and [*variant.training, f"seed={seed}", student, *STEPS]
         # The default modes ask a base for a structured record, which the tiny base cannot write.
         modes = f"modes=[{','.join(variant.modes)}]"
         # A trained student is evaluated with the settings of its training.
