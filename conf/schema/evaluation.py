@@ -49,7 +49,7 @@ class GenerationCommand(CommandConfig):
     """Folder of a run of train.sft, train.distill or train.reinforce, or of its export. The
     settings saved there replace `student` and `train`. null measures the base that `student`
     names."""
-    batch: int = setting(16, least=1)
+    batch: int = setting(32, least=1)
     """Number of prompts per generated batch; not used with servers."""
     seed: int = setting(0, least=0)
     """Seed for sampling items and responses, and for the bootstrap."""
