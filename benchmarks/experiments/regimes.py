@@ -47,7 +47,7 @@ from teacher.vocabulary import VERSIONS
 RECORD = Path(__file__).with_name("letters.parquet")
 BOTH = ("reasoning", "answer")
 RELATIONAL = "teacher.predicates=relational"
-STEPS = "train.max_steps=180", "train.evaluations=1"
+STEPS = "train.max_steps=100", "train.evaluations=1"
 """Every student is trained for the same number of steps."""
 ZERO_SHOT = "zero-shot"
 UNCHANGED = "none"
