@@ -269,12 +269,14 @@ class Simulator:
         form = bullet.createCollisionShape(kind, **size)
         mass = getattr(world.objects.mass, material) * scale**3
         handle = bullet.createMultiBody(mass, form, -1, state[:3], state[3:7])
+        # The solver takes longer with rolling friction, which only spheres need to stop.
+        rolling_friction = physics.rolling_friction if shape == "sphere" else 0.0
         bullet.changeDynamics(
             handle,
             -1,
             lateralFriction=physics.object_friction,
-            rollingFriction=physics.rolling_friction,
-            spinningFriction=physics.rolling_friction,
+            rollingFriction=rolling_friction,
+            spinningFriction=rolling_friction,
             restitution=getattr(physics.restitution, material),
             linearDamping=0,
             angularDamping=0,
