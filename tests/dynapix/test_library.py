@@ -239,7 +239,7 @@ def test_name_of_a_preset_and_a_world_builds_the_benchmark_in_the_world(
     micro = object()
     monkeypatch.setattr("data.build.ensure_benchmark", remember)
     assert dynapix.load("tiny-settling", store=tmp_path).store is micro
-    assert built == [("tiny-settling", 0.02, tmp_path)]
+    assert built == [("tiny-settling", 0.025, tmp_path)]
 
 
 def test_unknown_and_damaged_benchmarks_are_refused(micro_store, tmp_path) -> None:
