@@ -49,7 +49,7 @@ from data.tracks.retrieval import future
 from data.tracks.retrieval.database import make_databases
 from data.tracks.shortfalls import count_records, summarize_store
 from data.world.displacement import visible_positions
-from data.world.physics import GENERATOR_VERSION
+from data.world.physics import generator_version
 from data.world.scenes import make_scenes
 
 log = logging.getLogger(__name__)
@@ -213,7 +213,7 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(parents=True, exist_ok=True)
     plan = {
-        "generator": GENERATOR_VERSION,
+        "generator": generator_version(cfg.world.physics.rolling_friction),
         "benchmark": {key: asdict(cfg)[key] for key in SCENE_SETTINGS},
         "counterfactual scenes": {
             split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS

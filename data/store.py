@@ -47,7 +47,7 @@ from data.records import (
 )
 from data.render import RENDERERS
 from data.tracks.selection.distractors import BUILDERS_VERSIONS
-from data.world.physics import GENERATOR_VERSION
+from data.world.physics import generator_version
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -70,7 +70,7 @@ def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
     """Return the versions of the code that determines scenes, pixels, items and queries."""
     is_rendered, renderer = config["simulator"] == "bullet", RENDERERS[config["renderer"]]
     return {
-        "generator": GENERATOR_VERSION,
+        "generator": generator_version(config["world"]["physics"]["rolling_friction"]),
         "renderer": renderer.version if is_rendered else f"{config['simulator']}'s own frames",
         "builders": BUILDERS_VERSIONS[config["distractors"]],
     }

@@ -40,7 +40,7 @@ from data.tracks.selection import event, time, window
 from data.tracks.selection.balanced_subset import RESERVE, choose_items
 from data.tracks.selection.distractors import BUILDERS_VERSIONS, Family, Timing
 from data.tracks.shortcuts import item_scores, order_target_first
-from data.world.physics import GENERATOR_VERSION
+from data.world.physics import generator_version
 
 DYNAPIX_FAMILIES = {"event": event.FAMILY, "time": time.FAMILY, "window": window.FAMILY}
 OBSERVATIONS = ("event", "window")
@@ -67,7 +67,8 @@ def make_items_and_queries(
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
     recipe = cfg.distractors, cfg.selection.observation
     version = BUILDERS_VERSIONS[cfg.distractors]
-    inputs = [GENERATOR_VERSION, version, scene_ids, *recipe, *settings]
+    generator = generator_version(cfg.world.physics.rolling_friction)
+    inputs = [generator, version, scene_ids, *recipe, *settings]
     paths = {
         name: part_path(folder, [*inputs, name, asdict(quota)]) for name, quota in quotas.items()
     }

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 GENERATOR_VERSION = "2"
 """Changes whenever the same seed and index give a different scene."""
+ROLLING_VERSION = "2"
+"""Changes whenever this is so only in worlds with rolling friction."""
 
 SOLVER_ITERATIONS = 20
 CONTACT_FREE_FRAMES = 5
@@ -82,6 +84,11 @@ class Motion:
     @property
     def velocities(self) -> np.ndarray:
         return self.states[..., 7:10]
+
+
+def generator_version(rolling_friction: float) -> str:
+    """Return the version of the code that determines the scenes of a world."""
+    return f"{GENERATOR_VERSION}.{ROLLING_VERSION}" if rolling_friction else GENERATOR_VERSION
 
 
 def connect() -> BulletClient:

@@ -1,6 +1,6 @@
 """Samples the scenes of a world, and records their oracle.
 
-A scene depends only on the seed, its index, the world and GENERATOR_VERSION.
+A scene depends only on the seed, its index, the world and the version of the generator.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ from data.store import Store
 from data.world import sliding
 from data.world.camera import Camera
 from data.world.events import find_motion_onsets
-from data.world.physics import Body, shared_simulator
+from data.world.physics import Body, generator_version, shared_simulator
 from data.world.sampling import FALLEN, REMEDIES, check_sample, sample_scene
 from data.world.shapes import RADIUS
 from data.world.starts import RejectedError
@@ -163,6 +163,15 @@ def test_standard_world_is_no_part_of_the_identity() -> None:
     """Benchmarks of the world clevrer keep the identity that they had without worlds."""
     cfg = compose("data.build", BuildCommand, ["benchmark=tiny", "world=clevrer"]).benchmark
     assert world_changes(cfg.world) == {}
+
+
+def test_rolling_friction_has_a_version_of_its_own() -> None:
+    """A change of rolling friction leaves the benchmarks of other worlds valid."""
+    versions = {
+        name: generator_version(preset_world(name).physics.rolling_friction) for name in WORLDS
+    }
+    assert versions["settling"].startswith(f"{versions['clevrer']}.")
+    assert {v for name, v in versions.items() if name != "settling"} == {versions["clevrer"]}
 
 
 @pytest.mark.parametrize(
