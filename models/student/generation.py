@@ -21,6 +21,7 @@ from transformers import (
 
 from conf.schema import StudentConfig
 from models.loading import DTYPES
+from models.student.kv_cache import create_cache
 from models.student.responses import THOUGHT_TAG, GeneratedText
 
 TAG_SEARCH_TOKENS = 8
@@ -57,7 +58,7 @@ def generate(
             **inputs,
             max_new_tokens=limit,
             do_sample=False,
-            use_cache=True,
+            past_key_values=create_cache(model),
             logits_processor=processors,
         )
     prompt, new = ids[:, : inputs["input_ids"].shape[1]], ids[:, inputs["input_ids"].shape[1] :]

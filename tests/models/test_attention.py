@@ -18,6 +18,7 @@ from models.attention import (
     choose_attention,
 )
 from models.student.collator import Collator
+from models.student.kv_cache import BLOCK, create_cache
 from models.student.prompts import Sample, selection_sample
 from train.student.trainer import token_mean
 
@@ -155,6 +156,22 @@ def test_attention_depends_on_precision_and_length(model) -> None:
     ):
         choose_attention(model, precision, length)
         assert (text._attn_implementation, vision._attn_implementation) == (expected, BY_FRAME)
+
+
+@pytest.mark.parametrize("length", [MATMUL_MAX_TOKENS, MATMUL_MAX_TOKENS + 1])
+@pytest.mark.parametrize("padded", [True, False])
+def test_unused_memory_of_the_cache_changes_no_results(
+    samples, processor, model, length, padded
+) -> None:
+    choose_attention(model, "fp32", length)
+    batch = Collator(processor, LENGTH)(samples if padded else samples[:1])
+    del batch["labels"], batch["logits_to_keep"]
+    # The responses end beyond the first block that has room for the prompt.
+    settings = {"min_new_tokens": BLOCK + 10, "max_new_tokens": BLOCK + 10, "do_sample": False}
+    with torch.no_grad():
+        blocks = model.generate(**batch, **settings, past_key_values=create_cache(model))
+        expected = model.generate(**batch, **settings, use_cache=False)
+    assert torch.equal(blocks, expected)
 
 
 @pytest.mark.parametrize("precision", ["bf16", "fp32"])

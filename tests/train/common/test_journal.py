@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 from tqdm import tqdm
-from transformers import ProcessorMixin
+from transformers import ProcessorMixin, Qwen3VLConfig
 from transformers.trainer_callback import TrainerControl, TrainerState
 
 from conf import trackers
@@ -147,6 +147,8 @@ def test_an_unknown_best_metric_is_refused(settings, tmp_path) -> None:
 
 class Writer(nn.Module):
     """A model that generates given texts."""
+
+    config = Qwen3VLConfig()
 
     def __init__(self, processor: ProcessorMixin, texts: list[str]) -> None:
         super().__init__()
