@@ -5,8 +5,8 @@
 
 The variants are
 
-    student         `train.sft +exp=cot`
-    longer SFT      the same with more epochs (`--epochs`)
+    student         `train.sft +exp=cot`, 100 steps
+    longer SFT      the same with more steps (`--steps`), which take as long as the next variants
     distillation    the student, trained further by `train.distill`, towards a teacher that
                     `train.sft` has trained with the facts in its prompt
     rewards         the student, trained further by `train.reinforce`
@@ -60,10 +60,11 @@ RECORD = Path(__file__).with_name("on_policy.parquet")
 VARIANTS = STUDENT, LONGER, DISTILLATION, REWARDS = (
     "student", "longer SFT", "distillation", "rewards"
 )  # fmt: skip
-SFT = ["+exp=cot", "teacher.predicates=relational"]
+LONGER_SFT = ["+exp=cot", "teacher.predicates=relational", "train.evaluations=1"]
+SFT = [*LONGER_SFT, "train.max_steps=100"]
 FACTS = [*SFT, "train.facts=true"]
-DISTILL = ["+exp=on_policy", "train.evaluations=2"]
-REINFORCE = ["+exp=grpo", "train.evaluations=2"]
+DISTILL = ["+exp=on_policy", "train.max_steps=60", "train.evaluations=2"]
+REINFORCE = ["+exp=grpo", "train.max_steps=30", "train.evaluations=2"]
 MINUTES = "cpu_minutes.txt"
 """File in the folder of a training that was not interrupted."""
 HORIZONS = {"1 s": "in_1s", "2 s": "in_2s"}
@@ -71,8 +72,8 @@ HORIZONS = {"1 s": "in_1s", "2 s": "in_2s"}
 
 
 def main() -> None:
-    parser = create_parser(__doc__, "tiny", RECORD)
-    parser.add_argument("--epochs", type=float, default=6, help="epochs of the longer SFT")
+    parser = create_parser(__doc__, "comparison", RECORD)
+    parser.add_argument("--steps", type=int, default=330, help="steps of the longer SFT")
     args = parser.parse_args()
     base = compose("train.sft", SftCommand, [f"benchmark={args.benchmark}"]).student.model
     experiment = Experiment(
@@ -104,13 +105,14 @@ def settings_keys(args: argparse.Namespace) -> dict[str, str]:
     def key_of(command: str, schema: type, overrides: list[str]) -> str:
         return training_key(command, schema, overrides, versions)
 
-    sft = [*SFT, f"benchmark={args.benchmark}"]
-    student = key_of("train.sft", SftCommand, sft)
+    benchmark = f"benchmark={args.benchmark}"
+    student = key_of("train.sft", SftCommand, [*SFT, benchmark])
+    longer = [*LONGER_SFT, f"train.max_steps={args.steps}", benchmark]
     distill = key_of("train.distill", DistillCommand, [*DISTILL, "model=none"])
     reinforce = key_of("train.reinforce", ReinforceCommand, [*REINFORCE, "model=none"])
     return {
         STUDENT: student,
-        LONGER: key_of("train.sft", SftCommand, [*sft, f"train.epochs={args.epochs}"]),
+        LONGER: key_of("train.sft", SftCommand, longer),
         DISTILLATION: settings_key([student, distill]),
         REWARDS: settings_key([student, reinforce]),
     }
@@ -135,7 +137,7 @@ def train_variant(experiment: Experiment, variant: str, seed: int) -> list[Path]
         return folder
 
     if variant == LONGER:
-        train("train.sft", name, [*SFT, f"train.epochs={args.epochs}", *shared])
+        train("train.sft", name, [*LONGER_SFT, f"train.max_steps={args.steps}", *shared])
         return trained
     train("train.sft", student.name, [*SFT, *shared])
     if variant == DISTILLATION:
