@@ -88,6 +88,14 @@ class RetrievalTrackConfig(Settings):
     """Number of frames in the database of all counterfactual queries, including every target."""
 
 
+def store_name(benchmark: str, world: str) -> str:
+    """Return the name of a benchmark's folder: that of the benchmark, followed by the world's name
+    unless the world is clevrer or the name ends with it."""
+    if world == "clevrer" or benchmark.endswith(world):
+        return benchmark
+    return f"{benchmark}-{world}"
+
+
 @dataclass
 class BenchmarkConfig(Settings):
     name: str = MISSING
@@ -126,12 +134,8 @@ class BenchmarkConfig(Settings):
 
     @property
     def store_name(self) -> str:
-        """Name of the benchmark's folder: `name`, followed by the world's name unless the world is
-        clevrer or `name` ends with it."""
-        world = self.world.name
-        if world == "clevrer" or self.name.endswith(world):
-            return self.name
-        return f"{self.name}-{world}"
+        """Name of the benchmark's folder below `store`."""
+        return store_name(self.name, self.world.name)
 
     @property
     def item_recipe(self) -> str:

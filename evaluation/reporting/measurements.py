@@ -10,6 +10,7 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
+from conf.schema.benchmark import store_name
 from data.records import SelectionItem
 from evaluation.metrics.results import UNTRAINED, RetrievalResult, SelectionResult
 from evaluation.metrics.significance import PairedComparison, compare_runs
@@ -83,7 +84,10 @@ class Measurement:
     @property
     def training_benchmark(self) -> str | None:
         """The benchmark that the model was trained on, if known."""
-        return (self.training or {}).get("benchmark", {}).get("name")
+        if (benchmark := (self.training or {}).get("benchmark")) is None:
+            return None
+        world = benchmark.get("world", {}).get("name", "clevrer")
+        return store_name(benchmark["name"], world)
 
     @property
     def base(self) -> str | None:

@@ -174,7 +174,7 @@ def paired_table(comparisons: Iterable[PairedComparison]) -> Table:
     adjusted = adjust_holm([p.p for p in comparisons])
     groups: dict[str, list[Row]] = {}
     for p, holm in zip(comparisons, adjusted, strict=True):
-        label = f"{p.mode}{': ' * bool(p.mode)}{p.left} (left) less {p.right} (right)"
+        label = f"{p.mode}{': ' * bool(p.mode)}{p.left} (left) minus {p.right} (right)"
         row = {
             "name": p.of, "Left": p.left_accuracy, "Right": p.right_accuracy,
             "Difference": f"{100 * p.difference:+.1f}",
@@ -246,7 +246,7 @@ def rank_differences_table(differences: Iterable[RetrieverDifference]) -> Table:
     groups: dict[str, list[Row]] = {}
     for d in differences:
         measures = dict(zip(columns, d.measures.values(), strict=True))
-        rows = groups.setdefault(f"{d.left} less {d.right}", [])
+        rows = groups.setdefault(f"{d.left} minus {d.right}", [])
         rows.append({"name": f"at width {_width(d.width)}", **measures})
     caption = "Differences between retrievers, query by query (recall in %)"
     note = "Intervals are bootstrapped over scenes."

@@ -160,7 +160,7 @@ def teacher_settings(cfg: DistillCommand, trained: SftCommand) -> tuple[Path, Sf
     for name, ours, theirs in (
         ("train.regime", trained.train.regime, settings.train.regime),
         ("teacher.predicates", trained.teacher.predicates, settings.teacher.predicates),
-        ("benchmark.name", trained.benchmark.name, settings.benchmark.name),
+        ("benchmark", trained.benchmark.store_name, settings.benchmark.store_name),
     ):
         if ours != theirs:
             raise UserError(

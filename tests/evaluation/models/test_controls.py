@@ -64,7 +64,7 @@ def test_candidate_only_is_compared_with_the_unchanged_items(
     assert (overall["only_left"], overall["only_right"], overall["n"]) == (plain, control, 12)
     assert overall["difference"] == pytest.approx((plain - control) / 12)
     text = (tmp_path / "report.txt").read_text()
-    assert "answer: unchanged (left) less candidate_only (right)" in text
+    assert "answer: unchanged (left) minus candidate_only (right)" in text
     assert "any base (answer, candidate_only)" in text
 
     # The same command sends no requests when it is run again, and has the same results.

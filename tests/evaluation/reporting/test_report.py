@@ -92,11 +92,11 @@ def test_students_are_compared_with_their_bases_and_with_other_regimes(
     }  # fmt: skip
     # No base was measured in answer mode, and no student in record mode.
     groups = read_groups(read_table(folder, "paired-micro").replace("\\", ""))
-    assert set(groups) == {f"{left} (left) less {other} (right)" for left, other in expected}
+    assert set(groups) == {f"{left} (left) minus {other} (right)" for left, other in expected}
     for (left, other), cells in expected.items():
         [overall] = [
             line
-            for line in groups[f"{left} (left) less {other} (right)"].splitlines()
+            for line in groups[f"{left} (left) minus {other} (right)"].splitlines()
             if line.startswith("| all |")
         ]
         assert cells in overall
@@ -211,6 +211,22 @@ def test_results_on_a_benchmark_without_trained_models_are_transfer(runs, report
     assert "python -m data.build benchmark=elsewhere" in page
 
 
+def test_results_in_the_world_of_the_training_are_no_transfer(runs):
+    path = runs / "select" / "cot" / "report.json"
+    path.write_text(path.read_text().replace('"micro"', '"micro-above"', 1))
+    for run, key, value in (
+        ("sft/cot", "benchmark.world.name", "above"),
+        ("select/cot", "model", str(runs / "sft" / "cot")),
+    ):
+        settings = OmegaConf.load(runs / run / "config.yaml")
+        OmegaConf.update(settings, key, value)
+        OmegaConf.save(settings, runs / run / "config.yaml")
+    folder = run_report(runs, runs, items=1, runs=["select/cot"])
+    names = {path.stem for path in (folder / "tables").glob("*.md")}
+    assert "transfer" not in names
+    assert "distillation-selection-micro-above" in names
+
+
 @pytest.mark.parametrize("key", ["simulator", "recipe"])
 def test_a_base_on_a_transfer_suite_is_not_in_the_zero_shot_table(runs, key):
     config = runs / "select" / "base" / "config.yaml"
@@ -280,7 +296,7 @@ def test_a_retriever_is_compared_with_its_untrained_base(runs, micro, micro_stor
     similarity_run(runs, micro_store, micro, "small", model="other", untrained=(0, 1, 0, 0))
     folder = report(runs=["similarity/*"], items=40)
     table = read_table(folder, "paired-micro")
-    assert {name.split(" less ")[1] for name in read_groups(table)} == {
+    assert {name.split(" minus ")[1] for name in read_groups(table)} == {
         "untrained small, emb (similarity) (right)", "untrained small, other (similarity) (right)"
     }  # fmt: skip
     first = np.mean([item.answer == 0 for item in micro_store.selection("test")])

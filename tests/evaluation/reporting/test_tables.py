@@ -157,7 +157,7 @@ def test_differences_between_retrievers_are_paired_by_query():
     assert different.measures["recall@1"].value == (above == 0).mean()
     assert all(0 <= m.low <= m.value <= m.high for m in different.measures.values())
     text = str(rank_differences_table([same, different]))
-    assert "one less again" in text
+    assert "one minus again" in text
     assert "+0.0 to +0.0" in text
 
 
