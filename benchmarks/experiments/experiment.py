@@ -29,6 +29,10 @@ Job = tuple[str, int]
 """A variant and a seed."""
 
 
+MONITORING = ("evaluations", "generated_items", "keep_checkpoints")
+"""Settings of a training that do not change its last step."""
+
+
 class CommandError(SystemExit):
     """A command of an experiment failed. Unless it is caught, it ends the script."""
 
@@ -168,10 +172,13 @@ def training_key(
 ) -> str:
     """Return a short hash of what decides the result of a training, apart from its seed.
 
+    The trained model is that of the last step, so the settings in `MONITORING` change nothing.
+
     Args:
         versions: Versions of the code that makes the training's data.
     """
     settings = asdict(compose(command, schema, overrides))
+    settings["train"] = {k: v for k, v in settings["train"].items() if k not in MONITORING}
     deciding = ("student", "retriever", "teacher", "train", "benchmark")
     return settings_key([{name: settings.get(name) for name in deciding}, versions])
 
