@@ -48,7 +48,9 @@ MEASURES = {"recall@1": 1, "recall@10": 1, "recall@50": 1, "mrr": 3, "median_ran
 
 
 def main() -> None:
-    args = create_parser(__doc__, "tiny", RANKS).parse_args()
+    parser = create_parser(__doc__, "tiny", RANKS)
+    parser.add_argument("--variants", nargs="+", choices=[*VARIANTS], default=[*VARIANTS])
+    args = parser.parse_args()
     benchmark = f"benchmark={args.benchmark}"
     base = compose("train.contrastive", ContrastiveCommand, [benchmark]).retriever.model
     # Results of other settings, another base or other items are not reused.
@@ -66,7 +68,7 @@ def main() -> None:
         training = [*VARIANTS[variant], f"seed={seed}"]
         return read_ranks(experiment.train_and_evaluate(experiment.run_name(*job), training))
 
-    jobs = [(variant, seed) for seed, variant in product(range(args.seeds), VARIANTS)]
+    jobs = [(variant, seed) for seed, variant in product(range(args.seeds), args.variants)]
     print_tables(experiment.run(jobs, evaluate))
 
 
