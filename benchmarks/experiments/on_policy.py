@@ -73,7 +73,7 @@ HORIZONS = {"1 s": "in_1s", "2 s": "in_2s"}
 
 def main() -> None:
     parser = create_parser(__doc__, "comparison", RECORD)
-    parser.add_argument("--steps", type=int, default=330, help="steps of the longer SFT")
+    parser.add_argument("--steps", type=int, default=300, help="steps of the longer SFT")
     args = parser.parse_args()
     base = compose("train.sft", SftCommand, [f"benchmark={args.benchmark}"]).student.model
     experiment = Experiment(

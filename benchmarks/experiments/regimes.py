@@ -49,10 +49,10 @@ BOTH = ("reasoning", "answer")
 RELATIONAL = "teacher.predicates=relational"
 SHARED = ("train.evaluations=1",)
 STEPS = "train.max_steps=100"
-"""Number of steps of every student that learns rationales."""
-ANSWER_STEPS = "train.max_steps=600"
-"""Number of steps on answers alone. Their loss is that of a random letter for the first 300. They
-take about three times the compute of the steps on rationales."""
+"""Number of steps of the students that learn rationales."""
+EQUAL_COMPUTE = "train.max_steps=600", "train.max_steps=300"
+"""Numbers of steps on answers alone, and on rationales, that take about the same time. On answers
+alone, the loss is that of a random letter for the first 300 steps."""
 ZERO_SHOT = "zero-shot"
 UNCHANGED = "none"
 CONTROLS = ("candidate_only", "shuffled_prefix", MATCHED_ANCHOR)
@@ -77,9 +77,10 @@ class Variant:
 
 VARIANTS = {
     ZERO_SHOT: Variant(None),
-    "answers alone": Variant(("+exp=answer_only", ANSWER_STEPS), ("answer",), controls=True),
+    "answers alone": Variant(("+exp=answer_only", EQUAL_COMPUTE[0]), ("answer",), controls=True),
     "CoT": Variant(("+exp=cot", STEPS)),
     "relational CoT": Variant(("+exp=cot", STEPS, RELATIONAL), controls=True),
+    "relational CoT, 300 steps": Variant(("+exp=cot", EQUAL_COMPUTE[1], RELATIONAL)),
     "relational CoT without candidate analysis": Variant(
         ("+exp=cot_no_candidate_analysis", STEPS, RELATIONAL)
     ),
@@ -88,6 +89,8 @@ VARIANTS = {
 MAIN = ("relational CoT", "reasoning")
 PAIRS = (
     (MAIN, ("answers alone", "answer")),
+    (("relational CoT, 300 steps", "reasoning"), ("answers alone", "answer")),
+    (("relational CoT, 300 steps", "reasoning"), MAIN),
     (MAIN, ("CoT", "reasoning")),
     (MAIN, ("relational CoT", "answer")),
     (MAIN, ("relational CoT without candidate analysis", "reasoning")),
