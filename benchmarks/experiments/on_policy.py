@@ -43,7 +43,13 @@ from benchmarks.experiments.experiment import (
     run_command,
     training_key,
 )
-from benchmarks.experiments.records import Resampling, count_claims, credit_matrix
+from benchmarks.experiments.records import (
+    HORIZONS,
+    Resampling,
+    count_claims,
+    credit_matrix,
+    horizon_intervals,
+)
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import DistillCommand, ReinforceCommand, SftCommand
@@ -67,8 +73,6 @@ DISTILL = ["+exp=on_policy", "train.max_steps=60", "train.evaluations=2"]
 REINFORCE = ["+exp=grpo", "train.max_steps=30", "train.evaluations=2"]
 MINUTES = "cpu_minutes.txt"
 """File in the folder of a training that was not interrupted."""
-HORIZONS = {"1 s": "in_1s", "2 s": "in_2s"}
-"""Subtypes of the time family."""
 
 
 def main() -> None:
@@ -169,7 +173,7 @@ def read_rows(folder: Path, store: Store) -> Iterator[dict[str, Any]]:
         response = responses[item.item_id]
         yield {
             "mode": "reasoning", "item_id": item.item_id, "family": item.family,
-            "subtype": item.subtype, "scene_id": item.scene_id, "answer": item.letter,
+            "scene_id": item.scene_id, "answer": item.letter,
             "letter": response.letter, "numbers": bool(find_numbers(response.text)),
             "text": response.text,
         } | dict(count_claims(item, response, store))  # fmt: skip
@@ -184,14 +188,9 @@ def print_accuracies(results: pd.DataFrame) -> None:
     print_header("", *FAMILIES, "macro", *HORIZONS, "seeds", "CPU minutes")
     for variant, matrix in credits.items():
         rows = results[results.variant == variant]
-        # The subtypes of time items are their horizons.
-        by_horizon = credit_matrix(
-            rows[rows.family == "time"].assign(family=rows.subtype), variant, "reasoning"
-        )
-        horizons = Resampling(by_horizon.index, tuple(HORIZONS.values()))
         intervals = [
             *resampling.intervals((variant, matrix)),
-            *horizons.intervals((variant, by_horizon))[:-1],
+            *horizon_intervals(results, variant, "reasoning"),
         ]
         cells = [f"{m:.1f} [{low:.1f}, {high:.1f}]" for m, low, high in intervals]
         minutes = rows.groupby("seed").cpu_minutes.first().astype(float).mean()

@@ -21,6 +21,8 @@ from teacher.predicates.facts import OUT_OF_VIEW
 from teacher.predicates.relations import Bounds
 from teacher.validation.reasons import PARTS, SUPPORTED, read_response
 
+HORIZONS = ("1s", "2s")
+"""Times from the end of the prefix to the target of a time item."""
 DRAWS = 4000
 """Number of bootstrap samples."""
 
@@ -52,6 +54,17 @@ def credit_matrix(table: pd.DataFrame, variant: str, mode: str) -> pd.DataFrame:
     rows = table[(table.variant == variant) & (table["mode"] == mode)]
     credits = (rows.letter == rows.answer).astype(float)
     return credits.groupby([rows.family, rows.scene_id, rows.item_id, rows.seed]).sum().unstack()
+
+
+def horizon_intervals(
+    table: pd.DataFrame, variant: str, mode: str
+) -> list[tuple[float, float, float]]:
+    """Return the mean accuracy on time items and the bounds of its interval, in percent, for each
+    of `HORIZONS`."""
+    # An item's id begins with its family and its subtype, such as time-in_1s.
+    horizon = table.item_id.str.extract(r"^time-in_(\ds)-", expand=False)
+    credits = credit_matrix(table[horizon.notna()].assign(family=horizon), variant, mode)
+    return Resampling(credits.index, HORIZONS).intervals((variant, credits))[: len(HORIZONS)]
 
 
 class Resampling:

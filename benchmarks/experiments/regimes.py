@@ -30,7 +30,13 @@ from benchmarks.experiments.experiment import (
     read_item_responses,
     training_key,
 )
-from benchmarks.experiments.records import Resampling, count_claims, credit_matrix
+from benchmarks.experiments.records import (
+    HORIZONS,
+    Resampling,
+    count_claims,
+    credit_matrix,
+    horizon_intervals,
+)
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import SftCommand
@@ -185,14 +191,16 @@ def print_tables(table: pd.DataFrame, store: Store) -> None:
 def print_accuracies(
     table: pd.DataFrame, correct: dict[tuple[str, str], pd.DataFrame], resampling: Resampling
 ) -> None:
-    print_header("", "mode", *FAMILIES, "macro", "by seed", "parsed")
+    horizons = [f"time, {horizon}" for horizon in HORIZONS]
+    print_header("", "mode", *FAMILIES, "macro", *horizons, "by seed", "parsed")
     for (name, mode), credits in correct.items():
         rows = table[(table.variant == name) & (table["mode"] == mode)]
         seeds = [100 * resampling.means(credits[[seed]])[-1] for seed in credits]
-        cells = [
-            f"{m:.1f} [{low:.1f}, {high:.1f}]"
-            for m, low, high in resampling.intervals((name, credits))
+        intervals = [
+            *resampling.intervals((name, credits)),
+            *horizon_intervals(table, name, mode),
         ]
+        cells = [f"{m:.1f} [{low:.1f}, {high:.1f}]" for m, low, high in intervals]
         by_seed = " ".join(f"{s:.1f}" for s in seeds)
         print_row(name, mode, *cells, by_seed, f"{100 * rows.letter.notna().mean():.1f}")
 
