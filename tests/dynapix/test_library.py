@@ -180,7 +180,7 @@ def test_results_are_compared_on_the_same_items(bench) -> None:
     overall = comparison[-1]
     difference = one.accuracy.micro.value - two.accuracy.micro.value
     assert overall.difference == pytest.approx(difference)
-    assert "one (left) less two (right)" in str(comparison)
+    assert "one (left) minus two (right)" in str(comparison)
     few = dynapix.evaluate(bench.selection[:-2], always_a, name="few", progress=False)
     with raises_user_error("different-items", contains=("2 only in one",)):
         one.compare(few)
