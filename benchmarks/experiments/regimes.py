@@ -230,7 +230,7 @@ def print_controls(
     controls = [control for control in CONTROLS if control != MATCHED_ANCHOR]
     print_header("macro, first seed", "unchanged", *controls, "pairs, event", "pairs, time")
     for (name, mode), credits in correct.items():
-        if not VARIANTS[name].controls:
+        if not VARIANTS[name].controls or 0 not in credits:
             continue
         first = credits[[0]]
         cells = [f"{100 * resampling.means(first)[-1]:.1f}"]
