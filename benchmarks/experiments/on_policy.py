@@ -6,7 +6,7 @@
 The variants are
 
     student         `train.sft +exp=cot`, 100 steps
-    longer SFT      the same with more steps (`--steps`), which take as long as the next variants
+    longer SFT      the same with more steps (`--steps`), for about as much compute as the others
     distillation    the student, trained further by `train.distill`, towards a teacher that
                     `train.sft` has trained with the facts in its prompt
     rewards         the student, trained further by `train.reinforce`

@@ -54,11 +54,13 @@ RECORD = Path(__file__).with_name("letters.parquet")
 BOTH = ("reasoning", "answer")
 RELATIONAL = "teacher.predicates=relational"
 SHARED = ("train.evaluations=1",)
+"""Overrides of every training."""
 STEPS = "train.max_steps=100"
 """Number of steps of the students that learn rationales."""
-EQUAL_COMPUTE = "train.max_steps=600", "train.max_steps=300"
-"""Numbers of steps on answers alone, and on rationales, that take about the same time. On answers
-alone, the loss is that of a random letter for the first 300 steps."""
+ANSWER_STEPS = "train.max_steps=600"
+"""Number of steps on answers alone. For the first 300, the loss is that of a random letter."""
+LONG_STEPS = "train.max_steps=300"
+"""Number of steps on rationales that take about as long as `ANSWER_STEPS`."""
 ZERO_SHOT = "zero-shot"
 UNCHANGED = "none"
 CONTROLS = ("candidate_only", "shuffled_prefix", MATCHED_ANCHOR)
@@ -83,10 +85,10 @@ class Variant:
 
 VARIANTS = {
     ZERO_SHOT: Variant(None),
-    "answers alone": Variant(("+exp=answer_only", EQUAL_COMPUTE[0]), ("answer",), controls=True),
+    "answers alone": Variant(("+exp=answer_only", ANSWER_STEPS), ("answer",), controls=True),
     "CoT": Variant(("+exp=cot", STEPS)),
     "relational CoT": Variant(("+exp=cot", STEPS, RELATIONAL), controls=True),
-    "relational CoT, 300 steps": Variant(("+exp=cot", EQUAL_COMPUTE[1], RELATIONAL)),
+    "relational CoT, 300 steps": Variant(("+exp=cot", LONG_STEPS, RELATIONAL)),
     "relational CoT without candidate analysis": Variant(
         ("+exp=cot_no_candidate_analysis", STEPS, RELATIONAL)
     ),

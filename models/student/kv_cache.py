@@ -33,6 +33,8 @@ class BlockLayer(DynamicLayer):
     values for each new token, which takes half of the time of a step on a CPU.
     """
 
+    is_croppable = False
+
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self._length = 0
@@ -65,11 +67,3 @@ class BlockLayer(DynamicLayer):
             memory = larger
         memory[..., start:stop, :] = states
         return memory
-
-    def reset(self) -> None:
-        super().reset()
-        self._length = 0
-
-    def crop(self, tokens_to_remove: int) -> None:
-        """Remove the last `-tokens_to_remove` tokens."""
-        self._length += tokens_to_remove
