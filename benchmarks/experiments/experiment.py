@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +29,8 @@ from models.fingerprints import settings_key
 Job = tuple[str, int]
 """A variant and a seed."""
 
-
+MINUTES = "cpu_minutes.txt"
+"""File with the CPU time of a training, in its folder. An interrupted training has none."""
 MONITORING = ("evaluations", "generated_items", "keep_checkpoints")
 """Settings of a training that do not change its last step."""
 
@@ -142,6 +144,15 @@ class Experiment:
         table.to_parquet(part, index=False, compression="zstd")
         part.replace(self.args.record)
 
+    def train(self, command: str, name: str, overrides: Sequence[str]) -> Path:
+        """Train with a command, and return the folder of the run."""
+        folder = self.args.checkpoints / command.partition(".")[2] / name
+        interrupted, started = folder.exists(), read_cpu_minutes()
+        run_command([command, *overrides, f"run={name}"])
+        if not interrupted:
+            (folder / MINUTES).write_text(f"{read_cpu_minutes() - started}\n")
+        return folder
+
     def train_and_evaluate(
         self,
         name: str,
@@ -157,11 +168,9 @@ class Experiment:
             evaluation: Overrides of the evaluation.
             trained: Run of the training; by default, that of the evaluation.
         """
-        trained = trained or name
         if training is not None:
-            run_command([self.trainer, *training, *self.shared_overrides, f"run={trained}"])
-            kind = self.trainer.partition(".")[2]
-            evaluation = [*evaluation, f"model={self.args.checkpoints / kind / trained}"]
+            folder = self.train(self.trainer, trained or name, [*training, *self.shared_overrides])
+            evaluation = [*evaluation, f"model={folder}"]
         # The command itself reuses the answers of the same model.
         run_command([self.evaluator, *evaluation, *self.shared_overrides, f"run={name}"])
         return self.args.checkpoints / self.evaluator.partition(".")[2] / name
@@ -213,6 +222,12 @@ def run_command(command: Sequence[str]) -> None:
     print("python -m", *command, flush=True)
     if subprocess.run([sys.executable, "-m", *command]).returncode:
         raise CommandError(f"error: {' '.join(command)} failed, see above")
+
+
+def read_cpu_minutes() -> float:
+    """Return the CPU time of all finished subprocesses, in minutes."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return (used.ru_utime + used.ru_stime) / 60
 
 
 def print_header(*titles: object) -> None:

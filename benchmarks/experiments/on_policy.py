@@ -5,11 +5,13 @@
 
 The variants are
 
-    student         `train.sft +exp=cot`, 100 steps
-    longer SFT      the same with more steps (`--steps`), for about as much compute as the others
-    distillation    the student, trained further by `train.distill`, towards a teacher that
-                    `train.sft` has trained with the facts in its prompt
-    rewards         the student, trained further by `train.reinforce`
+    relational CoT               the student of `benchmarks.experiments.regimes`, 100 steps
+    relational CoT, 300 steps    the same, for about as much compute as the next two
+    distillation                 the student, trained further by `train.distill`, towards a teacher
+                                 that `train.sft` has trained with the facts in its prompt
+    rewards                      the student, trained further by `train.reinforce`
+
+The runs of the first two are those of `benchmarks.experiments.regimes`, whichever runs first.
 
 The record, `on_policy.parquet`, has a row per test item and run. The first table has accuracies in
 percent, with 95% intervals over scenes and seeds, and minutes of CPU time of all trainings that a
@@ -23,9 +25,7 @@ the share about objects that are out of view at the cut.
 
 from __future__ import annotations
 
-import argparse
 import re
-import resource
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.experiments.experiment import (
+    MINUTES,
     Experiment,
     Job,
     create_parser,
@@ -50,6 +51,8 @@ from benchmarks.experiments.records import (
     credit_matrix,
     horizon_intervals,
 )
+from benchmarks.experiments.regimes import BOTH, EVALUATION, SHARED
+from benchmarks.experiments.regimes import VARIANTS as REGIMES
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import DistillCommand, ReinforceCommand, SftCommand
@@ -63,33 +66,28 @@ from teacher.validation.reasons import PARTS
 from teacher.vocabulary import VERSIONS
 
 RECORD = Path(__file__).with_name("on_policy.parquet")
-VARIANTS = STUDENT, LONGER, DISTILLATION, REWARDS = (
-    "student", "longer SFT", "distillation", "rewards"
+STUDENT, LONGER, DISTILLATION, REWARDS = (
+    "relational CoT", "relational CoT, 300 steps", "distillation", "rewards"
 )  # fmt: skip
-LONGER_SFT = ["+exp=cot", "teacher.predicates=relational", "train.evaluations=1"]
-SFT = [*LONGER_SFT, "train.max_steps=100"]
-FACTS = [*SFT, "train.facts=true"]
+VARIANTS = (STUDENT, LONGER, DISTILLATION, REWARDS)
+SFT = {name: [*(REGIMES[name].training or ()), *SHARED] for name in (STUDENT, LONGER)}
+FACTS = [*SFT[STUDENT], "train.facts=true"]
 DISTILL = ["+exp=on_policy", "train.max_steps=60", "train.evaluations=2"]
 REINFORCE = ["+exp=grpo", "train.max_steps=30", "train.evaluations=2"]
-MINUTES = "cpu_minutes.txt"
-"""File in the folder of a training that was not interrupted."""
 
 
 def main() -> None:
-    parser = create_parser(__doc__, "comparison", RECORD)
-    parser.add_argument("--steps", type=int, default=300, help="steps of the longer SFT")
-    args = parser.parse_args()
+    args = create_parser(__doc__, "comparison", RECORD).parse_args()
     base = compose("train.sft", SftCommand, [f"benchmark={args.benchmark}"]).student.model
-    experiment = Experiment(
-        args, weights_digest(base), settings_keys(args), "train.sft", "evaluation.select"
-    )
+    settings = settings_keys(args.benchmark)
+    experiment = Experiment(args, weights_digest(base), settings, "train.sft", "evaluation.select")
     store = Path(args.store)
 
     def run_variant(job: Job) -> list[dict[str, Any]]:
         trained = train_variant(experiment, *job)
         name = experiment.run_name(*job)
         run_command([
-            "evaluation.select", f"model={trained[-1]}", "modes=[reasoning]", "batch=64",
+            "evaluation.select", f"model={trained[-1]}", f"modes=[{','.join(BOTH)}]", *EVALUATION,
             *experiment.shared_overrides, f"run={name}",
         ])  # fmt: skip
         minutes = sum_minutes(trained)
@@ -102,23 +100,20 @@ def main() -> None:
     print_responses(results)
 
 
-def settings_keys(args: argparse.Namespace) -> dict[str, str]:
+def settings_keys(benchmark: str) -> dict[str, str]:
     """Return the key of each variant's settings: those of all trainings that it needs."""
     versions = {"builders": BUILDERS_VERSIONS, "narrator": NARRATOR_VERSION, "words": VERSIONS}
-
-    def key_of(command: str, schema: type, overrides: list[str]) -> str:
-        return training_key(command, schema, overrides, versions)
-
-    benchmark = f"benchmark={args.benchmark}"
-    student = key_of("train.sft", SftCommand, [*SFT, benchmark])
-    longer = [*LONGER_SFT, f"train.max_steps={args.steps}", benchmark]
-    distill = key_of("train.distill", DistillCommand, [*DISTILL, "model=none"])
-    reinforce = key_of("train.reinforce", ReinforceCommand, [*REINFORCE, "model=none"])
-    return {
-        STUDENT: student,
-        LONGER: key_of("train.sft", SftCommand, longer),
-        DISTILLATION: settings_key([student, distill]),
-        REWARDS: settings_key([student, reinforce]),
+    keys = {
+        name: training_key("train.sft", SftCommand, [*sft, f"benchmark={benchmark}"], versions)
+        for name, sft in SFT.items()
+    }
+    distill = training_key("train.distill", DistillCommand, [*DISTILL, "model=none"], versions)
+    reinforce = training_key(
+        "train.reinforce", ReinforceCommand, [*REINFORCE, "model=none"], versions
+    )
+    return keys | {
+        DISTILLATION: settings_key([keys[STUDENT], distill]),
+        REWARDS: settings_key([keys[STUDENT], reinforce]),
     }
 
 
@@ -126,43 +121,30 @@ def train_variant(experiment: Experiment, variant: str, seed: int) -> list[Path]
     """Train what is missing of a variant, and return the folders of its trainings: the last one has
     the student to evaluate."""
     args, name = experiment.args, experiment.run_name(variant, seed)
-    student = args.checkpoints / "sft" / experiment.run_name(STUDENT, seed)
-    where = [f"store={args.store}", f"checkpoints={args.checkpoints}"]
-    shared = experiment.shared_overrides
-    trained = []
 
-    def train(command: str, run: str, overrides: list[str]) -> Path:
-        folder = args.checkpoints / command.partition(".")[2] / run
-        interrupted, started = folder.exists(), cpu_minutes()
-        run_command([command, *overrides, f"seed={seed}", f"run={run}"])
-        if not interrupted:
-            (folder / MINUTES).write_text(f"{cpu_minutes() - started}\n")
-        trained.append(folder)
-        return folder
+    def train_student(name: str, overrides: Sequence[str]) -> Path:
+        overrides = [*overrides, f"seed={seed}", *experiment.shared_overrides]
+        return experiment.train("train.sft", name, overrides)
 
     if variant == LONGER:
-        train("train.sft", name, [*LONGER_SFT, f"train.max_steps={args.steps}", *shared])
-        return trained
-    train("train.sft", student.name, [*SFT, *shared])
+        return [train_student(name, SFT[LONGER])]
+    student = train_student(experiment.run_name(STUDENT, seed), SFT[STUDENT])
+    further = [
+        f"model={student}", f"seed={seed}", f"store={args.store}", f"checkpoints={args.checkpoints}"
+    ]  # fmt: skip
     if variant == DISTILLATION:
-        teacher = train("train.sft", f"{student.name}-facts", [*FACTS, *shared])
-        models = [f"model={student}", f"teacher_model={teacher}"]
-        train("train.distill", name, [*DISTILL, *models, *where])
-    elif variant == REWARDS:
-        train("train.reinforce", name, [*REINFORCE, f"model={student}", *where])
-    return trained
+        teacher = train_student(f"{student.name}-facts", FACTS)
+        overrides = [*DISTILL, f"teacher_model={teacher}", *further]
+        return [student, teacher, experiment.train("train.distill", name, overrides)]
+    if variant == REWARDS:
+        return [student, experiment.train("train.reinforce", name, [*REINFORCE, *further])]
+    return [student]
 
 
 def sum_minutes(trained: Sequence[Path]) -> float | None:
     """Return the minutes of CPU time of several trainings, or None if one was interrupted."""
     files = [folder / MINUTES for folder in trained]
     return sum(float(f.read_text()) for f in files) if all(f.exists() for f in files) else None
-
-
-def cpu_minutes() -> float:
-    """Return the CPU time of all finished subprocesses, in minutes."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return (used.ru_utime + used.ru_stime) / 60
 
 
 def read_rows(folder: Path, store: Store) -> Iterator[dict[str, Any]]:

@@ -1,10 +1,10 @@
-"""Measures what a student predicts in its rationales: whether its predictions are true, and whether
-they single out the target.
+"""Measures what students predict in their rationales: whether their predictions are true, and
+whether they single out the target.
 
     python -m benchmarks.experiments.predictions checkpoints/select/model-checkpoints-sft-exp-cot
 
-The argument is a run of `evaluation.select` with answers in reasoning mode. The columns are, in %
-of the items of a family:
+The arguments are runs of `evaluation.select`, such as the seeds of one experiment. The columns of
+the first table are, in % of the items of a family:
 
     right       the answer is right
     predicts    the response predicts something
@@ -16,12 +16,18 @@ of the items of a family:
     chosen      of the items with predictions, a predicted object is one that the built-in narrator
                 chooses to decide the item
     follows     the answer is a candidate of which the predictions are true
+
+The second table divides the responses by the number of candidates that show what is predicted,
+according to the response itself. The last one tells which candidates wrong answers choose: those of
+an earlier or later moment than the target, or of another scene; and how often these are offered
+among the wrong candidates of the same items.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,13 +40,20 @@ from benchmarks.experiments.experiment import (
     read_item_responses,
 )
 from conf.failures import report_failures
-from data.records import FAMILIES
+from data.records import FAMILIES, LETTERS, SelectionItem
 from data.store import Store
 from teacher.deciding import choose_statements
 from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.relations import Bounds
+from teacher.predicates.facts import Relation
+from teacher.predicates.relations import VALUES, Bounds, normalize_relation
+from teacher.reading.claims import Claim
 from teacher.sufficiency import find_predicted, is_consistent, measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
+
+SUBTYPES = ("in_1s", "in_2s")
+"""Subtypes of time items."""
+KINDS = ("earlier", "later", "another scene")
+"""Kinds of wrong candidates, compared with the target."""
 
 
 class Predicted(NamedTuple):
@@ -50,6 +63,8 @@ class Predicted(NamedTuple):
         fitting: Letters of the candidates of which the predictions are true.
         reader: The probability that a reader of the predictions picks the target.
         chosen: Whether a predicted object decides the item; None if nothing is predicted.
+        described: Letters of the candidates that show all that is predicted, according to the
+            response.
     """
 
     family: str
@@ -58,15 +73,25 @@ class Predicted(NamedTuple):
     fitting: tuple[str, ...]
     reader: float
     chosen: bool | None
+    described: tuple[str, ...]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
-    parser.add_argument("run", type=Path, help="folder of a run of evaluation.select")
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of runs of evaluation.select")
     parser.add_argument("--benchmark", default="tiny")
     parser.add_argument("--store", type=Path, default=Path("store"))
     args = parser.parse_args()
-    found = list(read_predictions(args.run, open_benchmark(args.store, args.benchmark)))
+    store = open_benchmark(args.store, args.benchmark)
+    found = [p for run in args.runs for p in read_predictions(run, store)]
+    if found:
+        print_shares(found)
+        print_agreement(found)
+    print_wrong_answers(args.runs, store)
+
+
+def print_shares(found: Sequence[Predicted]) -> None:
+    """Print the shares of the first table by family."""
     print_header(
         "family", "items", "right", "predicts", "true", "decides", "reader", "chosen", "follows"
     )
@@ -103,7 +128,74 @@ def read_predictions(run: Path, store: Store) -> Iterator[Predicted]:
         names = {name for claim in predicted for name in claim.subjects}
         reader = measure_sufficiency(response.text, claims, p)
         chosen = not names.isdisjoint(deciding) if names else None
-        yield Predicted(item.family, item.letter, response.letter, fitting, reader, chosen)
+        described = find_described(predicted, claims) if predicted else ()
+        yield Predicted(
+            item.family, item.letter, response.letter, fitting, reader, chosen, described
+        )
+
+
+def find_described(predicted: Sequence[Claim], claims: Sequence[Claim]) -> tuple[str, ...]:
+    """Return the letters of the candidates that show all that is predicted, according to the
+    claims about them."""
+    shown = {(c.candidate, statement(c)) for c in claims if c.candidate is not None}
+    return tuple(
+        letter for letter in LETTERS if all((letter, statement(c)) in shown for c in predicted)
+    )
+
+
+def statement(claim: Claim) -> tuple[object, ...]:
+    """Return what a claim states, without the candidate or the moment that it is about."""
+    relation = Relation(claim.kind, claim.subjects, claim.value)
+    return (normalize_relation(relation) if claim.kind in VALUES else relation, claim.affirmed)
+
+
+def print_agreement(found: Sequence[Predicted]) -> None:
+    """Print how often the answer is right by the number of candidates that agree with the
+    prediction, in the student's words."""
+    print_header("agreeing candidates", "responses", "right")
+    for count in range(len(LETTERS) + 1):
+        rows = [r for r in found if r.chosen is not None and len(r.described) == count]
+        share = f"{100 * np.mean([r.answer == r.target for r in rows]):.1f}" if rows else "-"
+        print_row(count, len(rows), share)
+
+
+def print_wrong_answers(runs: Sequence[Path], store: Store) -> None:
+    """Print which wrong candidates are chosen and which are offered, in percent."""
+    print_header("mode", "items", "wrong answers", *(f"{kind}: chosen, offered" for kind in KINDS))
+    items = store.selection("test")
+    for mode in ("reasoning", "answer"):
+        responses = [read_item_responses(run, mode) for run in runs]
+        for family in ("all", *FAMILIES, *SUBTYPES):
+            wrong = [
+                (item, run[item.item_id].letter)
+                for run in responses
+                for item in items
+                if family in ("all", item.family, item.subtype)
+                and item.item_id in run
+                and run[item.item_id].letter not in (None, item.letter)
+            ]
+            if wrong:
+                chosen = Counter(kind_of(item, letter) for item, letter in wrong)
+                offered = Counter(
+                    kind_of(item, letter)
+                    for item, _ in wrong
+                    for letter in LETTERS
+                    if letter != item.letter
+                )
+                cells = (
+                    f"{100 * chosen[k] / chosen.total():.1f}, "
+                    f"{100 * offered[k] / offered.total():.1f}"
+                    for k in KINDS
+                )
+                print_row(mode, family, len(wrong), *cells)
+
+
+def kind_of(item: SelectionItem, letter: str) -> str:
+    """Return which kind of wrong candidate a letter names."""
+    target, chosen = (item.candidates[LETTERS.index(k)] for k in (item.letter, letter))
+    if chosen.scene_id != target.scene_id:
+        return "another scene"
+    return "earlier" if chosen.frame < target.frame else "later"
 
 
 if __name__ == "__main__":

@@ -55,6 +55,8 @@ BOTH = ("reasoning", "answer")
 RELATIONAL = "teacher.predicates=relational"
 SHARED = ("train.evaluations=1",)
 """Overrides of every training."""
+EVALUATION = ("batch=64",)
+"""Overrides of every evaluation."""
 STEPS = "train.max_steps=100"
 """Number of steps of the students that learn rationales."""
 ANSWER_STEPS = "train.max_steps=600"
@@ -133,7 +135,7 @@ def main() -> None:
         # The default modes ask a base for a structured record, which the tiny base cannot write.
         modes = f"modes=[{','.join(variant.modes)}]"
         # A trained student is evaluated with the settings of its training.
-        evaluation = ["batch=64", modes, *([] if training else [student])]
+        evaluation = [*EVALUATION, modes, *([] if training else [student])]
         store, rows = open_benchmark(Path(args.store), args.benchmark), []
         for control in (UNCHANGED, *(CONTROLS if variant.controls and seed == 0 else ())):
             changed = control != UNCHANGED
