@@ -145,8 +145,11 @@ class Experiment:
         part.replace(self.args.record)
 
     def train(self, command: str, name: str, overrides: Sequence[str]) -> Path:
-        """Train with a command, and return the folder of the run."""
+        """Train with a command unless the run is finished, and return the folder of the run. Its
+        name has the key of the settings that decide the result, so no others are compared."""
         folder = self.args.checkpoints / command.partition(".")[2] / name
+        if (folder / "metrics.json").exists():
+            return folder
         interrupted, started = folder.exists(), read_cpu_minutes()
         run_command([command, *overrides, f"run={name}"])
         if not interrupted:

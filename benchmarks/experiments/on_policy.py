@@ -77,7 +77,9 @@ REINFORCE = ["+exp=grpo", "train.max_steps=30", "train.evaluations=2"]
 
 
 def main() -> None:
-    args = create_parser(__doc__, "comparison", RECORD).parse_args()
+    parser = create_parser(__doc__, "comparison", RECORD)
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=VARIANTS)
+    args = parser.parse_args()
     base = compose("train.sft", SftCommand, [f"benchmark={args.benchmark}"]).student.model
     settings = settings_keys(args.benchmark)
     experiment = Experiment(args, weights_digest(base), settings, "train.sft", "evaluation.select")
@@ -94,7 +96,7 @@ def main() -> None:
         rows = read_rows(args.checkpoints / "select" / name, open_benchmark(store, args.benchmark))
         return [{"cpu_minutes": minutes, **row} for row in rows]
 
-    jobs = [(variant, seed) for seed in range(args.seeds) for variant in VARIANTS]
+    jobs = [(variant, seed) for seed in range(args.seeds) for variant in args.variants]
     results = experiment.run(jobs, run_variant)
     print_accuracies(results)
     print_responses(results)
