@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from conf.errors import UserError
+from conf.schema import RelationBounds
 from dynapix.benchmark import Item
 from teacher.numbers.detection import find_numbers
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates
-from teacher.predicates.relations import Bounds
 from teacher.reading.claims import VERDICTS, Claim
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
@@ -90,7 +90,9 @@ def sufficiency(item: Item, text: str) -> float:
 
 def _extract_predicates(item: Item) -> RelationalPredicates:
     store = item._benchmark.store
-    predicates = extract_predicates(item.record, store.scene(item.scene_id), store.scene, Bounds())
+    predicates = extract_predicates(
+        item.record, store.scene(item.scene_id), store.scene, RelationBounds()
+    )
     if predicates is None:
         raise UserError(
             f"{item.item_id} has no predicates: a collision follows its prefix too early",

@@ -10,9 +10,10 @@ from math import dist, erf, hypot, sqrt
 
 import numpy as np
 
+from conf.schema import RelationBounds
 from teacher.predicates.facts import OUT_OF_VIEW, Relation, RelationalPredicates, View
 from teacher.predicates.margins import measure_margin
-from teacher.predicates.relations import CHANGES, Bounds
+from teacher.predicates.relations import CHANGES
 
 SEEN_ERROR, PREDICTED_ERROR = 0.02, 0.3
 """Standard deviations, along each axis, of a reader's errors in the places of objects. `SEEN_ERROR`
@@ -174,13 +175,13 @@ def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:
     return tuple(int(k) for k in (holds[:, None] * excludes).argmax(axis=0))
 
 
-def _probability_of_falsity(statement: Relation, view: View, bounds: Bounds) -> float:
+def _probability_of_falsity(statement: Relation, view: View, bounds: RelationBounds) -> float:
     """Return the probability that a reader finds a statement false of a candidate; 0 if it is
     true."""
     return 0.0 if statement in view.statements else _probability_of_sight(statement, view, bounds)
 
 
-def _probability_of_sight(statement: Relation, view: View, bounds: Bounds) -> float:
+def _probability_of_sight(statement: Relation, view: View, bounds: RelationBounds) -> float:
     """Return the probability that a reader finds a statement true of a candidate if it is true, or
     false if it is false."""
     margin = abs(measure_margin(statement, view.places, bounds))

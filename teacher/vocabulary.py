@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from data.records import SelectionItem
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Predicates, RelationalPredicates
-from teacher.predicates.relations import Bounds
 
 if TYPE_CHECKING:
     from conf.schema import TeacherConfig
@@ -24,17 +22,12 @@ def name_vocabulary(cfg: TeacherConfig) -> str:
     return f"{cfg.predicates} {VERSIONS[cfg.predicates]}"
 
 
-def relation_bounds(cfg: TeacherConfig) -> Bounds:
-    """Return the bounds of the words for relations."""
-    return Bounds(**asdict(cfg.bounds))
-
-
 def describe_item(
     item: SelectionItem, store: Store, cfg: TeacherConfig
 ) -> RelationalPredicates | None:
     """Return all predicates of an item; None if its prefix is too short."""
     scene = store.scene(item.scene_id)
-    return extract_predicates(item, scene, store.scene, relation_bounds(cfg))
+    return extract_predicates(item, scene, store.scene, cfg.bounds)
 
 
 def choose_vocabulary(predicates: RelationalPredicates, cfg: TeacherConfig) -> Predicates:

@@ -27,6 +27,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from conf.failures import report_failures
+from conf.schema import RelationBounds
 from data.records import COLORS, LETTERS
 from data.store import open_store
 from teacher.narrator import write_rationale
@@ -39,7 +40,6 @@ from teacher.predicates.facts import (
     Predicates,
     RelationalPredicates,
 )
-from teacher.predicates.relations import Bounds
 from teacher.validation.claim_extraction import extract_claims
 
 ALL_REGIONS = [region for row in REGIONS for region in row]
@@ -62,7 +62,7 @@ def main() -> None:
     misses: dict[str, list[str]] = defaultdict(list)
     claims: Counter[tuple[str, str]] = Counter()
     rejected = 0
-    bounds = Bounds() if args.predicates == "relational" else None
+    bounds = RelationBounds() if args.predicates == "relational" else None
     for number, (item_id, text, predicates) in enumerate(read_rationales(args.source, bounds)):
         if number == args.limit:
             break
@@ -93,7 +93,7 @@ def main() -> None:
 
 
 def read_rationales(
-    source: Path, bounds: Bounds | None = None
+    source: Path, bounds: RelationBounds | None = None
 ) -> Iterator[tuple[str, str, Predicates]]:
     """Yield the item id, text and predicates of each rationale. With `bounds`, the narrator of a
     benchmark's rationales uses relations."""

@@ -40,12 +40,13 @@ from benchmarks.experiments.experiment import (
     read_item_responses,
 )
 from conf.failures import report_failures
+from conf.schema import RelationBounds
 from data.records import FAMILIES, LETTERS, SelectionItem
 from data.store import Store
 from teacher.deciding import choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation
-from teacher.predicates.relations import VALUES, Bounds, normalize_relation
+from teacher.predicates.relations import VALUES, normalize_relation
 from teacher.reading.claims import Claim
 from teacher.sufficiency import find_predicted, is_consistent, measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
@@ -118,7 +119,7 @@ def read_predictions(run: Path, store: Store) -> Iterator[Predicted]:
         response = responses.get(item.item_id)
         if response is None:
             continue
-        p = extract_predicates(item, store.scene(item.scene_id), store.scene, Bounds())
+        p = extract_predicates(item, store.scene(item.scene_id), store.scene, RelationBounds())
         if p is None:
             continue
         claims = extract_claims(response.text, p)

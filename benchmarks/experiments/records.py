@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from conf.schema import RelationBounds
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
 from evaluation.reporting.run_responses import ItemResponse
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import OUT_OF_VIEW
-from teacher.predicates.relations import Bounds
 from teacher.validation.reasons import PARTS, SUPPORTED, read_response
 
 HORIZONS = ("1s", "2s")
@@ -34,7 +34,7 @@ def count_claims(
     many of the claims about the prefix and the prediction are about objects out of view at the cut;
     none for an item without predicates."""
     scene = store.scene(item.scene_id)
-    predicates = extract_predicates(item, scene, store.scene, Bounds())
+    predicates = extract_predicates(item, scene, store.scene, RelationBounds())
     if predicates is None:
         return
     reasons = read_response(response.text, response.letter, item.letter, predicates)

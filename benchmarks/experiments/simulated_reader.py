@@ -29,6 +29,7 @@ import numpy as np
 
 from benchmarks.experiments.experiment import open_benchmark, print_header, print_row
 from conf.failures import report_failures
+from conf.schema import RelationBounds
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
 from teacher.deciding import UNKNOWN_PATH, Decision, choose_statements
@@ -36,7 +37,6 @@ from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation
 from teacher.predicates.places import region_at
 from teacher.predicates.relations import (
-    Bounds,
     Places,
     find_relations,
     find_topic,
@@ -49,7 +49,7 @@ of the tiny base are about 0.02 and 0.3."""
 ABSENCE = 0.3
 """Distance that counts for an object that only one of two frames shows."""
 READERS = ("statements", "closest", "all places")
-BOUNDS = Bounds()
+BOUNDS = RelationBounds()
 
 
 class Case(NamedTuple):

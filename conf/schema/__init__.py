@@ -40,6 +40,7 @@ from conf.schema.models import (
     StudentConfig,
 )
 from conf.schema.servers import (
+    RelationBounds,
     SamplingServerConfig,
     ServerConfig,
     ServersConfig,

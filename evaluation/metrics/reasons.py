@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from conf.schema import RelationBounds
 from data.records import SelectionItem
 from evaluation.metrics.intervals import Interval, SceneBootstrap
 from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.relations import Bounds
 from teacher.reading.claims import Claim
 from teacher.validation.reasons import (
     CONTRADICTED,
@@ -79,7 +79,7 @@ def read_reasons(
     """Read the reasons of a response; None if the item has no predicates, because a collision
     follows its prefix too early."""
     scene = store.scene(item.scene_id)
-    predicates = extract_predicates(item, scene, store.scene, Bounds())
+    predicates = extract_predicates(item, scene, store.scene, RelationBounds())
     return None if predicates is None else read_response(text, letter, item.letter, predicates)
 
 

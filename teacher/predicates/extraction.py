@@ -8,6 +8,7 @@ from math import dist, hypot
 
 import numpy as np
 
+from conf.schema import RelationBounds
 from data.records import LETTERS, Candidate, Scene, SelectionItem
 from data.world.displacement import MODEL_SIZE
 from teacher.predicates.facts import (
@@ -39,7 +40,6 @@ from teacher.predicates.places import (
 from teacher.predicates.relations import (
     CLEARLY,
     DISPLACED,
-    Bounds,
     Places,
     find_changes,
     find_relations,
@@ -81,7 +81,7 @@ def extract_predicates(
     item: SelectionItem,
     scene: Scene,
     scene_of: Callable[[str], Scene],
-    bounds: Bounds | None = None,
+    bounds: RelationBounds | None = None,
 ) -> Predicates | None:
     """Return the predicates of an item; None if the prefix is too short (see `find_cut`).
 
@@ -123,7 +123,7 @@ def _describe_views(
     scene: Scene,
     scene_of: Callable[[str], Scene],
     cut: int,
-    bounds: Bounds,
+    bounds: RelationBounds,
 ) -> tuple[tuple[Relation, ...], dict[str, float], tuple[View, ...]]:
     """Return the relations at the cut, the paths of the objects, and the views of the candidates.
 

@@ -12,7 +12,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from teacher.predicates.relations import Bounds, Places
+    from conf.schema import RelationBounds
+    from teacher.predicates.relations import Places
 
 SPEEDS = ("slowly", "steadily", "quickly")
 """Words for speeds below each of the bounds of a scene; above these, it is VERY_FAST."""
@@ -196,7 +197,7 @@ class RelationalPredicates(Predicates):
     paths: dict[str, float]
     observed: tuple[Relation, ...]
     views: tuple[View, ...]
-    bounds: Bounds
+    bounds: RelationBounds
 
     @property
     def target(self) -> View:

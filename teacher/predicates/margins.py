@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from math import dist, inf
 
+from conf.schema import RelationBounds
 from teacher.predicates.facts import REGIONS, Relation
 from teacher.predicates.relations import (
     EXTREMES,
     VALUES,
-    Bounds,
     Places,
     between_margin,
     find_covering,
@@ -21,7 +21,7 @@ REGION_INDICES = {value: (x, y) for y, row in enumerate(REGIONS) for x, value in
 """Column and row of each region."""
 
 
-def measure_margin(statement: Relation, places: Places, bounds: Bounds) -> float:
+def measure_margin(statement: Relation, places: Places, bounds: RelationBounds) -> float:
     """Return the distance of what a statement describes from the bound of its words, as a share of
     the image's width or height: not negative if the statement is true of a frame, negative if it is
     false.
@@ -78,13 +78,13 @@ def _order_margin(difference: float, position: int, level: float) -> float:
     return (difference - level, level - abs(difference), -difference - level)[position]
 
 
-def _extreme_margin(name: str, value: str, places: Places, bounds: Bounds) -> float:
+def _extreme_margin(name: str, value: str, places: Places, bounds: RelationBounds) -> float:
     axis, sign = EXTREMES[value]
     others = [sign * place[axis] for other, place in places.image.items() if other != name]
     return min(others, default=-inf) - sign * places.image[name][axis] - bounds.level
 
 
-def _gap_margin(a: str, b: str, value: str, places: Places, bounds: Bounds) -> float:
+def _gap_margin(a: str, b: str, value: str, places: Places, bounds: RelationBounds) -> float:
     size = (places.scale[a] + places.scale[b]) / 2
     apart = dist(places.ground[a], places.ground[b])
     against, near = (size * (1 + bound) for bound in (bounds.against, bounds.near))
@@ -96,7 +96,9 @@ def _gap_margin(a: str, b: str, value: str, places: Places, bounds: Bounds) -> f
     return margin * _image_scale(places, (a, b))
 
 
-def _nearer_margin(a: str, b: str, c: str, value: str, places: Places, bounds: Bounds) -> float:
+def _nearer_margin(
+    a: str, b: str, c: str, value: str, places: Places, bounds: RelationBounds
+) -> float:
     one, other = (dist(places.ground[a], places.ground[name]) for name in (b, c))
     if value == "nearer to":
         margin = other / bounds.nearer - one
@@ -105,7 +107,7 @@ def _nearer_margin(a: str, b: str, c: str, value: str, places: Places, bounds: B
     return margin * _image_scale(places, (a, b), (a, c)) / (1 + 1 / bounds.nearer)
 
 
-def _cover_margin(a: str, b: str, value: str, places: Places, bounds: Bounds) -> float:
+def _cover_margin(a: str, b: str, value: str, places: Places, bounds: RelationBounds) -> float:
     front = a if value == "in front of" else b
     return FAINT if find_covering(places, a, b, bounds) == front else -FAINT
 

@@ -26,8 +26,8 @@ from itertools import combinations, permutations
 from math import hypot, inf
 from typing import NamedTuple
 
+from conf.schema import RelationBounds
 from data.records import Scene
-from data.world.displacement import MODEL_SIZE
 from teacher.predicates.facts import Relation
 from teacher.predicates.places import CONTACT, object_sight
 
@@ -66,42 +66,7 @@ DISPLACED, CLEARLY = 12.0, 40.0
 "clearly" rather than "slightly"."""
 
 
-class Bounds(NamedTuple):
-    """Bounds of the words for relations."""
-
-    level: float = 0.04
-    """Share of the image's width or height below which two objects are aligned or level, and by
-    which the leftmost object must lie to the left of all others."""
-    against: float = 0.15
-    """Gap, as a share of an object's width, below which two objects are against each other."""
-    near: float = 1.0
-    """Gap, as a share of an object's width, below which two objects are near each other."""
-    between_ends: float = 0.2
-    """An object between two others divides their distance; each part has at least this share."""
-    between_offset: float = 0.25
-    """Maximum distance of an object between two others from the line through them, as a share of
-    their distance."""
-    nearer: float = 1.25
-    """a is nearer to b than to c if it is at least this many times as far from c as from b."""
-    covered: float = 0.9
-    """An object is partly hidden if its visible fraction is below this. A close object that is
-    lower in the image is then in front of it."""
-    cover_distance: float = 0.12
-    """Maximum distance in the image of an object from one that it covers, as a share of the
-    width."""
-    edge: float = 0.06
-    """Distance from the image's edge, as a share of its width or height, below which an object has
-    reached the edge."""
-    displaced: float = DISPLACED / MODEL_SIZE
-    """Distance of an object in a candidate from its place at the target, as a share of the image,
-    from which it is "slightly off"."""
-    clearly: float = CLEARLY / MODEL_SIZE
-    """Distance, as above, from which it is "clearly off"."""
-    far: float = 0.25
-    """Distance, as above, from which it is "far off"."""
-
-
-def describe_distance(distance: float, bounds: Bounds) -> str | None:
+def describe_distance(distance: float, bounds: RelationBounds) -> str | None:
     """Return how far an object is off if its place is at a distance (share of the image's width)
     from the expected place: slightly, clearly or far; None if it counts as being there."""
     if distance < bounds.displaced:
@@ -176,7 +141,7 @@ class Places(NamedTuple):
         )
 
 
-def find_relations(places: Places, bounds: Bounds) -> set[Relation]:
+def find_relations(places: Places, bounds: RelationBounds) -> set[Relation]:
     """Return the relations of the visible objects of a frame, normalized."""
     names = sorted(places.image)
     found: set[Relation] = set()
@@ -216,7 +181,7 @@ def find_relations(places: Places, bounds: Bounds) -> set[Relation]:
 
 
 def find_changes(
-    earlier: Places, later: Places, at_rest: set[str], bounds: Bounds
+    earlier: Places, later: Places, at_rest: set[str], bounds: RelationBounds
 ) -> set[Relation]:
     """Return how the places of objects change that are visible at both of two frames, normalized.
 
@@ -253,7 +218,7 @@ def _compare(one: float, other: float, bound: float, words: tuple[str, str, str]
     return words[0] if one < other else words[2]
 
 
-def find_covering(places: Places, a: str, b: str, bounds: Bounds) -> str | None:
+def find_covering(places: Places, a: str, b: str, bounds: RelationBounds) -> str | None:
     """Return which of two objects hides a part of the other; None if neither does.
 
     An object lower in the image is nearer to the camera.
@@ -268,7 +233,7 @@ def between_margin(
     place: tuple[float, float],
     one: tuple[float, float],
     other: tuple[float, float],
-    bounds: Bounds,
+    bounds: RelationBounds,
 ) -> float:
     """Return the distance of a place from the bounds of "between" two others, as a share of the
     image; it is negative if the place is not between them."""
@@ -282,7 +247,9 @@ def between_margin(
     return min(along - ends, length - ends - along, bounds.between_offset * length - offset)
 
 
-def _find_extremes(image: Mapping[str, tuple[float, float]], bounds: Bounds) -> Iterator[Relation]:
+def _find_extremes(
+    image: Mapping[str, tuple[float, float]], bounds: RelationBounds
+) -> Iterator[Relation]:
     if len(image) < 2:
         return
     for value, (axis, sign) in EXTREMES.items():
@@ -291,7 +258,7 @@ def _find_extremes(image: Mapping[str, tuple[float, float]], bounds: Bounds) -> 
             yield Relation("extreme", (first[1],), value)
 
 
-def _passing_side(earlier: Places, later: Places, a: str, b: str, bounds: Bounds) -> str:
+def _passing_side(earlier: Places, later: Places, a: str, b: str, bounds: RelationBounds) -> str:
     """Return "crosses in front of" if object a is lower in the image than b at both frames."""
     lower = [places.image[a][1] - places.image[b][1] for places in (earlier, later)]
     if min(lower) >= bounds.level:
@@ -299,7 +266,7 @@ def _passing_side(earlier: Places, later: Places, a: str, b: str, bounds: Bounds
     return "crosses behind" if max(lower) <= -bounds.level else "passes"
 
 
-def _edges(place: tuple[float, float], bounds: Bounds) -> set[str]:
+def _edges(place: tuple[float, float], bounds: RelationBounds) -> set[str]:
     x, y = place
     distances = zip(EDGES, (x, 1 - x, y, 1 - y), strict=True)
     return {edge for edge, distance in distances if distance < bounds.edge}

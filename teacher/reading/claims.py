@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
 
+from conf.schema import RelationBounds
 from teacher.predicates.facts import (
     COMPASS,
     OUT_OF_VIEW,
@@ -20,7 +21,6 @@ from teacher.predicates.facts import (
 from teacher.predicates.relations import (
     EXTENTS,
     VALUES,
-    Bounds,
     describe_distance,
     normalize_relation,
 )
@@ -83,7 +83,7 @@ class IndexedPredicates:
         self.observed: frozenset[Relation] | None = None
         """Relations at the cut; None if the predicates have no relations."""
         self.views: dict[str, View] = {}
-        self.bounds: Bounds | None = None
+        self.bounds: RelationBounds | None = None
         if isinstance(predicates, RelationalPredicates):
             self.observed = frozenset(predicates.observed)
             self.views = {view.letter: view for view in predicates.views}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
+from dataclasses import astuple
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
@@ -18,7 +19,7 @@ from teacher.sections import GRAMMAR_VERSION
 from teacher.servers.responses import Response
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.validator import VALIDATOR_VERSION, Validation, validate_rationale
-from teacher.vocabulary import choose_vocabulary, name_vocabulary, relation_bounds
+from teacher.vocabulary import choose_vocabulary, name_vocabulary
 
 MAX_CHARACTERS = 20_000
 """Maximum length of a response. A longer one is rejected, and the record has its beginning only."""
@@ -98,7 +99,7 @@ class RationaleGrader:
         cfg = self.cfg
         settings = [cfg.min_words, cfg.max_words]
         if cfg.predicates == "relational" or cfg.sufficient:
-            settings += [cfg.sufficient, *relation_bounds(cfg)]
+            settings += [cfg.sufficient, *astuple(cfg.bounds)]
         if cfg.url is not None:
             settings += [cfg.model, cfg.temperature, cfg.top_p, cfg.top_k, cfg.max_tokens]
         if self.grammar_version is not None:

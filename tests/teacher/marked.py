@@ -12,10 +12,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from conf.schema import RelationBounds
 from data.records import Scene, SelectionItem
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates
-from teacher.predicates.relations import Bounds
 from teacher.validation.claim_extraction import extract_claims
 from tests.data.simulated import simulate_scene
 from tests.teacher import synthetic
@@ -50,7 +50,9 @@ def marked_items() -> Iterator[tuple[SelectionItem, RelationalPredicates]]:
                 framing=(None, "future", "contact")[k],
             )
             scene = marked_scene(index)
-            predicates = extract_predicates(item, scene, lambda _, scene=scene: scene, Bounds())
+            predicates = extract_predicates(
+                item, scene, lambda _, scene=scene: scene, RelationBounds()
+            )
             if predicates is not None:
                 yield item, predicates
 

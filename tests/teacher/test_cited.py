@@ -8,12 +8,11 @@ from typing import Any
 
 import pytest
 
-from conf.schema import TeacherConfig
+from conf.schema import RelationBounds, TeacherConfig
 from data.records import LETTERS
 from teacher.cited import PREFIXES, CitationError, cited_schema, compose_rationale, list_facts
 from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
-from teacher.predicates.relations import Bounds
 from teacher.prompts import build_messages
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
@@ -39,8 +38,8 @@ def cite_all(facts: dict[str, str]) -> Cited:
     return {name: ordered[name][:8] for name in cited_schema()["required"]}
 
 
-@pytest.mark.parametrize("bounds", [None, Bounds()], ids=["paper", "relational"])
-def test_cited_rationales_are_true_whatever_they_cite(bounds: Bounds | None) -> None:
+@pytest.mark.parametrize("bounds", [None, RelationBounds()], ids=["paper", "relational"])
+def test_cited_rationales_are_true_whatever_they_cite(bounds: RelationBounds | None) -> None:
     for item, predicates in random_cases(40, bounds):
         facts = list_facts(predicates, item)
         text = compose_rationale(json.dumps(cite_all(facts)), facts, predicates.answer)

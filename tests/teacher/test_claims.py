@@ -23,9 +23,9 @@ from benchmarks.experiments.mutations import (
     parse_predicates,
     read_rationales,
 )
-from conf.schema import TeacherConfig
+from conf.schema import RelationBounds, TeacherConfig
 from teacher.narrator import write_rationale
-from teacher.predicates.relations import Bounds, describe_distance
+from teacher.predicates.relations import describe_distance
 from teacher.reading.phrases import PHRASES_BY_FIRST_WORD
 from teacher.sections import SECTIONS
 from teacher.validation.claim_extraction import extract_claims
@@ -120,7 +120,7 @@ def rationales(benchmark_store):
     folder = benchmark_store.folder
     return {
         "narrator": list(read_rationales(folder)),
-        "relational": list(read_rationales(folder, Bounds())),
+        "relational": list(read_rationales(folder, RelationBounds())),
         "prose": PROSE,
     }
 
@@ -177,7 +177,11 @@ def add_rare_statements(text, predicates):
         f" Candidate {view.letter} has the {name} {extent} off."
         for view in predicates.views
         for name in target.keys() & view.places.image.keys()
-        if (extent := describe_distance(dist(view.places.image[name], target[name]), Bounds()))
+        if (
+            extent := describe_distance(
+                dist(view.places.image[name], target[name]), RelationBounds()
+            )
+        )
     ]
     text = text.replace("\nOutcome:", f"{''.join(sorted(off))}\nOutcome:")
     text = text.replace("\nPrediction:", f"{''.join(edges + passed)}\nPrediction:")

@@ -9,7 +9,7 @@ from math import dist, hypot
 import numpy as np
 import pytest
 
-from conf.schema import TeacherConfig
+from conf.schema import RelationBounds, TeacherConfig
 from teacher.deciding import UNSEEN_DISTANCE, choose_statements, measure_separation
 from teacher.narrator import FULL, write_match_lines, write_rationale
 from teacher.predicates.facts import Relation
@@ -17,7 +17,6 @@ from teacher.predicates.relations import (
     CHANGES,
     KINDS,
     VALUES,
-    Bounds,
     describe_distance,
     normalize_relation,
 )
@@ -27,7 +26,7 @@ from teacher.validation.validator import validate_rationale
 from teacher.writers.relational import RelationalWriter
 from tests.teacher.test_predicates import random_cases
 
-BOUNDS = Bounds()
+BOUNDS = RelationBounds()
 CFG = TeacherConfig(name="template")
 
 

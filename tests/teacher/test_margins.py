@@ -8,6 +8,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from conf.schema import RelationBounds
 from teacher import deciding
 from teacher.deciding import choose_statements
 from teacher.predicates.extraction import extract_predicates
@@ -16,7 +17,6 @@ from teacher.predicates.margins import measure_margin
 from teacher.predicates.relations import (
     CHANGES,
     VALUES,
-    Bounds,
     Places,
     find_relations,
     normalize_relation,
@@ -26,7 +26,7 @@ from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 from tests.teacher.test_relations import A, B, C, places, random_places
 
-BOUNDS = Bounds()
+BOUNDS = RelationBounds()
 IN_THE_IMAGE = ("region", "side", "height", "between", "extreme")
 """Kinds of statements whose margins are exact. Gaps and distances are measured on the ground."""
 
@@ -131,7 +131,7 @@ def choose_with_margins(
 ) -> tuple[Relation, ...]:
     """Choose with the margins of a statement, and those of all others, multiplied."""
 
-    def measure_scaled(s: Relation, where: Places, bounds: Bounds) -> float:
+    def measure_scaled(s: Relation, where: Places, bounds: RelationBounds) -> float:
         return measure_margin(s, where, bounds) * (factor if s == statement else others)
 
     with patch.object(deciding, "measure_margin", measure_scaled):

@@ -7,8 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from conf.schema import TeacherConfig
-from conf.schema.servers import RelationBounds
+from conf.schema import RelationBounds, TeacherConfig
 from data.records import Rationale
 from teacher.journal import Journal, read_rationales
 from teacher.narrate import ensure_rationales, narrate_store

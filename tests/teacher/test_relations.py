@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import combinations, permutations
 
 import numpy as np
 import pytest
 
-from conf.schema import TeacherConfig
-from conf.schema.servers import RelationBounds
+from conf.schema import RelationBounds, TeacherConfig
+from data.world.displacement import MODEL_SIZE
 from teacher.predicates.facts import Relation
 from teacher.predicates.relations import (
+    CLEARLY,
+    DISPLACED,
     KINDS,
     OPPOSITES,
     SYMMETRIC,
-    Bounds,
     Places,
     describe_distance,
     find_changes,
@@ -25,7 +26,7 @@ from teacher.predicates.relations import (
 )
 from tests.teacher import synthetic
 
-BOUNDS = Bounds()
+BOUNDS = RelationBounds()
 A, B, C = "blue metal cube", "green metal sphere", "red rubber cylinder"
 
 
@@ -197,7 +198,7 @@ def test_objects_that_look_alike_have_no_relations() -> None:
 
 
 def test_bounds_of_words_are_settings() -> None:
-    wide = BOUNDS._replace(level=0.2)
+    wide = replace(BOUNDS, level=0.2)
     near = places(a=(0.4, 0.5), b=(0.5, 0.5))
     assert values(find_relations(near, BOUNDS), "side") == {((A, B), "left of")}
     assert values(find_relations(near, wide), "side") == {((A, B), "aligned with")}
@@ -212,9 +213,13 @@ def test_interchangeable_objects_state_the_same(order: tuple[int, int]) -> None:
     assert normalize_relation(Relation("side", tuple(names), value)) in relations
 
 
-def test_bounds_of_the_settings_are_those_of_the_predicates() -> None:
-    """The schema cannot import the teacher, so that it repeats the bounds."""
-    assert Bounds(**asdict(RelationBounds())) == Bounds()
+def test_bounds_of_displacements_are_those_of_the_paper_by_default() -> None:
+    """The schema cannot import the teacher, so that it repeats two bounds."""
+    default = RelationBounds()
+    assert (default.displaced, default.clearly) == (DISPLACED / MODEL_SIZE, CLEARLY / MODEL_SIZE)
+
+
+def test_invalid_bounds_are_named() -> None:
     [problem] = TeacherConfig(name="t", bounds=RelationBounds(against=2.0)).check("teacher.")
     assert "teacher.bounds.against=2" in problem
     [problem] = TeacherConfig(name="t", bounds=RelationBounds(clearly=0.3)).check("teacher.")
@@ -233,6 +238,6 @@ def test_distances_have_the_words_of_their_bounds(distance: float, extent: str |
 
 
 def test_bounds_of_distances_are_settings() -> None:
-    near = BOUNDS._replace(displaced=0.01, clearly=0.02, far=0.03)
+    near = replace(BOUNDS, displaced=0.01, clearly=0.02, far=0.03)
     words = [describe_distance(distance, near) for distance in (0.005, 0.015, 0.025, 0.035)]
     assert words == [None, "slightly", "clearly", "far"]

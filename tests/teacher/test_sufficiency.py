@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conf.schema import TeacherConfig
+from conf.schema import RelationBounds, TeacherConfig
 from data.records import Scene
 from teacher.narrator import write_rationale
-from teacher.predicates.relations import Bounds
 from teacher.servers.responses import Response
 from teacher.sufficiency import find_predicted, measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
@@ -19,7 +18,7 @@ from teacher.vocabulary import choose_vocabulary
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 
-BOUNDS = Bounds()
+BOUNDS = RelationBounds()
 SUFFICIENT = "Prediction: At the target moment, the {a} will be {place}."
 
 

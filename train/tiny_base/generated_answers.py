@@ -24,12 +24,12 @@ from math import dist, inf
 
 from transformers import PreTrainedModel, ProcessorMixin
 
-from conf.schema import StudentConfig
+from conf.schema import RelationBounds, StudentConfig
 from data.records import LETTERS, SelectionItem
 from models.student.collator import Collator
 from models.student.generation import generate
 from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.relations import Bounds, Places
+from teacher.predicates.relations import Places
 from teacher.validation.claim_extraction import extract_claims
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.mentions import CLOSEST, NAME
@@ -104,7 +104,7 @@ def _read(
 ) -> list[tuple[str, bool]]:
     """Return what an answer says, by the kind of word or claim, and whether it is right."""
     scene = sampler.frames.scene
-    predicates = extract_predicates(item, scene(item.scene_id), scene, Bounds())
+    predicates = extract_predicates(item, scene(item.scene_id), scene, RelationBounds())
     claims = [c for c in extract_claims(text, predicates) if c.kind != "mention"]
     decided = [c for c in claims if c.verdict != "unknown"]
     read = [(claim.kind, claim.verdict == "supported") for claim in decided]

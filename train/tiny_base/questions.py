@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from conf.schema import RelationBounds
 from data.records import Candidate, Scene, SelectionItem
 from data.world.displacement import frame_displacements
 from models.student.prompts import build_response
@@ -39,7 +40,6 @@ from teacher.predicates.facts import Relation, RelationalPredicates, View
 from teacher.predicates.relations import (
     CHANGES,
     SYMMETRIC,
-    Bounds,
     find_topic,
     flip_relation,
     normalize_relation,
@@ -234,13 +234,13 @@ def make_question(
         scene_of: Returns a scene by its id.
     """
     scene = scene_of(item.scene_id)
-    predicates = extract_predicates(item, scene, scene_of, Bounds())
+    predicates = extract_predicates(item, scene, scene_of, RelationBounds())
     if kind != "explain":
         return ASK[kind](predicates, item, rng)
     other = replace_target(item, scene, rng)
     if other is None:
         return ask_first_steps(predicates, item, rng)
-    shown = extract_predicates(other, scene, scene_of, Bounds()).views
+    shown = extract_predicates(other, scene, scene_of, RelationBounds()).views
     question = ask_explain(predicates, shown, item, rng)
     return replace(question, instead=other.candidates[item.answer])
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from conf.schema import RelationBounds
 from data.records import LETTERS, SelectionItem
 from data.store import Store
 from evaluation.metrics.intervals import SceneBootstrap
@@ -17,7 +18,6 @@ from evaluation.reporting.run_responses import parse_response
 from evaluation.reporting.tables import reason_table
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.relations import Bounds
 from teacher.validation.reasons import PARTS
 
 
@@ -27,7 +27,7 @@ def rationales(micro_store: Store) -> list[tuple[SelectionItem, str]]:
     found = []
     for item in micro_store.selection("test"):
         scene = micro_store.scene(item.scene_id)
-        predicates = extract_predicates(item, scene, micro_store.scene, Bounds())
+        predicates = extract_predicates(item, scene, micro_store.scene, RelationBounds())
         if predicates is not None:
             text = write_rationale(predicates, item, 0)
             body, answer = text.rsplit("\n", 1)

@@ -6,8 +6,8 @@ from collections import Counter
 
 import numpy as np
 
+from conf.schema import RelationBounds
 from teacher.narrator import write_rationale
-from teacher.predicates.relations import Bounds
 from teacher.validation.claim_extraction import extract_claims
 from tests.teacher.test_predicates import random_cases
 from train.common.false_words import ALTERNATIVES, SECTIONS, WORD, falsify_words
@@ -17,7 +17,7 @@ def test_words_are_replaced_by_others_of_their_kind() -> None:
     """Nothing else changes, and the spans contain each false word and one more character."""
     replaced = kept = 0
     rng = np.random.default_rng(1)
-    for item, predicates in random_cases(40, Bounds()):
+    for item, predicates in random_cases(40, RelationBounds()):
         true = write_rationale(predicates, item, 0)
         assert falsify_words(true, 0.0, rng) == (true, ())
         text, spans = falsify_words(true, 0.5, rng)
@@ -38,7 +38,7 @@ def test_replaced_words_are_false() -> None:
     """Apart from extremes: an object can be both leftmost and topmost."""
     verdicts = Counter()
     rng = np.random.default_rng(0)
-    for item, predicates in random_cases(60, Bounds()):
+    for item, predicates in random_cases(60, RelationBounds()):
         text, spans = falsify_words(write_rationale(predicates, item, 0), 0.5, rng)
         claims = [c for c in extract_claims(text, predicates) if c.kind != "extreme"]
         for start, stop in spans:

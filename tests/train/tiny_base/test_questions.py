@@ -10,13 +10,14 @@ from math import dist
 import numpy as np
 import pytest
 
+from conf.schema import RelationBounds
 from data.records import LETTERS, SelectionItem
 from data.store import Store
 from models.student.collator import IGNORED, encode
 from teacher.deciding import choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates, View
-from teacher.predicates.relations import Bounds, normalize_relation
+from teacher.predicates.relations import normalize_relation
 from teacher.validation.claim_extraction import extract_claims
 from train.tiny_base.questions import (
     ASK,
@@ -38,7 +39,7 @@ def described(micro_store: Store) -> Described:
     """The training items that have predicates, and these."""
     items = micro_store.selection("train")
     facts = [
-        extract_predicates(i, micro_store.scene(i.scene_id), micro_store.scene, Bounds())
+        extract_predicates(i, micro_store.scene(i.scene_id), micro_store.scene, RelationBounds())
         for i in items
     ]
     return [(item, p) for item, p in zip(items, facts, strict=True) if p is not None]
@@ -128,7 +129,7 @@ def test_explained_candidates_do_not_include_the_target(
         candidates[item.answer] = question.instead
         other = replace(item, candidates=tuple(candidates), target_frame=question.instead.frame)
         scene = micro_store.scene(item.scene_id)
-        shown = extract_predicates(other, scene, micro_store.scene, Bounds())
+        shown = extract_predicates(other, scene, micro_store.scene, RelationBounds())
         claims = extract_claims(before, shown)
         claims = [c for c in claims if c.kind not in RELATIVE and c.candidate is not None]
         assert [c for c in claims if c.verdict == "contradicted"] == []
