@@ -21,8 +21,15 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
   `Transformer`, which passes it on to its model.
 - `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer, and
   `train.on_policy.distillation` overrides `get_batch_samples` and calls `_get_num_items_in_batch`.
-- `train.on_policy.reinforcement` overrides `_generate_and_score_completions`, `_compute_loss` and
-  `_get_per_token_logps_and_entropies` of TRL's GRPOTrainer, and uses its `rollout_func`.
+- `train.on_policy.reinforcement` overrides `_generate_and_score_completions`, `_calculate_rewards`,
+  `_compute_loss`, `_get_per_token_logps_and_entropies`, `_get_train_sampler` and `_send_telemetry`
+  of TRL's GRPOTrainer, uses its `rollout_func` and `_metrics`, and the `generator` of its
+  RepeatSampler.
+- `models.student.kv_cache` subclasses transformers' `DynamicLayer`.
+- `train.tiny_base.trace` records the outputs of `q_norm` and `k_norm` in Qwen3-VL's attention, and
+  the keyword `position_embeddings` that it takes.
+- `train.retriever.loss` uses `RandContext` of sentence-transformers.
+- `evaluation.embedders.languagebind` subclasses transformers' `CLIPEncoderLayer`.
 """
 
 from __future__ import annotations

@@ -11,16 +11,16 @@ the first table are, in % of the items of a family:
     true        the response predicts something, and every prediction is true of the target
     decides     of the items whose predictions are true, the probability that a reader of these
                 alone picks the target (`dynapix.sufficiency`)
-    reader      this probability in all items: the accuracy of a student that reads and compares
+    sufficiency this probability in all items: the accuracy of a student that reads and compares
                 without mistakes, but predicts what this student predicts
-    chosen      of the items with predictions, a predicted object is one that the built-in narrator
+    deciding    of the items with predictions, a predicted object is one that the built-in narrator
                 chooses to decide the item
     follows     the answer is a candidate of which the predictions are true
 
 The second table divides the responses by the number of candidates that show what is predicted,
 according to the response itself. The last one tells which candidates wrong answers choose: those of
-an earlier or later moment than the target, or of another scene; and how often these are offered
-among the wrong candidates of the same items.
+an earlier or later moment than the target, of an alternative future of the scene, or of another
+scene; and how often these are offered among the wrong candidates of the same items.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from teacher.validation.claim_extraction import extract_claims
 
 SUBTYPES = ("in_1s", "in_2s")
 """Subtypes of time items."""
-KINDS = ("earlier", "later", "another scene")
+KINDS = ("earlier", "later", "alternative future", "another scene")
 """Kinds of wrong candidates, compared with the target."""
 
 
@@ -62,8 +62,8 @@ class Predicted(NamedTuple):
 
     Attributes:
         fitting: Letters of the candidates of which the predictions are true.
-        reader: The probability that a reader of the predictions picks the target.
-        chosen: Whether a predicted object decides the item; None if nothing is predicted.
+        sufficiency: The probability that a reader of the predictions picks the target.
+        names_deciding: Whether a predicted object decides the item; None if nothing is predicted.
         described: Letters of the candidates that show all that is predicted, according to the
             response.
     """
@@ -72,8 +72,8 @@ class Predicted(NamedTuple):
     target: str
     answer: str | None
     fitting: tuple[str, ...]
-    reader: float
-    chosen: bool | None
+    sufficiency: float
+    names_deciding: bool | None
     described: tuple[str, ...]
 
 
@@ -94,18 +94,26 @@ def main() -> None:
 def print_shares(found: Sequence[Predicted]) -> None:
     """Print the shares of the first table by family."""
     print_header(
-        "family", "items", "right", "predicts", "true", "decides", "reader", "chosen", "follows"
+        "family",
+        "items",
+        "right",
+        "predicts",
+        "true",
+        "decides",
+        "sufficiency",
+        "deciding",
+        "follows",
     )
     for family in (*FAMILIES, "all"):
         rows = [r for r in found if family in (r.family, "all")]
         true = [r for r in rows if r.target in r.fitting]
         columns = (
             [r.answer == r.target for r in rows],
-            [r.chosen is not None for r in rows],
+            [r.names_deciding is not None for r in rows],
             [r.target in r.fitting for r in rows],
-            [r.reader for r in true],
-            [r.reader for r in rows],
-            [r.chosen for r in rows if r.chosen is not None],
+            [r.sufficiency for r in true],
+            [r.sufficiency for r in rows],
+            [r.names_deciding for r in rows if r.names_deciding is not None],
             [r.answer in r.fitting for r in rows],
         )
         shares = (f"{100 * np.mean(c):.1f}" if c else "-" for c in columns)
@@ -127,11 +135,17 @@ def read_predictions(run: Path, store: Store) -> Iterator[Predicted]:
         fitting = tuple(v.letter for v in p.views if predicted and is_consistent(predicted, v))
         deciding = {name for s in choose_statements(p).statements for name in s.objects}
         names = {name for claim in predicted for name in claim.subjects}
-        reader = measure_sufficiency(response.text, claims, p)
-        chosen = not names.isdisjoint(deciding) if names else None
+        sufficiency = measure_sufficiency(response.text, claims, p)
+        names_deciding = not names.isdisjoint(deciding) if names else None
         described = find_described(predicted, claims) if predicted else ()
         yield Predicted(
-            item.family, item.letter, response.letter, fitting, reader, chosen, described
+            item.family,
+            item.letter,
+            response.letter,
+            fitting,
+            sufficiency,
+            names_deciding,
+            described,
         )
 
 
@@ -155,14 +169,19 @@ def print_agreement(found: Sequence[Predicted]) -> None:
     prediction, in the student's words."""
     print_header("agreeing candidates", "responses", "right")
     for count in range(len(LETTERS) + 1):
-        rows = [r for r in found if r.chosen is not None and len(r.described) == count]
+        rows = [r for r in found if r.names_deciding is not None and len(r.described) == count]
         share = f"{100 * np.mean([r.answer == r.target for r in rows]):.1f}" if rows else "-"
         print_row(count, len(rows), share)
 
 
 def print_wrong_answers(runs: Sequence[Path], store: Store) -> None:
     """Print which wrong candidates are chosen and which are offered, in percent."""
-    print_header("mode", "items", "wrong answers", *(f"{kind}: chosen, offered" for kind in KINDS))
+    print_header(
+        "mode",
+        "family or subtype",
+        "wrong answers",
+        *(f"{kind}: chosen, offered" for kind in KINDS),
+    )
     items = store.selection("test")
     for mode in ("reasoning", "answer"):
         responses = [read_item_responses(run, mode) for run in runs]
@@ -176,9 +195,9 @@ def print_wrong_answers(runs: Sequence[Path], store: Store) -> None:
                 and run[item.item_id].letter not in (None, item.letter)
             ]
             if wrong:
-                chosen = Counter(kind_of(item, letter) for item, letter in wrong)
+                chosen = Counter(classify_candidate(item, letter) for item, letter in wrong)
                 offered = Counter(
-                    kind_of(item, letter)
+                    classify_candidate(item, letter)
                     for item, _ in wrong
                     for letter in LETTERS
                     if letter != item.letter
@@ -191,9 +210,11 @@ def print_wrong_answers(runs: Sequence[Path], store: Store) -> None:
                 print_row(mode, family, len(wrong), *cells)
 
 
-def kind_of(item: SelectionItem, letter: str) -> str:
-    """Return which kind of wrong candidate a letter names."""
+def classify_candidate(item: SelectionItem, letter: str) -> str:
+    """Return which of `KINDS` a wrong candidate is."""
     target, chosen = (item.candidates[LETTERS.index(k)] for k in (item.letter, letter))
+    if chosen.source == "alternative":
+        return "alternative future"
     if chosen.scene_id != target.scene_id:
         return "another scene"
     return "earlier" if chosen.frame < target.frame else "later"

@@ -17,6 +17,9 @@ from sentence_transformers import MultiVectorEncoder, SentenceTransformerTrainer
 from sentence_transformers.base.modules import Dense
 from torch import nn
 from transformers import AttentionInterface, AttentionMaskInterface, Trainer, TrainingArguments
+from transformers.cache_utils import DynamicLayer
+from trl import GRPOTrainer
+from trl.trainer.utils import RepeatSampler
 
 from models import attention, compat
 from models.fast_layers import use_fast_layers
@@ -106,7 +109,12 @@ def test_qwen3_vl_takes_the_vision_towers_outputs_instead_of_pixels(model) -> No
     ("kind", "names"),
     [
         (MultiVectorEncoder, ["_load_with_module_classes"]),
-        (Trainer, ["_get_train_sampler", "_load_from_checkpoint"]),
+        (Trainer, ["_get_train_sampler", "_load_from_checkpoint", "get_batch_samples",
+                   "_get_num_items_in_batch"]),
+        (GRPOTrainer,
+         ["_generate_and_score_completions", "_calculate_rewards", "_compute_loss",
+          "_get_per_token_logps_and_entropies", "_get_train_sampler", "_send_telemetry"]),
+        (DynamicLayer, ["lazy_initialization", "get_mask_sizes", "get_seq_length", "update"]),
         (SentenceTransformerTrainer,
          ["_load_from_checkpoint", "_load_best_model", "get_batch_sampler", "collect_features",
           "add_model_card_callback"]),
@@ -116,6 +124,16 @@ def test_qwen3_vl_takes_the_vision_towers_outputs_instead_of_pixels(model) -> No
 def test_overridden_methods_exist(kind, names) -> None:
     for name in names:
         assert hasattr(kind, name), f"{CHANGED} {kind.__name__}.{name} is gone"
+
+
+def test_grpo_trainer_keeps_measures_and_an_order_that_can_be_seeded() -> None:
+    initialised = inspect.getsource(GRPOTrainer.__init__)
+    for name in ("self._metrics =", "rollout_func"):
+        assert name in initialised, f"{CHANGED} GRPOTrainer has no {name}"
+    sampler = RepeatSampler(range(4), mini_repeat_count=1, seed=0)
+    assert isinstance(sampler.generator, torch.Generator), (
+        f"{CHANGED} RepeatSampler has no generator"
+    )
 
 
 def test_the_projection_of_a_multi_vector_model_takes_a_dict_with_token_embeddings() -> None:

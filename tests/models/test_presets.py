@@ -326,5 +326,9 @@ def test_the_longest_rationale_fits_and_the_audit_needs_no_weights(
     sample = selection_sample(longest.item, "reasoning", regime, frames, cfg.frames, target)
     text = audit_student(adapted(preset), released, cfg, sample, Collator(released, cfg.max_length))
     assert "336 x 336 px become a video of 6 x 10 x 10 tokens and an image of 1 x 10 x 10" in text
+    assert text.count(">>>") == 1
+    false = replace(sample, false_spans=((20, 30),))
+    text = audit_student(adapted(preset), released, cfg, false, Collator(released, cfg.max_length))
+    assert text.count(">>>") == 2
     for parameters, *_ in expected_towers(preset, RANK).values():
         assert f"{parameters:,}" in text

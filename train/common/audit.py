@@ -38,8 +38,8 @@ def audit_student(
     """
     batch = collator([sample])
     ids = batch["input_ids"][0].tolist()
-    prompt_length = len(ids) - int((batch["labels"] != IGNORED).sum())
-    supervised = [k >= prompt_length for k in range(len(ids))]
+    labels = batch["labels"][0]
+    supervised = [False] * (len(ids) - len(labels)) + (labels != IGNORED).tolist()
     return "\n".join(
         [
             *describe_model(model, processor, cfg, batch),

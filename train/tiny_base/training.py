@@ -276,7 +276,7 @@ class BaseTrainer:
         journal = self.folder / JOURNAL
         if not path.exists():
             if rank() == 0:
-                journal.unlink(missing_ok=True)
+                journal.write_text("")
             return
         state = torch.load(path, weights_only=True)
         if state["tokenizer"] != self.tokenizer_digest:

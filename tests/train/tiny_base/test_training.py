@@ -90,9 +90,10 @@ def test_killed_run_resumes_as_if_it_had_never_stopped(
 
 
 def test_checkpoints_of_another_tokenizer_are_refused(cfg, micro_store: Store, tmp_path) -> None:
+    """The checkpoint precedes the first line of the log."""
     trainer = start(cfg, micro_store, tmp_path)
     trainer.optimizers = trainer._new_optimizers()
-    (tmp_path / "metrics.jsonl").touch()
+    trainer._load()
     trainer._save()
     other = replace(cfg.student, architecture=replace(SIZES, vocabulary=400))
     with raises_user_error("other-recipe", contains=str(tmp_path)):
