@@ -62,7 +62,7 @@ def score_rationale(item: Item, text: str) -> RationaleScore:
             the teacher writes them. A text without headings has no claims.
 
     Raises:
-        UserError: The item has no predicates, because a collision follows its prefix too early.
+        UserError: The item has no predicates, because its prefix is too short.
     """
     predicates = _extract_predicates(item)
     numbers = tuple(text[start:stop] for start, stop in find_numbers(text))
@@ -82,7 +82,7 @@ def sufficiency(item: Item, text: str) -> float:
         text: The rationale, with the heading "Prediction:".
 
     Raises:
-        UserError: The item has no predicates, because a collision follows its prefix too early.
+        UserError: The item has no predicates, because its prefix is too short.
     """
     predicates = _extract_predicates(item)
     return measure_sufficiency(text, extract_claims(text, predicates), predicates)
@@ -95,7 +95,7 @@ def _extract_predicates(item: Item) -> RelationalPredicates:
     )
     if predicates is None:
         raise UserError(
-            f"{item.item_id} has no predicates: a collision follows its prefix too early",
+            f"{item.item_id} has no predicates: its prefix is too short",
             code="no-predicates",
         )
     return predicates

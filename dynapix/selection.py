@@ -19,7 +19,12 @@ from data.records import LETTERS
 from dynapix.benchmark import Benchmark, Item
 from dynapix.saved_runs import saved_run
 from evaluation.metrics.results import SIMILARITY, SelectionReport, SelectionResult
-from evaluation.metrics.selection import Choices, choose_letters, credit_choices, selection_report
+from evaluation.metrics.selection import (
+    Choices,
+    build_selection_report,
+    choose_letters,
+    credit_choices,
+)
 from evaluation.metrics.significance import PairedComparison, compare_runs
 from models.student.answer_parser import parse_choice
 
@@ -218,7 +223,7 @@ class Result:
         records = [item.record for item in self.items]
         name, build = self.benchmark.name, self.benchmark.store.identity
         asked = [(TEXT, None, TEXT)] if self._texts else []
-        return selection_report([choices], records, name, build, self.seed, asked=asked)
+        return build_selection_report([choices], records, name, build, self.seed, asked=asked)
 
     @property
     def accuracy(self) -> SelectionResult:

@@ -39,7 +39,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from evaluation.generators.generator import item_sample, open_generator, response_settings
     from evaluation.metrics.reasons import measure_reasons
     from evaluation.metrics.results import variant_name
-    from evaluation.metrics.selection import Choices, selection_report
+    from evaluation.metrics.selection import Choices, build_selection_report
     from evaluation.reporting.selection_report import write_report
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
@@ -76,7 +76,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         if variant[0] == "reasoning"
         and (summary := measure_reasons(items, responses, store, cfg.seed)) is not None
     }
-    report = selection_report(
+    report = build_selection_report(
         choices, items, store.name, store.identity, cfg.seed, cfg.suite, asked, reasons
     )
     write_report(report, run.folder, items[0].suite)

@@ -19,9 +19,9 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from evaluation.metrics.results import SIMILARITY
     from evaluation.metrics.selection import (
         Choices,
+        build_selection_report,
         choose_letters,
         credit_choices,
-        selection_report,
     )
     from evaluation.reporting.selection_report import write_report
     from evaluation.retrieval import candidate_similarity
@@ -43,7 +43,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         choices.append(Choices(name, SIMILARITY, None, credits, letters))
 
     write_json_lines(run.folder / "scores.jsonl", score_rows)
-    report = selection_report(choices, items, store.name, store.identity, cfg.seed, cfg.suite)
+    report = build_selection_report(choices, items, store.name, store.identity, cfg.seed, cfg.suite)
     write_report(report, run.folder, items[0].suite)
     return report.rows[0].metrics
 

@@ -8,7 +8,7 @@ one call per frame; here, one batched call computes it for all frames of one siz
 
 On a CPU, the forward and backward pass of torch's fused attention takes 1.5 times as long as matrix
 products of blocks of queries with the keys before them; in bf16, three times as long. The products
-are used if the matrices of scores fit into memory.
+are used for up to `MATMUL_MAX_TOKENS` tokens.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def attend_by_matmul(
     fp32 and in bf16. This function keeps only the latter, which takes a third of the memory.
 
     Args:
-        attention_mask: Mask to add to the scores, of which at least the later keys of each query
-            are masked; None masks no key. Scores of keys after a block of queries are not computed.
+        attention_mask: (B, 1, Q, K) mask to add to the scores, which masks at least all later keys
+            of each query; None for bidirectional attention.
     """
     repeats = query.shape[1] // key.shape[1]
     query, key = query * settings["scaling"], repeat_kv(key, repeats).transpose(2, 3)

@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from torch import nn
     from transformers import PreTrainedConfig, PreTrainedTokenizerBase, ProcessorMixin
 
-PEFT = "base_model.model."
+ADAPTER_WEIGHTS = "adapter_model.safetensors"
+"""File of saved adapters."""
+ADAPTER_CONFIG = "adapter_config.json"
+"""File of their settings."""
+PEFT_PREFIX = "base_model.model."
 """Prefix that peft adds to the names of the modules that it adapts."""
 PROCESSOR_FIELDS = {
     "image_processor.patch_size": "vision_config.patch_size",
@@ -86,13 +90,13 @@ def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) 
         UserError: The adapters have another rank or were trained on another base.
         SafetensorError: The file of the adapters is damaged.
     """
-    if not (path := folder / "adapter_model.safetensors").exists():
+    if not (path := folder / ADAPTER_WEIGHTS).exists():
         return
-    modules = {name.removeprefix(PEFT): module for name, module in base.named_modules()}
+    modules = {name.removeprefix(PEFT_PREFIX): module for name, module in base.named_modules()}
     with safe_open(path, "pt") as file:
         shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
     for name, shape in shapes.items():
-        adapted, _, side = name.removeprefix(PEFT).partition(".lora_")
+        adapted, _, side = name.removeprefix(PEFT_PREFIX).partition(".lora_")
         # A is (rank, inputs), B is (outputs, rank).
         own_rank, width = shape if side.startswith("A") else reversed(shape)
         if own_rank != rank:

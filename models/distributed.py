@@ -13,6 +13,7 @@ from conf.runs import rank, world_size
 
 if TYPE_CHECKING:
     import torch
+    from accelerate import PartialState
     from torch.nn import Parameter
 
 
@@ -27,7 +28,7 @@ def main_first() -> Iterator[None]:
         return
     from torch import distributed
 
-    rank_device()
+    _get_state()
     # The timeout of the default group suits training steps; preparations may take longer.
     group = distributed.new_group(backend="gloo", timeout=timedelta(days=30))
     if rank() > 0:
@@ -39,11 +40,16 @@ def main_first() -> Iterator[None]:
 
 
 def rank_device() -> torch.device:
-    """Return this rank's GPU, or the CPU. The first call initialises torch.distributed."""
+    """Return this rank's GPU, or the CPU."""
+    return _get_state().device
+
+
+def _get_state() -> PartialState:
+    """Return accelerate's state of this rank. The first call initialises torch.distributed."""
     import torch
     from accelerate import PartialState
 
-    return PartialState(cpu=not torch.cuda.is_available()).device
+    return PartialState(cpu=not torch.cuda.is_available())
 
 
 def average_gradients(parameters: Iterable[Parameter]) -> None:
@@ -57,7 +63,7 @@ def average_gradients(parameters: Iterable[Parameter]) -> None:
     import torch
     from torch import distributed
 
-    rank_device()
+    _get_state()
     parameters = [*parameters]
     present = torch.tensor([float(p.grad is not None) for p in parameters])
     distributed.all_reduce(present)

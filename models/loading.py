@@ -26,7 +26,13 @@ from transformers.utils import logging as transformers_logging
 from conf.errors import UserError
 from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
 from models.attention import choose_attention
-from models.checks import check_adapters, check_processor, check_vision_tower
+from models.checks import (
+    ADAPTER_CONFIG,
+    ADAPTER_WEIGHTS,
+    check_adapters,
+    check_processor,
+    check_vision_tower,
+)
 from models.compat import keep_differentiable
 from models.fingerprints import find_commit
 from models.tiny_qwen3_vl import build_model, build_processor
@@ -36,7 +42,7 @@ UNQUANTIZED = ["model.visual", "visual", "lm_head"]
 """Prefixes of the names of modules that are not quantised. The vision tower is model.visual in a
 generative model, and visual in a model without a language head."""
 DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
-UNREADABLE = (OSError, ValueError, KeyError, TypeError, SafetensorError)
+LOAD_ERRORS = (OSError, ValueError, KeyError, TypeError, SafetensorError)
 """Errors that libraries raise for files that are missing, truncated or of another kind."""
 
 Corpus = Callable[[], Iterable[str]]
@@ -110,7 +116,8 @@ def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
 def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
     """Make a processor resize frames to one size in images and in videos of up to `frames` frames.
 
-    It is the multiple of the patch size nearest to image_size x image_size px. By default, a video
+    Its edge is the multiple of the edge of a visual token (patch size x merge size) nearest to
+    image_size. By default, a video
     has another pixel budget than an image, and one frame could get two sizes.
     """
     step = processor.image_processor.patch_size * processor.image_processor.merge_size
@@ -129,10 +136,15 @@ def load_student(
 ) -> tuple[nn.Module, ProcessorMixin]:
     """Load a student for training: its base, with new adapters if the preset has adapters."""
     base, processor = load_base(cfg, precision, corpus)
+    prepare_for_training(base)
+    return (add_adapters(base, cfg.lora) if cfg.lora.rank else base), processor
+
+
+def prepare_for_training(base: PreTrainedModel) -> None:
+    """Keep a base from caching keys and values, and from repacking its 4-bit weights."""
     # The language tower has its own setting.
     base.config.use_cache = base.config.get_text_config().use_cache = False
     keep_differentiable(base)
-    return (add_adapters(base, cfg.lora) if cfg.lora.rank else base), processor
 
 
 def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
@@ -187,7 +199,7 @@ def load_trainable(
     """
     import peft
 
-    if (folder / EXPORT).exists() and not (folder / "adapter_config.json").exists():
+    if (folder / EXPORT).exists() and not (folder / ADAPTER_CONFIG).exists():
         raise UserError(
             f"{folder} is a merged export, which has no adapters to train: give the run that was "
             "exported",
@@ -197,8 +209,7 @@ def load_trainable(
         return load_student(replace(cfg, model=str(folder), architecture=None), precision, list)
     check_safetensors(folder)
     base, processor = load_base(cfg, precision, list)
-    base.config.use_cache = base.config.get_text_config().use_cache = False
-    keep_differentiable(base)
+    prepare_for_training(base)
     with explain_damage(folder):
         check_adapters(folder, base, cfg.lora.rank, cfg.model)
         return peft.PeftModel.from_pretrained(base, folder, is_trainable=True), processor
@@ -206,8 +217,12 @@ def load_trainable(
 
 def check_safetensors(folder: Path) -> None:
     """Raise UserError if the adapters in a folder have no safetensors; peft would read a pickle."""
-    if not (weights := folder / "adapter_model.safetensors").exists():
-        raise UserError(f"{folder} has no student: {weights} is missing", code="missing-run")
+    if not (weights := folder / ADAPTER_WEIGHTS).exists():
+        raise UserError(
+            f"{folder} has no student: {weights} is missing; give the folder of a finished run, or "
+            "train again",
+            code="missing-run",
+        )
 
 
 def load_trained(
@@ -223,7 +238,7 @@ def load_trained(
     """
     import peft
 
-    if (folder / "adapter_config.json").exists():
+    if (folder / ADAPTER_CONFIG).exists():
         check_safetensors(folder)
         base, processor = load_base(cfg, precision, list)
         with explain_damage(folder):
@@ -337,10 +352,11 @@ def explain_unloadable(group: str, model: str, key: str = "model") -> Iterator[N
     check_available(group, model, key)
     try:
         yield
-    except UNREADABLE as error:
+    except LOAD_ERRORS as error:
         where = "that folder" if Path(model).is_dir() else "the hub or its cache"
         raise UserError(
-            f"{group}.{key}={model} cannot be loaded from {where}: {_first_line(error)}",
+            f"{group}.{key}={model} cannot be loaded from {where}: {_first_line(error)}; "
+            "restore its files, or give another model",
             code="unloadable-model",
         ) from error
 
@@ -371,7 +387,7 @@ def explain_damage(folder: Path) -> Iterator[None]:
     """Turn errors of loading a trained or exported model in the block into a UserError."""
     try:
         yield
-    except UNREADABLE as error:
+    except LOAD_ERRORS as error:
         exported = (folder / EXPORT).exists()
         raise UserError(
             f"{folder} is damaged and cannot be read ({_first_line(error)}): "

@@ -38,12 +38,12 @@ def run_title(folder: Path) -> str:
     """Return a run's name in tables: its folder's name, SWEEP/NUMBER for a job of a sweep, or "RUN
     FORMAT" for an export."""
     if (folder / EXPORT).exists():
-        record = export_record(folder)
+        record = read_export_record(folder)
         return f"{record['run']} {record['format']}"
     return f"{folder.parent.name}/{folder.name}" if folder.name.isdigit() else folder.name
 
 
-def export_record(folder: Path) -> dict[str, Any]:
+def read_export_record(folder: Path) -> dict[str, Any]:
     """Return the record of an export: the exported `run`, the `format`, the SHA-256 of the adapters
     (`weights`), and the differences from the trained model's outputs (`measured`).
 
@@ -72,7 +72,7 @@ def settings_file(folder: Path) -> Path:
     return path if path.exists() else folder / "config.yaml"
 
 
-def trained_settings(
+def read_trained_settings(
     folder: Path, schema: type[Command], product: str, key: str = "model"
 ) -> Command:
     """Return the settings of a finished training run or of an export.
@@ -97,7 +97,8 @@ def trained_settings(
             )
         if not OmegaConf.is_dict(saved) or product not in saved:
             raise UserError(
-                f"{key}={folder} is not a run that trained a {product}", code="missing-run"
+                f"{key}={folder} is not a run that trained a {product}: give the folder of one",
+                code="missing-run",
             )
         finished = (folder / "metrics.json").exists() and (folder / product).is_dir()
         if not finished and not (folder / EXPORT).exists():
@@ -142,14 +143,14 @@ def resolve_model(
             settings of the run.
 
     Raises:
-        UserError: As `trained_settings` and `check_unseen`; or an override changes another setting
-            of the model or its training, which the run has fixed.
+        UserError: As `read_trained_settings` and `check_unseen`; or an override changes another
+            setting of the model or its training, which the run has fixed.
     """
     if cfg.model is None:
         _check_base_unseen(getattr(cfg, product).model, benchmark)
         return None, cfg
     folder = Path(cfg.model)
-    settings = trained_settings(folder, schema, product, key)
+    settings = read_trained_settings(folder, schema, product, key)
     if product == "student":
         check_sees_frames(folder, settings.train.facts, key)
     check_unseen(f"{key}={folder}", settings.benchmark, benchmark)

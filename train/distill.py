@@ -28,19 +28,24 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     from train.on_policy.continuation import (
         inherit_settings,
         load_source,
+        read_source_settings,
         resolve_continuation,
-        source_settings,
         train_and_save,
     )
     from train.on_policy.distillation import build_trainer
     from train.on_policy.paired_prompts import load_datasets
-    from train.on_policy.teachers import LocalTeacher, ServerTeacher, load_teacher, teacher_settings
+    from train.on_policy.teachers import (
+        LocalTeacher,
+        ServerTeacher,
+        load_teacher,
+        read_teacher_settings,
+    )
 
     compat.keep_freed_memory()
-    source, trained = source_settings(cfg.model)
+    source, trained = read_source_settings(cfg.model)
     cfg = inherit_settings(cfg, trained)
     distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)
-    teacher_run = None if cfg.teacher_server.url else teacher_settings(cfg, trained)
+    teacher_run = None if cfg.teacher_server.url else read_teacher_settings(cfg, trained)
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.
     with distributed.main_first():

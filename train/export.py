@@ -41,15 +41,16 @@ COMMANDS = {"student": SftCommand, "retriever": ContrastiveCommand}
 @command("train.export", ExportModelCommand)
 def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
     from data.store import hash_file
+    from models.checks import ADAPTER_WEIGHTS
     from models.resolved_settings import RESOLVED
-    from models.trained_runs import EXPORT, export_record, settings_file
-    from train.common.model_card import model_card
+    from models.trained_runs import EXPORT, read_export_record, settings_file
+    from train.common.model_card import build_model_card
 
     name, run_folder, settings = find_run(cfg.run, cfg.product, cfg.checkpoints)
     saved, folder = run_folder / cfg.product, run.folder / cfg.product
-    weights = hash_file(saved / "adapter_model.safetensors")
+    weights = hash_file(saved / ADAPTER_WEIGHTS)
     if folder.exists():
-        record = export_record(folder)
+        record = read_export_record(folder)
         if record["weights"] != weights:
             raise UserError(
                 f"{folder} was exported from other adapters than those now in {saved}: delete "
@@ -75,7 +76,7 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
         for file_name in RECORDS:
             shutil.copy(run_folder / file_name, partial)
         shutil.copy(settings_file(run_folder), partial / "config.yaml")
-        card = model_card(name, settings, run_folder, cfg.format, measured)
+        card = build_model_card(name, settings, run_folder, cfg.format, measured)
         card.save(partial / "README.md")
         record = {"run": name, "format": cfg.format, "weights": weights, "measured": measured}
         write_json(partial / EXPORT, record)
@@ -94,13 +95,14 @@ def find_run(
         UserError: The run does not exist, is not finished or trained all weights; its adapters are
             missing; or its base has changed.
     """
+    from models.checks import ADAPTER_WEIGHTS
     from models.resolved_settings import check_base
-    from models.trained_runs import trained_settings
+    from models.trained_runs import read_trained_settings
 
     runs = runs_folder(checkpoints, product, run)
     name = resolve_run_name(run, runs)
     folder = Path(runs) / name
-    settings = trained_settings(folder, COMMANDS[product], product, "run")
+    settings = read_trained_settings(folder, COMMANDS[product], product, "run")
     preset = getattr(settings, product)
     if preset.lora.rank == 0:
         raise UserError(
@@ -108,7 +110,7 @@ def find_run(
             f"to merge: {folder / product} is the model itself",
             code="nothing-to-merge",
         )
-    if not (folder / product / "adapter_model.safetensors").exists():
+    if not (folder / product / ADAPTER_WEIGHTS).exists():
         raise UserError(
             f"{folder / product} holds no adapters: delete the run and train again",
             code="missing-adapters",

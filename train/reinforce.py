@@ -31,14 +31,14 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     from train.on_policy.continuation import (
         inherit_settings,
         load_source,
+        read_source_settings,
         resolve_continuation,
-        source_settings,
         train_and_save,
     )
     from train.on_policy.reinforcement import build_trainer, load_items
 
     compat.keep_freed_memory()
-    source, trained = source_settings(cfg.model)
+    source, trained = read_source_settings(cfg.model)
     cfg = inherit_settings(cfg, trained)
     train, responses = cfg.train, "train.batch x train.responses"
     distributed.split_batch(train.batch * train.responses, train.micro_batch, key=responses)

@@ -40,7 +40,7 @@ from models.student.answer_parser import parse_choice
 from models.student.collator import Collator
 from models.student.generation import generate
 from models.student.prompts import Sample, selection_sample
-from models.trained_runs import check_modes, check_unseen, product_folder, trained_settings
+from models.trained_runs import check_modes, check_unseen, product_folder, read_trained_settings
 from teacher.narrator import write_rationale
 from teacher.sections import split_sections
 from teacher.vocabulary import choose_vocabulary, describe_item
@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--items", type=int, default=300, help="number of test items")
     parser.add_argument("--batch", type=int, default=32)
     args = parser.parse_args()
-    trained = trained_settings(args.student, SftCommand, "student")
+    trained = read_trained_settings(args.student, SftCommand, "student")
     check_base(args.student, trained.student)
     check_modes(args.student, trained.train.regime, ["reasoning"])
     check_unseen(str(args.student), trained.benchmark, compose_benchmark(args.benchmark))

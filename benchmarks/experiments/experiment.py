@@ -67,10 +67,6 @@ class Experiment:
     """Hash of the weights that every variant starts from."""
     settings: Mapping[str, str]
     """Key of each variant's settings and of the versions that its results depend on, by variant."""
-    trainer: str
-    """Command that trains a variant, such as train.sft."""
-    evaluator: str
-    """Command that evaluates a variant, such as evaluation.select."""
 
     @property
     def identity(self) -> dict[str, str]:
@@ -145,8 +141,11 @@ class Experiment:
         part.replace(self.args.record)
 
     def train(self, command: str, name: str, overrides: Sequence[str]) -> Path:
-        """Train with a command unless the run is finished, and return the folder of the run. Its
-        name has the key of the settings that decide the result, so no others are compared."""
+        """Train with a command unless the run is finished, and return the folder of the run.
+
+        The run's name contains the key of the settings that decide its result, so a finished run
+        with other such settings is never reused.
+        """
         folder = self.args.checkpoints / command.partition(".")[2] / name
         if (folder / "metrics.json").exists():
             return folder
@@ -156,27 +155,11 @@ class Experiment:
             (folder / MINUTES).write_text(f"{read_cpu_minutes() - started}\n")
         return folder
 
-    def train_and_evaluate(
-        self,
-        name: str,
-        training: Sequence[str] | None,
-        evaluation: Sequence[str] = (),
-        trained: str | None = None,
-    ) -> Path:
-        """Train and evaluate a variant, and return the folder of the evaluation.
-
-        Args:
-            name: Run of the evaluation.
-            training: Overrides of the training; None evaluates an untrained model.
-            evaluation: Overrides of the evaluation.
-            trained: Run of the training; by default, that of the evaluation.
-        """
-        if training is not None:
-            folder = self.train(self.trainer, trained or name, [*training, *self.shared_overrides])
-            evaluation = [*evaluation, f"model={folder}"]
+    def evaluate(self, command: str, name: str, overrides: Sequence[str]) -> Path:
+        """Evaluate with a command, and return the folder of the run."""
         # The command itself reuses the answers of the same model.
-        run_command([self.evaluator, *evaluation, *self.shared_overrides, f"run={name}"])
-        return self.args.checkpoints / self.evaluator.partition(".")[2] / name
+        run_command([command, *overrides, *self.shared_overrides, f"run={name}"])
+        return self.args.checkpoints / command.partition(".")[2] / name
 
 
 def training_key(

@@ -41,7 +41,6 @@ from benchmarks.experiments.experiment import (
     print_header,
     print_row,
     read_item_responses,
-    run_command,
     training_key,
 )
 from benchmarks.experiments.records import (
@@ -82,18 +81,14 @@ def main() -> None:
     args = parser.parse_args()
     base = compose("train.sft", SftCommand, [f"benchmark={args.benchmark}"]).student.model
     settings = settings_keys(args.benchmark)
-    experiment = Experiment(args, weights_digest(base), settings, "train.sft", "evaluation.select")
-    store = Path(args.store)
+    experiment = Experiment(args, weights_digest(base), settings)
 
     def run_variant(job: Job) -> list[dict[str, Any]]:
         trained = train_variant(experiment, *job)
-        name = experiment.run_name(*job)
-        run_command([
-            "evaluation.select", f"model={trained[-1]}", f"modes=[{','.join(BOTH)}]", *EVALUATION,
-            *experiment.shared_overrides, f"run={name}",
-        ])  # fmt: skip
+        overrides = [f"model={trained[-1]}", f"modes=[{','.join(BOTH)}]", *EVALUATION]
+        folder = experiment.evaluate("evaluation.select", experiment.run_name(*job), overrides)
         minutes = sum_minutes(trained)
-        rows = read_rows(args.checkpoints / "select" / name, open_benchmark(store, args.benchmark))
+        rows = read_rows(folder, open_benchmark(Path(args.store), args.benchmark))
         return [{"cpu_minutes": minutes, **row} for row in rows]
 
     jobs = [(variant, seed) for seed in range(args.seeds) for variant in args.variants]

@@ -125,27 +125,29 @@ def main() -> None:
         name: training_key("train.sft", SftCommand, [*(v.training or ()), *overrides], versions)
         for name, v in VARIANTS.items()
     }
-    experiment = Experiment(args, base, settings, "train.sft", "evaluation.select")
+    experiment = Experiment(args, base, settings)
 
     def evaluate(job: Job) -> list[dict[str, Any]]:
-        name, seed = job
-        variant, student = VARIANTS[name], f"student={args.student}"
-        folder = experiment.run_name(*job)
-        training = variant.training and [*variant.training, f"seed={seed}", student, *SHARED]
+        (variant_name, seed), student = job, f"student={args.student}"
+        variant = VARIANTS[variant_name]
+        run = experiment.run_name(*job)
+        if variant.training is None:
+            model = student
+        else:
+            training = [*variant.training, f"seed={seed}", student, *SHARED]
+            trained = experiment.train("train.sft", run, [*training, *experiment.shared_overrides])
+            # A trained student is evaluated with the settings of its training.
+            model = f"model={trained}"
         # The default modes ask a base for a structured record, which the tiny base cannot write.
         modes = f"modes=[{','.join(variant.modes)}]"
-        # A trained student is evaluated with the settings of its training.
-        evaluation = [*EVALUATION, modes, *([] if training else [student])]
+        evaluation = [*EVALUATION, modes, model]
         store, rows = open_benchmark(Path(args.store), args.benchmark), []
         for control in (UNCHANGED, *(CONTROLS if variant.controls and seed == 0 else ())):
-            changed = control != UNCHANGED
-            run = experiment.train_and_evaluate(
-                f"{folder}-{control}" if changed else folder,
-                training,
-                [*evaluation, *([f"+exp={control}"] if changed else [])],
-                trained=folder,
-            )
-            rows += read_letters(run, store, control, variant.modes)
+            name, overlay = run, []
+            if control != UNCHANGED:
+                name, overlay = f"{run}-{control}", [f"+exp={control}"]
+            folder = experiment.evaluate("evaluation.select", name, [*evaluation, *overlay])
+            rows += read_letters(folder, store, control, variant.modes)
         return rows
 
     # Sorted by seed, so that an interrupted experiment has fewer seeds of every variant.

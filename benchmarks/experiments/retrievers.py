@@ -59,14 +59,14 @@ def main() -> None:
         name: training_key("train.contrastive", ContrastiveCommand, [*variant, benchmark], versions)
         for name, variant in VARIANTS.items()
     }
-    experiment = Experiment(
-        args, weights_digest(base), settings, "train.contrastive", "evaluation.retrieve"
-    )
+    experiment = Experiment(args, weights_digest(base), settings)
 
     def evaluate(job: Job) -> list[dict[str, Any]]:
         variant, seed = job
-        training = [*VARIANTS[variant], f"seed={seed}"]
-        return read_ranks(experiment.train_and_evaluate(experiment.run_name(*job), training))
+        name = experiment.run_name(*job)
+        training = [*VARIANTS[variant], f"seed={seed}", *experiment.shared_overrides]
+        trained = experiment.train("train.contrastive", name, training)
+        return read_ranks(experiment.evaluate("evaluation.retrieve", name, [f"model={trained}"]))
 
     jobs = [(variant, seed) for seed, variant in product(range(args.seeds), args.variants)]
     print_tables(experiment.run(jobs, evaluate))

@@ -27,6 +27,7 @@ import numpy as np
 import torch
 from transformers import PreTrainedModel, ProcessorMixin
 
+from conf.failures import report_failures
 from conf.files import read_json_lines
 from data.records import LETTERS
 from models import loading
@@ -216,4 +217,5 @@ def run_in_process(name: str, overrides: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

@@ -25,6 +25,7 @@ import pandas as pd
 import psutil
 
 from conf.compose import compose
+from conf.failures import report_failures
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
 from data import build
 from data.parallel import Workers
@@ -114,4 +115,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

@@ -35,6 +35,7 @@ from transformers import Trainer, set_seed
 from benchmarks.speed import comparison
 from benchmarks.speed.comparison import OURS, SEED, Measurements, timing_arguments
 from conf.compose import compose
+from conf.failures import report_failures
 from conf.runs import Run
 from conf.schema import ContrastiveCommand
 from data.build import ensure_benchmark
@@ -198,4 +199,5 @@ def write_base(overrides: list[str], preset: str, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

@@ -33,6 +33,7 @@ from benchmarks.speed.sft import VARIANTS as SFT_VARIANTS
 from benchmarks.speed.sft import list_overrides, write_base
 from benchmarks.speed.sft import measure as measure_sft
 from conf.compose import compose
+from conf.failures import report_failures
 from conf.runs import Run
 from conf.schema import DistillCommand, SftCommand
 from data.build import ensure_benchmark
@@ -122,4 +123,5 @@ def measure_sampling(
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

@@ -24,6 +24,7 @@ from pathlib import Path
 
 from conf.compose import compose
 from conf.errors import UserError
+from conf.failures import report_failures
 from conf.schema import ContrastiveCommand, SftCommand
 from data.tracks.build_items import family_quotas
 
@@ -59,10 +60,7 @@ def main() -> None:
     parser.add_argument("--student", default="qwen3_vl_8b")
     parser.add_argument("--retriever", default="qwen3_vl_emb_8b")
     args = parser.parse_args()
-    try:
-        print(format_table(list_runs(args.student, args.retriever), read_rates(RATES)))
-    except UserError as error:
-        raise SystemExit(f"error: {error}") from None
+    print(format_table(list_runs(args.student, args.retriever), read_rates(RATES)))
 
 
 def list_runs(student: str, retriever: str) -> list[TrainingRun]:
@@ -140,4 +138,5 @@ def add_rate(
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

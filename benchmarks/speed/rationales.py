@@ -18,6 +18,7 @@ from typing import TypeVar
 
 import pandas as pd
 
+from conf.failures import report_failures
 from conf.schema import TeacherConfig
 from data.store import open_store
 from teacher.deciding import choose_statements
@@ -65,4 +66,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

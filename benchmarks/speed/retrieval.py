@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 
+from conf.failures import report_failures
 from data.records import FRAMES as SCENE
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.retrieval.exact_search import Ranks, exact_ranks
@@ -132,4 +133,5 @@ def print_ranks(ranks: Ranks) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

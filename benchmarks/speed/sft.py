@@ -39,6 +39,7 @@ from transformers import ProcessorMixin, Trainer, set_seed
 from benchmarks.speed import comparison
 from benchmarks.speed.comparison import OURS, SEED, Measurements, timing_arguments
 from conf.compose import compose
+from conf.failures import report_failures
 from conf.runs import Run
 from conf.schema import SftCommand
 from data.build import ensure_benchmark
@@ -246,4 +247,5 @@ def write_base(overrides: list[str], preset: str, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

@@ -20,6 +20,7 @@ import pandas as pd
 from PIL import Image
 
 from conf.compose import compose, list_presets
+from conf.failures import report_failures
 from conf.schema import BuildCommand, WorldConfig
 from data.records import Scene
 from data.render.bullet import BulletRenderer
@@ -101,4 +102,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with report_failures():
+        main()

@@ -9,8 +9,7 @@ from conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageComman
 from data.records import SelectionItem
 from data.render.frame_cache import FrameReader
 from evaluation.generators.response_log import RECORD_MODES, SampleOf, SaveResponses, Subject
-from evaluation.generators.response_schema import instruction as record_instruction
-from evaluation.generators.response_schema import schema
+from evaluation.generators.response_schema import build_record_schema, write_record_instruction
 from models.precision import resolve_precision
 from models.student.prompts import Sample, choose_instruction, selection_sample
 from models.student.responses import response_token_limit
@@ -71,7 +70,7 @@ def open_generator(
 def item_instruction(mode: str, regime: str) -> str:
     """Return the instruction that ends a prompt in `mode`. The training regime determines which
     sections of a rationale the instruction requests."""
-    return record_instruction() if mode in RECORD_MODES else choose_instruction(mode, regime)
+    return write_record_instruction() if mode in RECORD_MODES else choose_instruction(mode, regime)
 
 
 def item_sample(
@@ -113,6 +112,6 @@ def response_settings(
         "inputs": PROMPT_VERSION,
         "frames": student.frames,
         "image_size": student.image_size,
-        "schema": schema() if mode == "constrained" else None,
+        "schema": build_record_schema() if mode == "constrained" else None,
         "sampling": sampling,
     }

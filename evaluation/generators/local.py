@@ -16,7 +16,7 @@ from xgrammar.contrib.hf import LogitsProcessor
 from conf.schema import SelectCommand, StudentConfig, TwoStageCommand
 from data.parallel import batched
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
-from evaluation.generators.response_schema import schema
+from evaluation.generators.response_schema import build_record_schema
 from models import loading
 from models.compat import keep_freed_memory
 from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
@@ -82,15 +82,17 @@ class LocalModel:
         grammar = compile_record_grammar(model, processor) if mode == "constrained" else None
         for batch in batched(subjects, self._batch):
             seeds = [response_seed(self._seed, subject, mode) for subject in batch]
-            steps = sampling_processors(student, seeds)
+            logits_processors = sampling_processors(student, seeds)
             if grammar is not None:
                 # The grammar comes first, so that tokens are sampled from those that it allows.
-                steps.insert(0, LogitsProcessor(grammar))
+                logits_processors.insert(0, LogitsProcessor(grammar))
             inputs = collator([sample_of(subject) for subject in batch])
             with explain_out_of_memory(
                 f"with {len(batch)} prompts in a batch", "lower batch, in a separate run (run=NAME)"
             ):
-                texts = generate(model, processor, inputs, limit, self._precision, steps)
+                texts = generate(
+                    model, processor, inputs, limit, self._precision, logits_processors
+                )
             if grammar is not None:
                 # `generate` adds the tag of the prompt, but the grammar has allowed no thought.
                 texts = [replace(t, text=t.text.removeprefix(THOUGHT_TAG)) for t in texts]
@@ -111,5 +113,5 @@ def compile_record_grammar(model: nn.Module, processor: ProcessorMixin) -> xgram
     )
     # With arbitrary white space, a model could write spaces until the token limit.
     return xgrammar.GrammarCompiler(tokens).compile_json_schema(
-        json.dumps(schema()), any_whitespace=False
+        json.dumps(build_record_schema()), any_whitespace=False
     )

@@ -15,7 +15,7 @@ import openai
 from conf.errors import UserError
 from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageCommand
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
-from evaluation.generators.response_schema import schema
+from evaluation.generators.response_schema import build_record_schema
 from models.fingerprints import processor_digest, weights_digest
 from models.student.chat_requests import build_messages, sampling_fields
 from models.student.prompts import Clip, Sample
@@ -140,7 +140,7 @@ def request_fields(student: StudentConfig, mode: str, clip: Clip | None) -> Requ
     limit = response_token_limit(mode, student.max_new_tokens, student.thinking)
     request = sampling_fields(student, limit, clip)
     if mode == "constrained":
-        record = {"name": "record", "strict": True, "schema": schema()}
+        record = {"name": "record", "strict": True, "schema": build_record_schema()}
         request["response_format"] = {"type": "json_schema", "json_schema": record}
     return request
 

@@ -48,7 +48,7 @@ class Record:
     justification: str
 
 
-def instruction() -> str:
+def write_record_instruction() -> str:
     """Return the instruction that requests a record."""
     fields = "\n".join(f'"{name}": {meaning}' for name, meaning in FIELDS.items())
     return (
@@ -56,7 +56,7 @@ def instruction() -> str:
     )
 
 
-def schema(bound: bool = True) -> dict[str, Any]:
+def build_record_schema(bound: bool = True) -> dict[str, Any]:
     """Return the record's JSON schema. If `bound` is true, it limits the length of the texts."""
     letter = {"enum": list(LETTERS)}
     probability = {"type": "number", "minimum": 0, "maximum": 1}
@@ -109,4 +109,4 @@ def _refuse_constant(word: str) -> float:
 @cache
 def _validator() -> Draft202012Validator:
     # The instruction names no length limits, so a valid record may exceed them.
-    return Draft202012Validator(schema(bound=False))
+    return Draft202012Validator(build_record_schema(bound=False))

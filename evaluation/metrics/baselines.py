@@ -10,7 +10,7 @@ from data.records import SelectionItem
 from data.store import Store
 from data.tracks.baselines import score_baselines
 from evaluation.metrics.results import BASELINE, SelectionResult
-from evaluation.metrics.selection import Choices, selection_report
+from evaluation.metrics.selection import Choices, build_selection_report
 
 TITLES = {
     "nearest": "nearest to the last observed frame",
@@ -33,4 +33,4 @@ def baseline_results(
         for name, title in TITLES.items()
         if not np.isnan([s[name] for s in scores]).any()
     ]
-    return selection_report(choices, items, store.name, store.identity, seed).rows
+    return build_selection_report(choices, items, store.name, store.identity, seed).rows

@@ -76,8 +76,8 @@ def measure_reasons(
 def read_reasons(
     item: SelectionItem, text: str, letter: str | None, store: Store
 ) -> ResponseReasons | None:
-    """Read the reasons of a response; None if the item has no predicates, because a collision
-    follows its prefix too early."""
+    """Read the reasons of a response; None if the item has no predicates, because its prefix is
+    too short."""
     scene = store.scene(item.scene_id)
     predicates = extract_predicates(item, scene, store.scene, RelationBounds())
     return None if predicates is None else read_response(text, letter, item.letter, predicates)

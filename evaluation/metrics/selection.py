@@ -72,7 +72,7 @@ def is_best(scores: np.ndarray) -> np.ndarray:
     return scores == scores.max(axis=1, keepdims=True)
 
 
-def selection_report(
+def build_selection_report(
     choices: Sequence[Choices],
     items: Sequence[SelectionItem],
     benchmark: str,

@@ -14,7 +14,7 @@ import numpy as np
 from evaluation.metrics.intervals import Interval
 from evaluation.metrics.results import RECALLS, UNTRAINED, RetrievalResult
 from evaluation.reporting.reference import COT_STUDENT, cot_student
-from train.common.curves import COLORS, empty_figure
+from train.common.curves import COLORS, create_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +25,7 @@ GRAY = "#999999"
 """Color of untrained retrievers."""
 
 
-def accuracy_figure(
+def plot_accuracies(
     accuracy: Mapping[str, Mapping[str, Interval]], file: Path | IO[bytes], with_paper: bool = True
 ) -> None:
     """Plot accuracies (%) with 95% intervals: groups of bars, in which each model has a color.
@@ -35,7 +35,7 @@ def accuracy_figure(
         with_paper: Whether the accuracies of the paper's CoT student are plotted as diamonds.
     """
     groups = list(dict.fromkeys(group for by_group in accuracy.values() for group in by_group))
-    figure = empty_figure(8, 4.4)
+    figure = create_figure(8, 4.4)
     axes = figure.add_subplot()
     width = 0.84 / (len(accuracy) + 1)
     for i, (label, by_group) in enumerate(accuracy.items()):
@@ -63,7 +63,7 @@ def accuracy_figure(
     figure.savefig(file)
 
 
-def retrieval_figure(rows: Iterable[tuple[str, RetrievalResult]], file: Path | IO[bytes]) -> None:
+def plot_recalls(rows: Iterable[tuple[str, RetrievalResult]], file: Path | IO[bytes]) -> None:
     """Plot Recall@1, @10 and @50 (%) over the embedding width, with 95% intervals as bands.
 
     Args:
@@ -75,7 +75,7 @@ def retrieval_figure(rows: Iterable[tuple[str, RetrievalResult]], file: Path | I
         if result.width and result.builder is None:
             lines.setdefault(name, []).append(result)
     names = sorted(lines, key=lambda name: (name.startswith(UNTRAINED), name))
-    figure = empty_figure(9, 3.8)
+    figure = create_figure(9, 3.8)
     panels = figure.subplots(1, len(RECALLS), sharey=True)
     for axes, k in zip(panels, RECALLS, strict=True):
         for i, name in enumerate(names):

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
-from conf.files import read_json_lines
 from evaluation.reporting import figures, summary_tables, tables
 from evaluation.reporting.item_browser import ItemBrowser
 from evaluation.reporting.measurements import (
@@ -22,6 +21,7 @@ from evaluation.reporting.measurements import (
 from evaluation.reporting.runs import SELECTION_KINDS, STUDY_KINDS, TRAINING_KINDS, FinishedRun
 from evaluation.reporting.table import Row, Table, file_stem
 from train.common.curves import plot_curves
+from train.common.journal import read_journal
 
 Results = Sequence[Measurement]
 
@@ -73,20 +73,20 @@ def build_sections(
     studies = [run for run in runs if run.kind in STUDY_KINDS]
     widest = widest_results(retrievals)
     sections = [
-        zero_shot([m for m in in_domain if not m.trained], widest, studies, browser),
-        distillation(in_domain, widest, browser),
-        ablation(unchanged),
-        transfer(unchanged, transfers, browser),
-        controls([m for m in selections if m.variants], runs),
+        build_zero_shot([m for m in in_domain if not m.trained], widest, studies, browser),
+        build_distillation(in_domain, widest, browser),
+        build_ablation(unchanged),
+        build_transfer(unchanged, transfers, browser),
+        build_controls([m for m in selections if m.variants], runs),
         Section("Human study", [_study_table(study) for study in studies]),
-        selection_details(unchanged, transfers),
-        retrieval_details([m for m in retrievals if m.result.builder is None]),
-        training([run for run in runs if run.kind in TRAINING_KINDS]),
+        build_selection_details(unchanged, transfers),
+        build_retrieval_details([m for m in retrievals if m.result.builder is None]),
+        build_training([run for run in runs if run.kind in TRAINING_KINDS]),
     ]
     return [section for section in sections if section.tables or section.figures]
 
 
-def zero_shot(
+def build_zero_shot(
     selections: Results,
     retrievals: Results,
     studies: Sequence[FinishedRun],
@@ -113,7 +113,7 @@ def _majority_rows(study: FinishedRun, m: Measurement) -> list[Row]:
     return [tables.human_row(f"Majority vote, {study.name}", report.majority)]
 
 
-def distillation(selections: Results, retrievals: Results, browser: ItemBrowser) -> Section:
+def build_distillation(selections: Results, retrievals: Results, browser: ItemBrowser) -> Section:
     """Trained models beside released models, on benchmarks that do not test transfer."""
     section = Section("Distillation")
     for rows in group_by_item_set(selections).values():
@@ -134,7 +134,7 @@ def distillation(selections: Results, retrievals: Results, browser: ItemBrowser)
     return section
 
 
-def ablation(selections: Results) -> Section:
+def build_ablation(selections: Results) -> Section:
     """The students of all regimes in reasoning mode, if an ablated student was measured."""
     rows = [m for m in selections if m.result.mode == "reasoning" and m.regime in REGIMES]
     if not any(m.regime in ABLATED_REGIMES for m in rows):
@@ -146,7 +146,7 @@ def ablation(selections: Results) -> Section:
     return Section("Ablation", [table])
 
 
-def transfer(selections: Results, transfers: Container[str], browser: ItemBrowser) -> Section:
+def build_transfer(selections: Results, transfers: Container[str], browser: ItemBrowser) -> Section:
     """The models that were measured on transfer benchmarks: their accuracies on all benchmarks."""
     section = Section("Transfer")
     models = {(m.result.name, m.result.mode) for m in selections if m.benchmark in transfers}
@@ -178,7 +178,7 @@ def _model_differences(group: str, browser: ItemBrowser) -> list[Table]:
     ]
 
 
-def controls(selections: Results, runs: Sequence[FinishedRun]) -> Section:
+def build_controls(selections: Results, runs: Sequence[FinishedRun]) -> Section:
     """The accuracies on other suites and under controls, and the paired differences."""
     compared = [run for run in runs if run.kind in SELECTION_KINDS and run.report.controls]
     differences = [_name_table(tables.paired_table(r.report.controls), r.title) for r in compared]
@@ -192,11 +192,11 @@ def _study_table(run: FinishedRun) -> Table:
     return _name_table(tables.human_table(run.report), run.name, title)
 
 
-def selection_details(selections: Results, transfers: Container[str]) -> Section:
+def build_selection_details(selections: Results, transfers: Container[str]) -> Section:
     section = Section("Selection in detail")
     for benchmark, rows in group_by_item_set(selections).items():
         if horizons := {m.label: m.result.horizons for m in rows if m.result.horizons}:
-            plot = partial(figures.accuracy_figure, with_paper=rows[0].benchmark not in transfers)
+            plot = partial(figures.plot_accuracies, with_paper=rows[0].benchmark not in transfers)
             caption = f"Accuracy by horizon on {benchmark}."
             section.figures.append(
                 Figure(file_stem(f"horizons-{benchmark}"), caption, plot, horizons)
@@ -206,24 +206,23 @@ def selection_details(selections: Results, transfers: Container[str]) -> Section
     return section
 
 
-def retrieval_details(retrievals: Results) -> Section:
+def build_retrieval_details(retrievals: Results) -> Section:
     section = Section("Retrieval in detail")
     for benchmark, rows in group_by_item_set(retrievals).items():
         ordered = sorted(rows, key=lambda m: (-(m.result.width or 0), not m.result.untrained))
         section.tables.append(replace(summary_tables.summary_table("widths", ordered), folded=True))
         if any(m.result.width for m in rows):
-            plot, caption = figures.retrieval_figure, f"Recall by width on {benchmark}."
+            plot, caption = figures.plot_recalls, f"Recall by width on {benchmark}."
             results = [(m.name, m.result) for m in rows]
             section.figures.append(Figure(file_stem(f"widths-{benchmark}"), caption, plot, results))
     return section
 
 
-def training(runs: Sequence[FinishedRun]) -> Section:
+def build_training(runs: Sequence[FinishedRun]) -> Section:
     """The curves of the training loss, and of the measures on held-out scenes."""
     section = Section("Training")
     for run in runs:
-        journal = run.folder / "metrics.jsonl"
-        if journal.exists() and (records := [*read_json_lines(journal)]):
+        if records := read_journal(run.folder):
             name = f"training-{run.title.replace('/', '-')}"
             section.figures.append(Figure(name, f"Training of {run.title}.", plot_curves, records))
     return section
@@ -236,7 +235,7 @@ def _name_table(table: Table, name: str, title: str = "") -> Table:
 
 
 def _family_figure(name: str, rows: Results, with_paper: bool = True) -> Figure:
-    plot = partial(figures.accuracy_figure, with_paper=with_paper)
+    plot = partial(figures.plot_accuracies, with_paper=with_paper)
     caption = f"Accuracy by family on {rows[0].item_set}, with 95% intervals."
     accuracies = {m.label: m.result.families for m in rows}
     return Figure(file_stem(f"{name}-{rows[0].item_set}"), caption, plot, accuracies)

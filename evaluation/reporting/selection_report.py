@@ -11,7 +11,7 @@ from pathlib import Path
 from conf.files import write_text
 from evaluation.metrics.results import SelectionReport
 from evaluation.reporting import tables
-from evaluation.reporting.figures import accuracy_figure
+from evaluation.reporting.figures import plot_accuracies
 from evaluation.reporting.reference import SUITE
 
 log = logging.getLogger(__name__)
@@ -27,4 +27,4 @@ def write_report(report: SelectionReport, folder: Path, suite: str) -> None:
     write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
     write_text(folder / "report.json", json.dumps(asdict(report), indent=1))
     by_family = {f"{r.name} ({r.variant})": r.families for r in results}
-    accuracy_figure(by_family, folder / "selection.png", suite == SUITE)
+    plot_accuracies(by_family, folder / "selection.png", suite == SUITE)

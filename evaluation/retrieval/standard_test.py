@@ -69,4 +69,4 @@ def write_report(
     write_text(folder / "report.txt", page + "\n")
     report = {"rows": rows, **entries}
     write_text(folder / "report.json", json.dumps(report, indent=1, default=asdict))
-    figures.retrieval_figure([(row.name, row) for row in rows], folder / "retrieval.png")
+    figures.plot_recalls([(row.name, row) for row in rows], folder / "retrieval.png")

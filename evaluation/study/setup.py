@@ -108,7 +108,11 @@ def read_item_ids(path: Path) -> list[str]:
         ) from error
     repeated = [item_id for item_id, count in Counter(ids).items() if count > 1]
     if repeated or not ids:
-        problem = f"lists {repeated[0]} more than once" if repeated else "lists no item"
+        problem = (
+            f"lists {repeated[0]} more than once: remove the repeated line"
+            if repeated
+            else "lists no item: give one item_id per line"
+        )
         raise UserError(f"items={path} {problem}", code="invalid-items")
     return ids
 
@@ -126,7 +130,8 @@ def sample_items(
     """
     if count > len(pool):
         raise UserError(
-            f"{setting}={count} is more than the {len(pool)} items of the benchmark's split",
+            f"{setting}={count} is more than the {len(pool)} items of the benchmark's split: "
+            "lower it, or choose a larger benchmark",
             code="too-few-items",
         )
     rng = named_rng(seed, "study", "items")

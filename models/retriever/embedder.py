@@ -27,7 +27,14 @@ from conf.schema import RetrieverConfig
 from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
 from data.render.frame_cache import FrameReader
 from models.attention import choose_attention
-from models.checks import PEFT, check_is_qwen3_vl, check_modules, check_processor
+from models.checks import (
+    ADAPTER_CONFIG,
+    ADAPTER_WEIGHTS,
+    PEFT_PREFIX,
+    check_is_qwen3_vl,
+    check_modules,
+    check_processor,
+)
 from models.compat import keep_differentiable
 from models.distributed import main_first
 from models.loading import (
@@ -39,17 +46,15 @@ from models.loading import (
     weight_options,
 )
 from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
-from models.student.prompts import load_clip
+from models.student.prompts import list_timestamps, load_clip
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
 Retriever = SentenceTransformer | MultiVectorEncoder
 """A single-vector or a multi-vector retriever."""
-Item = RetrievalQuery | FrameRef
-"""An input of a retriever (not a selection item)."""
+QueryOrFrame = RetrievalQuery | FrameRef
+"""An input of a retriever."""
 
-ADAPTERS = "adapter_model.safetensors"
-"""The file name of saved adapters."""
 PROCESSING = {
     # By default, sentence-transformers truncates long inputs, even within a video. Here, inputs are
     # not truncated; `train.common.audit` raises an error before training if a query is too long.
@@ -128,8 +133,8 @@ def load_adapters(model: Retriever, folder: Path) -> None:
     """Load adapters, and the weights of the modules after the backbone, from a folder."""
     import peft
 
-    weights = load_file(folder / ADAPTERS)
-    adapters = {name.removeprefix(PEFT): weight for name, weight in weights.items()}
+    weights = load_file(folder / ADAPTER_WEIGHTS)
+    adapters = {name.removeprefix(PEFT_PREFIX): weight for name, weight in weights.items()}
     loaded = peft.set_peft_model_state_dict(model[0].model, adapters)
     if loaded.unexpected_keys:
         raise ValueError(
@@ -154,9 +159,9 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     Raises:
         UserError: `folder` contains no complete retriever, or its base is not on this machine.
     """
-    if (folder / EXPORT).exists() and not (folder / "adapter_config.json").exists():
+    if (folder / EXPORT).exists() and not (folder / ADAPTER_CONFIG).exists():
         return load_merged(folder, cfg)
-    if (folder / "adapter_config.json").exists() and cfg.model is not None:
+    if (folder / ADAPTER_CONFIG).exists() and cfg.model is not None:
         # Otherwise a missing base would look like a damaged run.
         check_available("retriever", cfg.model)
     weights = weight_options(cfg, precision)
@@ -182,9 +187,14 @@ def _load_saved(folder: Path, cfg: RetrieverConfig, **options: Any) -> Retriever
 def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list[str]:
     """Return texts to train a tokenizer on: questions, instructions, roles and timestamps."""
     questions = sorted({q.question for q in queries})
-    timestamps = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     roles = ["system", "user", "assistant"]
-    return [*questions, cfg.query_instruction, cfg.frame_instruction, *roles, *timestamps] * 10
+    return [
+        *questions,
+        cfg.query_instruction,
+        cfg.frame_instruction,
+        *roles,
+        *list_timestamps(),
+    ] * 10
 
 
 def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQuery:
@@ -208,7 +218,7 @@ def frame_input(frame: FrameRef, frames: FrameReader) -> Any:
 
 
 def model_inputs(
-    items: Sequence[Item], frames: FrameReader, cfg: RetrieverConfig
+    items: Sequence[QueryOrFrame], frames: FrameReader, cfg: RetrieverConfig
 ) -> tuple[list[Any], str]:
     """Return inputs of sentence-transformers, and their instruction; all items are of one type."""
     if isinstance(items[0], FrameRef):
@@ -218,7 +228,7 @@ def model_inputs(
 
 def embed(
     model: Retriever,
-    items: Sequence[Item],
+    items: Sequence[QueryOrFrame],
     frames: FrameReader,
     cfg: RetrieverConfig,
     batch: int,
@@ -248,7 +258,7 @@ def embed(
     return rows
 
 
-def check_finite(vectors: Sequence[torch.Tensor], items: Sequence[Item]) -> None:
+def check_finite(vectors: Sequence[torch.Tensor], items: Sequence[QueryOrFrame]) -> None:
     """Raise UserError if the embedding of an item has a NaN or an Inf."""
     for item, embedded in zip(items, vectors, strict=True):
         if not embedded.isfinite().all():

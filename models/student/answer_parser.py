@@ -210,9 +210,9 @@ def _read_record(text: str, start: int) -> tuple[list[str | None], int | None]:
     """Return the choices in the record that begins at `start` (None for an unreadable choice), and
     the record's end (None if it is cut off).
 
-    Without a choice at its outermost level, a record has no choices; in {"answer": {...}}, this is
-    the level of the inner object. With one, choices at deeper
-    levels count too, because another record may begin inside a record that was broken off.
+    A record counts only if it has a choice at its outermost level; in {"answer": {...}}, this is
+    the level of the inner object. Then choices at deeper levels are returned too, because another
+    record may begin inside a record that was broken off.
     """
     choices: list[tuple[int, str | None]] = []
     depth, end = 0, None

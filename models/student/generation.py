@@ -34,12 +34,12 @@ def generate(
     inputs: dict,
     limit: int,
     precision: str,
-    processors: LogitsProcessorList | None = None,
+    logits_processors: LogitsProcessorList | None = None,
 ) -> list[GeneratedText]:
     """Generate a response to each prompt of a left-padded batch.
 
-    Decoding is greedy: each new token has the largest logit after `processors` are applied. With
-    the processors of `sampling_processors`, this token is a random sample.
+    Decoding is greedy: each new token has the largest logit after `logits_processors` are applied.
+    With those of `sampling_processors`, this token is a random sample.
 
     Args:
         inputs: What `Collator` returns for samples without responses, all in one mode.
@@ -59,7 +59,7 @@ def generate(
             max_new_tokens=limit,
             do_sample=False,
             past_key_values=create_cache(model),
-            logits_processor=processors,
+            logits_processor=logits_processors,
         )
     prompt, new = ids[:, : inputs["input_ids"].shape[1]], ids[:, inputs["input_ids"].shape[1] :]
     tokenizer = processor.tokenizer

@@ -99,6 +99,11 @@ class Sample:
         return len(self.images) + ((len(self.clip.indices) + 1) // 2 if self.clip else 0)
 
 
+def list_timestamps() -> list[str]:
+    """Return timestamps, as a processor writes them before a clip's frames, with all digits."""
+    return [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
+
+
 def answer_line(letter: str) -> str:
     return f"Answer: {letter}"
 

@@ -17,7 +17,7 @@ from data.render.frame_cache import FrameReader
 from data.store import MANIFEST
 from dynapix.__main__ import COMMANDS, overview
 from dynapix.selection import MIN_FAILURES_TO_STOP
-from evaluation.metrics.selection import Choices, selection_report
+from evaluation.metrics.selection import Choices, build_selection_report
 from evaluation.reporting.tables import selection_table
 from tests.dynapix.models import always_a, nearest
 from tests.test_house import COMMANDS as ALL_COMMANDS
@@ -109,7 +109,7 @@ def test_a_result_is_the_report_of_the_command(bench, micro_store) -> None:
     items = micro_store.selection("test")
     credits = [float(item.letter == "A") for item in items]
     choices = Choices("model", "text", None, credits, ["A"] * len(items))
-    report = selection_report([choices], items, "micro", micro_store.identity, 3)
+    report = build_selection_report([choices], items, "micro", micro_store.identity, 3)
     assert result.accuracy == report.rows[0]
     assert str(selection_table(report.rows)) in str(result)
 

@@ -37,7 +37,7 @@ READERS = {
     **dict.fromkeys((".pt", ".pth", ".bin"), lambda path: zipfile.ZipFile(path).close()),
 }
 """By suffix, a function that raises an error if a file is incomplete."""
-UNREADABLE = (errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE)
+ACCESS_ERRNOS = (errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE)
 """Numbers of operating system errors that say nothing about the content of a file."""
 
 
@@ -81,7 +81,7 @@ def find_damage(checkpoint: Path) -> str | None:
             if read := READERS.get(path.suffix):
                 read(path)
         except (OSError, ValueError, SafetensorError, zipfile.BadZipFile) as error:
-            if isinstance(error, OSError) and error.errno in UNREADABLE:
+            if isinstance(error, OSError) and error.errno in ACCESS_ERRNOS:
                 # The checkpoint may be complete; without it, the run would start again.
                 raise UserError(
                     f"{path} cannot be read ({error}): correct this and run the same command again",

@@ -20,7 +20,7 @@ COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
 """Colors that people with any colour vision can distinguish (Paul Tol's bright set)."""
 
 
-def empty_figure(width: float, height: float) -> Figure:
+def create_figure(width: float, height: float) -> Figure:
     """Return an empty figure of width x height inches with the Agg backend."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -48,7 +48,7 @@ def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:
         panels.setdefault(panel, {})[key] = label
     columns = 1 if len(panels) <= 3 else 2
     rows = -(-len(panels) // columns)
-    figure = empty_figure(8.5 * columns, 0.6 + 2.5 * rows)
+    figure = create_figure(8.5 * columns, 0.6 + 2.5 * rows)
     all_axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in all_axes[len(panels) :]:
         axes.set_axis_off()

@@ -18,7 +18,7 @@ from teacher.predicates.relations import VALUES
 from teacher.sections import split_sections
 from teacher.writers.relational import PHRASES
 
-SECTIONS = ("Prediction", "Candidate analysis")
+FALSIFIED_SECTIONS = ("Prediction", "Candidate analysis")
 KINDS = ("side", "height", "gap", "cover", "extreme")
 """Kinds of relations whose words are replaced by another word of the kind."""
 
@@ -65,7 +65,7 @@ def falsify_words(
     """
     parts, spans, length, end = [], [], 0, 0
     for title, start, stop in split_sections(text):
-        if title not in SECTIONS:
+        if title not in FALSIFIED_SECTIONS:
             continue
         for match in WORD.finditer(text, start, stop):
             if rng.random() >= share:

@@ -13,6 +13,9 @@ from data.store import Store
 HELD_OUT_SHARE = 0.1
 """Share of the training scenes that are held out."""
 
+REPORTS = {"data.build": "shortfalls", "teacher.narrate": "rejected rationales"}
+"""What the commands that make training data report."""
+
 Row = TypeVar("Row")
 
 
@@ -38,11 +41,15 @@ def shuffled(rows: list[Row], seed: int) -> list[Row]:
     return [rows[k] for k in np.random.default_rng([seed, 2]).permutation(len(rows))]
 
 
-def check_not_empty(count: int, what: str) -> None:
-    """Raise UserError if `count` is 0; `what` names the missing items, queries or rationales."""
+def check_not_empty(count: int, what: str, command: str = "data.build") -> None:
+    """Raise UserError if `count` is 0.
+
+    Args:
+        what: Names the missing items, queries or rationales.
+        command: The command whose report explains why there are none, from `REPORTS`.
+    """
     if count == 0:
         raise UserError(
-            f"there are no {what}: see the shortfalls that python -m data.build prints and the "
-            "rejected rationales that python -m teacher.narrate prints",
+            f"there are no {what}: see the {REPORTS[command]} that python -m {command} prints",
             code="no-training-data",
         )

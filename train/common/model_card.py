@@ -16,7 +16,7 @@ from models.resolved_settings import read_resolved
 from train.common.journal import BEST_STEP
 
 
-def model_card(
+def build_model_card(
     name: str,
     settings: SftCommand | ContrastiveCommand,
     folder: Path,

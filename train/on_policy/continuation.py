@@ -24,7 +24,7 @@ from models.trained_runs import (
     STUDENT_SETTINGS,
     check_sees_frames,
     product_folder,
-    trained_settings,
+    read_trained_settings,
 )
 from train.common.journal import run_metrics
 from train.common.training_loop import run_training
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 Command = TypeVar("Command", DistillCommand, ReinforceCommand)
 
 
-def source_settings(model: str | None) -> tuple[Path, SftCommand]:
+def read_source_settings(model: str | None) -> tuple[Path, SftCommand]:
     """Return the folder and the settings of the run whose student is trained further.
 
     Raises:
@@ -54,7 +54,7 @@ def source_settings(model: str | None) -> tuple[Path, SftCommand]:
             code="missing-run",
         )
     source = Path(model)
-    trained = trained_settings(source, SftCommand, "student")
+    trained = read_trained_settings(source, SftCommand, "student")
     check_sees_frames(source, trained.train.facts)
     if trained.train.regime == "answer_only":
         raise UserError(
@@ -71,7 +71,8 @@ LR_SHARE = 0.5
 
 
 def inherit_settings(cfg: Command, trained: SftCommand) -> Command:
-    """Return a run's settings in which those of the student's training replace null."""
+    """Return a run's settings in which those of the student's training replace null. The
+    learning rate is `LR_SHARE` of that of the student's training."""
     inherited = {
         "lr": LR_SHARE * trained.train.lr,
         "micro_batch": trained.train.micro_batch,
@@ -131,12 +132,12 @@ def train_and_save(
     """Train a student, save it in the run's folder, and return the run's metrics.
 
     Args:
-        trainer: A trainer with a sampler, `responses`.
+        trainer: A trainer with a `response_sampler`.
         memory_settings: The settings that the error for running out of memory advises to lower.
     """
     best_step = run_training(trainer, run, checkpoint, memory_settings)
     if rank() == 0:
         loading.save_student(trainer.model, processor, run.folder / "student", precision)
-    trainer.responses.close()
+    trainer.response_sampler.close()
     log.info("the student is in %s", run.folder / "student")
     return run_metrics(run.folder, best_step)

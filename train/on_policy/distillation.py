@@ -62,7 +62,7 @@ class DistillationTrainer(StudentTrainer):
 
     Args:
         teacher: Measures the divergence.
-        responses: Samples the responses.
+        response_sampler: Samples the responses.
         student_collator: Makes the inputs of the student.
     """
 
@@ -70,14 +70,14 @@ class DistillationTrainer(StudentTrainer):
         self,
         *args: Any,
         teacher: Teacher,
-        responses: ResponseSampler,
+        response_sampler: ResponseSampler,
         student_collator: TrainerCollator,
         **settings: Any,
     ) -> None:
         super().__init__(*args, compute_loss_func=self._mean_divergence, **settings)
-        self._teacher, self.responses = teacher, responses
+        self._teacher, self.response_sampler = teacher, response_sampler
         self._student_collator = student_collator
-        self._read: Any = None
+        self._teacher_inputs: Any = None
         self._sampled: list[tuple[bool, bool, int]] = []
 
     def get_batch_samples(
@@ -88,10 +88,10 @@ class DistillationTrainer(StudentTrainer):
         parts = [batch["prompts"] for batch in batches]
         texts = iter(self._sample_responses([p for part in parts for p in part]))
         pairs = [[add_response(p, next(texts)) for p in part] for part in parts]
-        read = self._teacher.read([[teacher for _, teacher in part] for part in pairs])
+        prepared = self._teacher.prepare([[teacher for _, teacher in part] for part in pairs])
         batches = [
-            {**self._student_collator([student for student, _ in part]), TEACHER: found}
-            for part, found in zip(pairs, read, strict=True)
+            {**self._student_collator([student for student, _ in part]), TEACHER: inputs}
+            for part, inputs in zip(pairs, prepared, strict=True)
         ]
         return batches, self._get_num_items_in_batch(batches, device)
 
@@ -99,14 +99,14 @@ class DistillationTrainer(StudentTrainer):
         texts = []
         if prompts:
             samples, seeds = [p.student for p in prompts], [p.seed for p in prompts]
-            texts = self.responses.sample(self.model, samples, seeds)
+            texts = self.response_sampler.sample(self.model, samples, seeds)
         letters = [parse_choice(t.text, truncated=t.truncated).letter for t in texts]
         counted = [k for k, prompt in enumerate(prompts) if prompt.supervised]
         self._sampled += [
             (letters[k] == prompts[k].letter, letters[k] is not None, len(texts[k].ids))
             for k in counted
         ]
-        self.responses.check_parsed([letters[k] for k in counted], self.accelerator)
+        self.response_sampler.check_parsed([letters[k] for k in counted], self.accelerator)
         return texts
 
     def compute_loss(
@@ -116,7 +116,7 @@ class DistillationTrainer(StudentTrainer):
         return_outputs: bool = False,
         **settings: Any,
     ) -> Any:
-        self._read = inputs.pop(TEACHER, None)
+        self._teacher_inputs = inputs.pop(TEACHER, None)
         return super().compute_loss(model, inputs, return_outputs, **settings)
 
     def _mean_divergence(
@@ -124,11 +124,11 @@ class DistillationTrainer(StudentTrainer):
     ) -> Tensor:
         """Return a micro-batch's part of the mean divergence over an accumulated batch's tokens;
         in an evaluation, of the mean cross entropy."""
-        if self._read is None:
+        if self._teacher_inputs is None:
             return token_mean(outputs, labels, num_items_in_batch)
         supervised = labels[:, 1:] != IGNORED
         logits, tokens = outputs.logits[:, :-1][supervised], labels[:, 1:][supervised]
-        total = self._teacher.measure(self._read, logits, tokens).sum()
+        total = self._teacher.measure(self._teacher_inputs, logits, tokens).sum()
         return total / (supervised.sum() if num_items_in_batch is None else num_items_in_batch)
 
     def log(self, logs: dict[str, float], *args: Any, **settings: Any) -> None:
@@ -193,7 +193,7 @@ def build_trainer(
         accuracy=LetterAccuracy(letter_ids(processor)),
         answers=answers if train.generated_items else None,
         teacher=teacher,
-        responses=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
+        response_sampler=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
         # The sampled responses are limited by student.max_new_tokens already.
         student_collator=TrainerCollator(Collator(processor, None), digests=False),
     )

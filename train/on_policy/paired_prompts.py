@@ -36,8 +36,8 @@ class PairedPrompts:
 def pair_prompts(
     item: SupervisedItem, frames: FrameReader, frame_count: int, seed: int, permute: bool
 ) -> LazySample:
-    """Return the prompts about an item: with its frames for the student, and with its facts for the
-    teacher.
+    """Return a sample that renders `PairedPrompts` of an item: with its frames for the student, and
+    with its facts for the teacher.
 
     Args:
         item: The item with its facts.
@@ -92,6 +92,8 @@ def load_datasets(
         mode: StudentDataset([item.lazy_sample(frames, frame_count) for item in items])
         for mode, items in supervised_items(store, validation, *shared).items()
     }
-    check_not_empty(len(samples), "training items with accepted rationales")
-    check_not_empty(len(held_out["reasoning"]), "held-out items with accepted rationales")
+    check_not_empty(len(samples), "training items with accepted rationales", "teacher.narrate")
+    check_not_empty(
+        len(held_out["reasoning"]), "held-out items with accepted rationales", "teacher.narrate"
+    )
     return StudentDataset(samples), held_out

@@ -50,8 +50,8 @@ ROW = "row"
 
 
 @dataclass(frozen=True)
-class JudgedItem:
-    """An item, its predicates, by which responses are judged, and its prompt without response."""
+class ItemToJudge:
+    """An item whose responses are judged, its predicates, and its prompt without response."""
 
     item: SelectionItem
     predicates: RelationalPredicates
@@ -60,7 +60,7 @@ class JudgedItem:
 
 def load_items(
     cfg: ReinforceTrainConfig, trained: SftCommand, store: Store, seed: int
-) -> tuple[list[JudgedItem], list[JudgedItem]]:
+) -> tuple[list[ItemToJudge], list[ItemToJudge]]:
     """Return the training items, and held-out items, that have predicates.
 
     Raises:
@@ -68,28 +68,28 @@ def load_items(
     """
     frames = FrameReader(store, trained.student.image_size)
 
-    def judged(items: Sequence[SelectionItem]) -> list[JudgedItem]:
+    def with_predicates(items: Sequence[SelectionItem]) -> list[ItemToJudge]:
         found = []
         for item in items:
             predicates = describe_item(item, store, trained.teacher)
             if predicates is not None:
-                found.append(JudgedItem(item, predicates, lambda item=item: prompt(item)))
+                found.append(ItemToJudge(item, predicates, lambda item=item: prompt(item)))
         return found
 
     def prompt(item: SelectionItem) -> Sample:
         regime, count = trained.train.regime, trained.student.frames
         return selection_sample(item, "reasoning", regime, frames, count)
 
-    training, validation = map(judged, split_items(store, cfg.validation_items, seed))
+    training, validation = map(with_predicates, split_items(store, cfg.validation_items, seed))
     check_not_empty(len(training), "training items with predicates")
     check_not_empty(len(validation), "held-out items with predicates")
     return training, validation
 
 
-def make_rows(items: Sequence[JudgedItem], split: str) -> Dataset:
+def make_rows(items: Sequence[ItemToJudge], split: str) -> Dataset:
     """Return the rows of TRL's dataset: the index of each item. TRL needs a prompt, but the prompts
     are rendered later."""
-    ids = [judged.item.item_id for judged in items]
+    ids = [entry.item.item_id for entry in items]
     return Dataset.from_dict(
         {"prompt": ids, "index": list(range(len(ids))), "split": [split] * len(ids)}
     )
@@ -118,7 +118,7 @@ class MediaGRPOTrainer(GRPOTrainer):
 
     Args:
         items: The items by split, train and eval.
-        responses: Samples the responses.
+        response_sampler: Samples the responses.
         collator: Makes the model's inputs.
     """
 
@@ -126,8 +126,8 @@ class MediaGRPOTrainer(GRPOTrainer):
         self,
         model: nn.Module,
         *args: Any,
-        items: Mapping[str, Sequence[JudgedItem]],
-        responses: ResponseSampler,
+        items: Mapping[str, Sequence[ItemToJudge]],
+        response_sampler: ResponseSampler,
         collator: Collator,
         **settings: Any,
     ) -> None:
@@ -138,8 +138,9 @@ class MediaGRPOTrainer(GRPOTrainer):
             super().__init__(model, *args, rollout_func=self._respond, **settings)
         for parameter, data in trained.items():
             parameter.data = data
-        self._items, self.responses, self._collator = items, responses, collator
-        self._judged: list[JudgedItem] = []
+        self._items, self.response_sampler = items, response_sampler
+        self._collator = collator
+        self._batch_items: list[ItemToJudge] = []
         self._prompts: list[Sample] = []
         self._inputs: list[Sample] = []
         self._differ = torch.empty(0, dtype=torch.bool)
@@ -168,8 +169,8 @@ class MediaGRPOTrainer(GRPOTrainer):
 
         Responses to an item whose rewards are all equal do not count in the mean over tokens.
         """
-        self._judged = [self._items[row["split"]][row["index"]] for row in inputs]
-        self._prompts = [judged.render() for judged in self._judged]
+        self._batch_items = [self._items[row["split"]][row["index"]] for row in inputs]
+        self._prompts = [entry.render() for entry in self._batch_items]
         output = super()._generate_and_score_completions(inputs)
         first = self.accelerator.process_index * len(inputs)
         counted = self._differ[first : first + len(inputs), None]
@@ -197,20 +198,20 @@ class MediaGRPOTrainer(GRPOTrainer):
         mode, step = "train" if training else "eval", self.state.global_step
         seen: Counter[str] = Counter()
         seeds = []
-        for judged in self._judged:
-            name = judged.item.item_id
+        for entry in self._batch_items:
+            name = entry.item.item_id
             # The ranks have consecutive parts of the responses to an item.
             key = (self.args.seed, mode, step, name, seen[name], self.accelerator.process_index)
             seeds.append(int(seeded_rng(*key).integers(2**31)))
             seen[name] += 1
-        texts = self.responses.sample(self.model, self._prompts, seeds)
+        texts = self.response_sampler.sample(self.model, self._prompts, seeds)
         self.model.train(training)
         judged = [
-            judge_response(t.text, t.truncated, j.item, j.predicates)
-            for t, j in zip(texts, self._judged, strict=True)
+            judge_response(text.text, text.truncated, entry.item, entry.predicates)
+            for text, entry in zip(texts, self._batch_items, strict=True)
         ]
         if training:
-            self.responses.check_parsed([j.letter for j in judged], self.accelerator)
+            self.response_sampler.check_parsed([j.letter for j in judged], self.accelerator)
         batch = self._collator(self._prompts)
         prompt_ids = [
             ids[mask.bool()].tolist()
@@ -297,8 +298,8 @@ def build_trainer(
     student: StudentConfig,
     model: nn.Module,
     processor: ProcessorMixin,
-    training: Sequence[JudgedItem],
-    validation: Sequence[JudgedItem],
+    training: Sequence[ItemToJudge],
+    validation: Sequence[ItemToJudge],
     checkpoint: Path | None,
 ) -> MediaGRPOTrainer:
     """Return a trainer.
@@ -338,7 +339,7 @@ def build_trainer(
         eval_dataset=make_rows(validation, "eval"),
         processing_class=processor,
         items={"train": training, "eval": validation},
-        responses=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
+        response_sampler=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
         collator=Collator(processor, student.max_length),
     )
     trainer.add_callback(EpochCallback(trainer))

@@ -54,13 +54,15 @@ class ResponseSampler:
         """
         model.eval()
         inputs = self._collate(prompts)
-        steps = sampling_processors(self._sampling, seeds)
+        logits_processors = sampling_processors(self._sampling, seeds)
         device = next(model.parameters()).device
-        steps.insert(0, SuppressTokensLogitsProcessor(self._never, device=device))
+        logits_processors.insert(0, SuppressTokensLogitsProcessor(self._never, device=device))
         when = f"while sampling {len(prompts)} responses"
         with explain_out_of_memory(when, "lower train.batch in another run (run=NAME)"):
             limit = self._sampling.max_new_tokens
-            return generate(model, self._processor, inputs, limit, self._precision, steps)
+            return generate(
+                model, self._processor, inputs, limit, self._precision, logits_processors
+            )
 
     def close(self) -> None:
         """Release what the sampler uses besides the model."""

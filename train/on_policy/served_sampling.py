@@ -30,7 +30,7 @@ from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import TRUNCATED, Response
 from train.on_policy.sampling import ResponseSampler
 
-ADAPTERS = "sampled_adapters"
+ADAPTER_FOLDER = "sampled_adapters"
 """Folder of a run that contains the adapters of the current step."""
 
 
@@ -61,7 +61,7 @@ class ServedSampler(ResponseSampler):
                 code="no-adapters",
             )
         self._servers = servers
-        self._folder = folder.absolute() / ADAPTERS
+        self._folder = folder.absolute() / ADAPTER_FOLDER
 
     def sample(
         self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]

@@ -19,7 +19,7 @@ from models.distributed import rank_device
 from models.resolved_settings import check_base
 from models.student.collator import IGNORED, Collator, Encoded, encode
 from models.student.prompts import Sample
-from models.trained_runs import product_folder, trained_settings
+from models.trained_runs import product_folder, read_trained_settings
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from train.on_policy.divergence import estimate_divergence, measure_divergence
 
@@ -30,7 +30,7 @@ PARTIAL_CHARACTER = "\N{REPLACEMENT CHARACTER}"
 class Teacher(Protocol):
     """Tells how far a student's distributions are from its own, at the tokens of responses."""
 
-    def read(self, parts: Sequence[Sequence[Sample]]) -> list[Any]:
+    def prepare(self, parts: Sequence[Sequence[Sample]]) -> list[Any]:
         """Return what `measure` needs for each micro-batch of a step.
 
         Args:
@@ -38,11 +38,11 @@ class Teacher(Protocol):
         """
         ...
 
-    def measure(self, read: Any, logits: Tensor, tokens: Tensor) -> Tensor:
+    def measure(self, prepared: Any, logits: Tensor, tokens: Tensor) -> Tensor:
         """Return the divergence (N,) at each of the N supervised tokens of a micro-batch.
 
         Args:
-            read: What `read` returned for the micro-batch.
+            prepared: What `prepare` returned for the micro-batch.
             logits: (N, V) logits of the student at these tokens.
             tokens: (N,) ids of these tokens.
         """
@@ -61,12 +61,12 @@ class LocalTeacher:
         # The sampled responses are limited by student.max_new_tokens already.
         self._collate = Collator(processor, None)
 
-    def read(self, parts: Sequence[Sequence[Sample]]) -> list[dict[str, Any]]:
+    def prepare(self, parts: Sequence[Sequence[Sample]]) -> list[dict[str, Any]]:
         """Return the inputs of the model."""
         return [self._collate(part) for part in parts]
 
-    def measure(self, read: dict[str, Any], logits: Tensor, tokens: Tensor) -> Tensor:
-        inputs = dict(read)
+    def measure(self, prepared: dict[str, Any], logits: Tensor, tokens: Tensor) -> Tensor:
+        inputs = dict(prepared)
         supervised = inputs.pop("labels")[:, 1:] != IGNORED
         device = logits.device.type
         with torch.no_grad(), torch.autocast(device, torch.bfloat16, enabled=self._bf16):
@@ -84,7 +84,7 @@ class ServerTeacher:
     def __init__(self, servers: TeacherServerConfig, processor: ProcessorMixin) -> None:
         self._servers, self._processor = servers, processor
 
-    def read(self, parts: Sequence[Sequence[Sample]]) -> list[Tensor]:
+    def prepare(self, parts: Sequence[Sequence[Sample]]) -> list[Tensor]:
         """Request the log-probabilities (N,) of the supervised tokens of each micro-batch.
 
         Raises:
@@ -97,9 +97,9 @@ class ServerTeacher:
             torch.tensor([x for s in part if s.supervised for x in next(scores)]) for part in parts
         ]
 
-    def measure(self, read: Tensor, logits: Tensor, tokens: Tensor) -> Tensor:
+    def measure(self, prepared: Tensor, logits: Tensor, tokens: Tensor) -> Tensor:
         student = log_softmax(logits.float(), dim=-1).gather(1, tokens[:, None])[:, 0]
-        return estimate_divergence(student, read)
+        return estimate_divergence(student, prepared)
 
     async def _score(self, samples: Sequence[Sample]) -> list[list[float]]:
         """Return the log-probabilities of the tokens of each sample's response."""
@@ -144,7 +144,7 @@ def _response_start(encoded: Encoded) -> int:
     return sum(label == IGNORED for label in encoded.labels)
 
 
-def teacher_settings(cfg: DistillCommand, trained: SftCommand) -> tuple[Path, SftCommand]:
+def read_teacher_settings(cfg: DistillCommand, trained: SftCommand) -> tuple[Path, SftCommand]:
     """Return the folder and the settings of the run that trained the teacher.
 
     Args:
@@ -155,7 +155,7 @@ def teacher_settings(cfg: DistillCommand, trained: SftCommand) -> tuple[Path, Sf
             benchmark than the student.
     """
     folder = Path(cfg.teacher_model or cfg.model)
-    settings = trained_settings(folder, SftCommand, "student", "teacher_model")
+    settings = read_trained_settings(folder, SftCommand, "student", "teacher_model")
     check_base(folder, settings.student)
     for name, ours, theirs in (
         ("train.regime", trained.train.regime, settings.train.regime),

@@ -11,7 +11,7 @@ from accelerate.utils import send_to_device
 from conf.schema import RetrieverConfig
 from data.render.frame_cache import FrameReader
 from models.compat import encode_images, encoder_outputs
-from models.retriever.embedder import Item, Retriever, model_inputs
+from models.retriever.embedder import QueryOrFrame, Retriever, model_inputs
 from models.student.collator import MEDIA
 
 FEATURES = "vision_features"
@@ -40,10 +40,10 @@ class RetrieverInputs:
     ) -> None:
         self._model, self._frames, self._cfg = model, frames, cfg
         self._bf16, self._reuse = bf16, reuse_features
-        self._kept: dict[tuple[Item, ...], dict[str, Any]] = {}
+        self._kept: dict[tuple[QueryOrFrame, ...], dict[str, Any]] = {}
         model[0].register_forward_pre_hook(pass_features)
 
-    def load(self, items: Sequence[Item]) -> dict[str, Any]:
+    def load(self, items: Sequence[QueryOrFrame]) -> dict[str, Any]:
         """Return the inputs of queries or of frames, on the CPU."""
         kept = self._kept.pop(tuple(items), None)
         if kept is not None:
@@ -52,7 +52,7 @@ class RetrieverInputs:
         return self._model.preprocess(inputs, prompt=instruction)
 
     def prepare(
-        self, items: Sequence[Item], inputs: dict[str, Any], first_pass: bool
+        self, items: Sequence[QueryOrFrame], inputs: dict[str, Any], first_pass: bool
     ) -> dict[str, Any]:
         """Move loaded inputs to the model's device. In a first pass with `reuse_features`, also
         replace the pixels by the vision tower's outputs, and keep the result, which the next `load`

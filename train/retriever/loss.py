@@ -26,7 +26,7 @@ from torch.nn.functional import cross_entropy, normalize
 
 from conf.runs import rank, world_size
 from data.records import FrameRef
-from models.retriever.embedder import Item, Retriever, check_finite
+from models.retriever.embedder import QueryOrFrame, Retriever, check_finite
 from train.retriever.inputs import RetrieverInputs
 
 In = TypeVar("In")
@@ -67,7 +67,9 @@ class RankingLoss(nn.Module):
         self._widths, self._weights = widths, weights or [1.0] * len(widths)
         self._scale, self._mini_batch, self._prefetch = scale, mini_batch, prefetch
 
-    def forward(self, columns: Sequence[Sequence[Item]], labels: None = None) -> torch.Tensor:
+    def forward(
+        self, columns: Sequence[Sequence[QueryOrFrame]], labels: None = None
+    ) -> torch.Tensor:
         """Return the loss of a batch. Its `backward` runs the second pass.
 
         Args:
@@ -95,15 +97,15 @@ class RankingLoss(nn.Module):
         return loss
 
     def _load(
-        self, parts: Sequence[Sequence[Item]], first_pass: bool
-    ) -> Iterator[tuple[Sequence[Item], dict[str, Any]]]:
+        self, parts: Sequence[Sequence[QueryOrFrame]], first_pass: bool
+    ) -> Iterator[tuple[Sequence[QueryOrFrame], dict[str, Any]]]:
         """Yield each mini-batch with its inputs on the model's device."""
         loaded = prefetched(self._inputs.load, parts, self._prefetch)
         for part, inputs in zip(parts, loaded, strict=True):
             yield part, self._inputs.prepare(part, inputs, first_pass)
 
     def _embed(
-        self, part: Sequence[Item], inputs: dict[str, Any]
+        self, part: Sequence[QueryOrFrame], inputs: dict[str, Any]
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return vectors (items, vectors, width), and a mask (items, vectors) of scored vectors."""
         task = "document" if isinstance(part[0], FrameRef) else "query"
@@ -115,7 +117,7 @@ class RankingLoss(nn.Module):
 
     def _score(
         self,
-        columns: Sequence[Sequence[Item]],
+        columns: Sequence[Sequence[QueryOrFrame]],
         vectors: Sequence[torch.Tensor],
         masks: Sequence[torch.Tensor],
     ) -> torch.Tensor:
@@ -138,7 +140,7 @@ class RankingLoss(nn.Module):
 
     def _propagate(
         self,
-        parts: Sequence[Sequence[Item]],
+        parts: Sequence[Sequence[QueryOrFrame]],
         states: Sequence[RandContext],
         gradients: Sequence[torch.Tensor],
         factor: torch.Tensor,

@@ -17,7 +17,8 @@ from sentence_transformers.sentence_transformer.data_collator import (
     SentenceTransformerDataCollator,
 )
 
-from models.retriever.embedder import ADAPTERS, Item, load_adapters
+from models.checks import ADAPTER_WEIGHTS
+from models.retriever.embedder import QueryOrFrame, load_adapters
 from train.retriever.batches import QueryBatchSampler
 
 NUMBER = "query"
@@ -48,7 +49,7 @@ class IndexBatchTrainer:
         self,
         *args: Any,
         sampler: QueryBatchSampler,
-        columns_of: Callable[[Sequence[int]], list[list[Item]]],
+        columns_of: Callable[[Sequence[int]], list[list[QueryOrFrame]]],
         **options: Any,
     ) -> None:
         self._sampler = sampler
@@ -61,14 +62,16 @@ class IndexBatchTrainer:
     def get_batch_sampler(self, *_: Any, **__: Any) -> QueryBatchSampler:
         return self._sampler
 
-    def collect_features(self, inputs: dict[str, list[int]]) -> tuple[list[list[Item]], None]:
+    def collect_features(
+        self, inputs: dict[str, list[int]]
+    ) -> tuple[list[list[QueryOrFrame]], None]:
         return self._columns_of(inputs["indices"]), None
 
     def _load_from_checkpoint(self, checkpoint_path: str) -> None:
         """Load only the adapters and the head, if adapters are trained. The library would load the
         base too, without quantisation, and its weights would not fit the quantised model."""
         folder = Path(checkpoint_path)
-        if (folder / ADAPTERS).exists():
+        if (folder / ADAPTER_WEIGHTS).exists():
             load_adapters(self.model, folder)
         else:
             super()._load_from_checkpoint(checkpoint_path)

@@ -18,6 +18,7 @@ from models.student.prompts import (
     choose_instruction,
     facts_sample,
     has_matches,
+    list_timestamps,
     selection_sample,
 )
 from teacher.candidate_letters import relabel_text, reorder_candidates
@@ -82,8 +83,8 @@ class SupervisedItem:
         unless `variation` is given."""
         render = partial(self._render_in_epoch, frames, frame_count, variation)
         pairs = -(-frame_count // 2)
-        pictures = 0 if self.facts else pairs + len(LETTERS)
-        return LazySample(self.text, pictures, render, self.item.family)
+        picture_count = 0 if self.facts else pairs + len(LETTERS)
+        return LazySample(self.text, picture_count, render, self.item.family)
 
     def render(self, frames: FrameReader, frame_count: int) -> Sample:
         if self.facts:
@@ -176,7 +177,7 @@ def load_datasets(
     train, frame_count = cfg.train, cfg.student.frames
     frames = FrameReader(store, cfg.student.image_size)
     if train.regime != "answer_only":
-        check_not_empty(len(rationales), "accepted rationales")
+        check_not_empty(len(rationales), "accepted rationales", "teacher.narrate")
     training_items, validation_items = split_items(store, train.validation_items, cfg.seed)
     by_item = {r.item_id: r for r in rationales}
 
@@ -217,9 +218,7 @@ def prompt_corpus(items: Sequence[SelectionItem], others: Sequence[str] = ()) ->
         f"Candidate {x} does not match: it shows other objects and lacks\n{answer_line(x)}"
         for x in LETTERS
     ]
-    # Timestamps as prompts have them, with every digit.
-    clock = [f"<{tenths / 10:.1f} seconds>" for tenths in range(52)]
     instructions = [choose_instruction(mode, "cot") for mode in MODES]
     roles = ["user", "assistant"]
     prompts = [*item_questions, *letters, *instructions, *others, *roles]
-    return [*prompts * 20, *clock]
+    return [*prompts * 20, *list_timestamps()]

@@ -22,14 +22,14 @@ class LazySample:
 
     Attributes:
         text: Text of the prompt and the response, without parts that all prompts have.
-        media: Number of images plus number of frame pairs of the clip. With `text`, it determines
-            the estimated length in tokens.
-        render: Returns the sample in a given epoch.
+        picture_count: Number of images plus number of frame pairs of the clip. With `text`, it
+            determines the estimated length in tokens.
+        render: Returns the sample in a given epoch; for distillation, `PairedPrompts`.
         family: Family of the selection item.
     """
 
     text: str
-    media: int
+    picture_count: int
     render: Callable[[int], Sample]
     family: str | None = None
 
@@ -69,8 +69,10 @@ class StudentDataset(Dataset):
         ids = processor.tokenizer(self.texts, add_special_tokens=False).input_ids
         # A visual token covers a square of several patches.
         side = processor.image_processor.patch_size * processor.image_processor.merge_size
-        per_medium = round(image_size / side) ** 2 + EXTRA_TOKENS
-        return [len(i) + s.media * per_medium for i, s in zip(ids, self.samples, strict=True)]
+        per_picture = round(image_size / side) ** 2 + EXTRA_TOKENS
+        return [
+            len(i) + s.picture_count * per_picture for i, s in zip(ids, self.samples, strict=True)
+        ]
 
 
 def seeded_rng(*keys: int | str) -> np.random.Generator:

@@ -18,7 +18,7 @@ from train.student.lazy_samples import seeded_rng
 from train.tiny_base.questions import KINDS, QUESTIONS, Question, make_question
 from train.tiny_base.samples import OracleSample, make_sample
 
-SILENT = {
+PICTURES_ONLY = {
     "clip": Question("", "", candidates=False),
     "candidates": Question("", "", clip=False),
     "pictures": Question("", ""),
@@ -26,9 +26,9 @@ SILENT = {
 """What the samples of the stages without words show; they ask nothing."""
 COMPARISONS = ("compare", "explain")
 """The kinds of questions whose answers compare candidates with a prediction."""
-CYCLE = (*KINDS, *COMPARISONS)
+QUESTION_CYCLE = (*KINDS, *COMPARISONS)
 """The kinds of questions of successive steps. Comparing candidates is harder than the rest."""
-SHOWN = {"vision": ("clip", "candidates"), "motion": ("pictures",), "words": CYCLE}
+SAMPLE_KINDS = {"vision": ("clip", "candidates"), "motion": ("pictures",), "words": QUESTION_CYCLE}
 """The kinds of successive samples of each stage. The pictures of an item resemble each other, so a
 step of `vision` shows parts of more items."""
 FALSE_WORDS = 0.25
@@ -71,7 +71,7 @@ class ItemSampler:
         """Return this rank's samples of a step with `size` samples over all ranks. All are of the
         same kind, so that they show the same number of pictures."""
         samples = []
-        kind = SHOWN[stage][step % len(SHOWN[stage])]
+        kind = SAMPLE_KINDS[stage][step % len(SAMPLE_KINDS[stage])]
         for position in range(step * size + rank(), (step + 1) * size, world_size()):
             epoch, index = divmod(position, len(self.items))
             order = seeded_rng(self.seed, stage, epoch).permutation(len(self.items))
@@ -91,15 +91,15 @@ class ItemSampler:
         """Return an item with its candidates in random order, and a question about it.
 
         Args:
-            kind: The kind of question, or of `SILENT`.
+            kind: The kind of question, or of `PICTURES_ONLY`.
             key: Seed of the order and of the question, with the run's seed and the item.
             false_words: Share of the words for places and relations that are replaced in answers
                 that compare candidates with a prediction.
         """
         rng = seeded_rng(self.seed, key, item.item_id)
         item = reorder_candidates(item, rng.permutation(len(LETTERS)).tolist())
-        if kind in SILENT:
-            return item, SILENT[kind]
+        if kind in PICTURES_ONLY:
+            return item, PICTURES_ONLY[kind]
         question = make_question(kind, item, self.frames.scene, rng)
         if kind in COMPARISONS:
             answer, spans = falsify_words(question.answer, false_words, rng)

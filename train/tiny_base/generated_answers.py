@@ -36,7 +36,7 @@ from train.tiny_base.mentions import CLOSEST, NAME
 from train.tiny_base.oracle_targets import WORDS
 from train.tiny_base.questions import Question
 
-SECTIONS = {"parse": "", "predict": "", "describe": "Candidate analysis: "}
+SECTION_PREFIXES = {"parse": "", "predict": "", "describe": "Candidate analysis: "}
 """The kinds of questions whose answers are read, and what they lack to be read as sections of a
 rationale. Answers to `compare` state predictions that need not be true. `explain` repeats what the
 other kinds ask for; of its answers, only the outcome is read."""
@@ -55,7 +55,7 @@ def measure_generated_answers(
     collate = Collator(processor, student.max_length)
     model.eval()
     found: dict[str, list[bool]] = defaultdict(list)
-    for kind in (*SECTIONS, "explain"):
+    for kind in (*SECTION_PREFIXES, "explain"):
         for k in range(0, len(items), BATCH):
             asked = [sampler.ask_question(item, kind, "held out") for item in items[k : k + BATCH]]
             samples = [
@@ -68,7 +68,7 @@ def measure_generated_answers(
                 if kind == "explain":
                     read = _read_outcome(text.text, item, question, sampler)
                 else:
-                    read = _read(SECTIONS[kind] + text.text, item, kind, sampler)
+                    read = _read(SECTION_PREFIXES[kind] + text.text, item, kind, sampler)
                     names = set(NAME.findall(text.text))
                     true_names = set(NAME.findall(question.answer))
                     read += [("name_recall", name in names) for name in true_names]

@@ -137,7 +137,7 @@ class OracleHeads(nn.Module):
     def measures(
         self, tokens: Tensor, hidden: Tensor | None, targets: OracleTargets
     ) -> dict[str, Tensor]:
-        """Return the accuracies and errors of the heads of `seen_losses` and `known_losses`.
+        """Return the accuracies and errors of the heads of `vision_losses` and `object_losses`.
 
         Args:
             hidden: None leaves out what is read in the middle layers.

@@ -62,14 +62,14 @@ log = logging.getLogger(__name__)
 STAGES = ("vision", "motion", "words")
 CHECKPOINT = "state.pt"
 WARMUP_STEPS, MIN_LR_FACTOR = 40, 0.05
-DENSE = 1.0
+DENSE_WEIGHT = 1.0
 """Weight, in the stage of words, of the losses at visual tokens and of the colours, materials and
 shapes at names."""
-POINTING = 0.5
+POINTING_WEIGHT = 0.5
 """Weight, in the stage of words, of the losses of attention heads."""
-NAMED = 2.0
+NAME_WEIGHT = 2.0
 """Weight of the losses of places and motion in texts."""
-WORD_LOSSES = 5.0
+WORD_WEIGHT = 5.0
 """Weight of the losses of words: of all words, of those for colours, materials and shapes, of those
 for places, motion and relations, of the letters after "closest", and of the verdicts in the match
 layout. The second and third are a third and a tenth of all words, and harder to predict than the
@@ -101,19 +101,19 @@ def words_losses(
     losses = {}
     if len(targets.objects):
         dense = dense_losses(trace, heads, targets)
-        losses |= {name: DENSE * loss for name, loss in dense.items()}
+        losses |= {name: DENSE_WEIGHT * loss for name, loss in dense.items()}
     pointing = pointing_losses(trace, targets)
-    losses |= {name: POINTING * loss for name, loss in pointing.items()}
+    losses |= {name: POINTING_WEIGHT * loss for name, loss in pointing.items()}
     if len(targets.names) and len(targets.objects):
         names = heads.name_losses(trace.outputs[NAMING], targets)
-        losses |= {f"name {name}": NAMED * loss for name, loss in names.items()}
+        losses |= {f"name {name}": NAME_WEIGHT * loss for name, loss in names.items()}
         described = heads.description_losses(trace.outputs[SPEAKING], targets)
-        losses |= {f"description {name}": NAMED * loss for name, loss in described.items()}
+        losses |= {f"description {name}": NAME_WEIGHT * loss for name, loss in described.items()}
     if len(targets.names):
         words = heads.name_word_losses(trace.outputs[MIDDLE], targets)
-        losses |= {f"name {kind}": DENSE * loss for kind, loss in words.items()}
+        losses |= {f"name {kind}": DENSE_WEIGHT * loss for kind, loss in words.items()}
     predicted, following = logits[:, :-1].flatten(0, 1).float(), labels[:, 1:].flatten()
-    losses["words"] = WORD_LOSSES * cross_entropy(predicted, following, ignore_index=IGNORED)
+    losses["words"] = WORD_WEIGHT * cross_entropy(predicted, following, ignore_index=IGNORED)
     # The logits and labels are those of the last tokens.
     start = batch["input_ids"].shape[1] - labels.shape[1]
     groups = {
@@ -126,7 +126,7 @@ def words_losses(
         row, at = tokens.T
         if len(row):
             predicted = logits[row, at - start - 1].float()
-            losses[name] = WORD_LOSSES * cross_entropy(predicted, labels[row, at - start])
+            losses[name] = WORD_WEIGHT * cross_entropy(predicted, labels[row, at - start])
     return losses
 
 

@@ -11,9 +11,9 @@ from jsonschema import Draft202012Validator
 from evaluation.generators.response_schema import (
     FIELDS,
     Record,
-    instruction,
+    build_record_schema,
     read_record,
-    schema,
+    write_record_instruction,
 )
 from models.student.answer_parser import parse_choice
 
@@ -60,8 +60,8 @@ def random_record(rng: random.Random) -> Record:
 
 def test_a_record_is_valid_exactly_if_its_schema_accepts_it():
     """Checked on many records that differ from a valid record in one field."""
-    validator = Draft202012Validator(schema(bound=False))
-    Draft202012Validator.check_schema(schema())
+    validator = Draft202012Validator(build_record_schema(bound=False))
+    Draft202012Validator.check_schema(build_record_schema())
     values = [None, True, -0.1, 1.1, 0, 1, "", "A", "e", "none", "N", {}, [], {"A": 1}, "0.5"]
     record = asdict(RECORD)
     changed = [{**record, name: value} for name in record for value in values]
@@ -96,6 +96,11 @@ def test_a_response_without_exactly_one_json_record_is_invalid(raw):
 
 def test_prompt_and_schema_have_the_fields_of_the_record_in_its_order():
     names = [f.name for f in fields(Record)]
-    assert list(FIELDS) == list(schema()["properties"]) == schema()["required"] == names
-    positions = [instruction().index(f'"{name}"') for name in names]
+    assert (
+        list(FIELDS)
+        == list(build_record_schema()["properties"])
+        == build_record_schema()["required"]
+        == names
+    )
+    positions = [write_record_instruction().index(f'"{name}"') for name in names]
     assert positions == sorted(positions)

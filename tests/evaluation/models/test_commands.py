@@ -19,7 +19,7 @@ from conf.schema import (
 )
 from evaluation import report, select
 from evaluation.generators.response_log import ResponseLog
-from models.trained_runs import check_unseen, resolve_model, trained_settings
+from models.trained_runs import check_unseen, read_trained_settings, resolve_model
 from tests.evaluation.models.conftest import (
     STUDENT,
     check_resumed,
@@ -114,7 +114,7 @@ def test_a_run_that_cannot_be_measured_is_refused(trained_student, tmp_path, dam
     shutil.copytree(trained_student, tmp_path / "run")
     damage(tmp_path / "run")
     with raises_user_error(code):
-        trained_settings(tmp_path / "run", SftCommand, "student")
+        read_trained_settings(tmp_path / "run", SftCommand, "student")
 
 
 def test_a_model_is_not_tested_on_its_training_scenes(trained_student, micro) -> None:

@@ -13,7 +13,7 @@ from conf.files import read_json_lines
 from conf.schema import SelectCommand
 from evaluation import select
 from evaluation.generators.response_log import ResponseLog
-from evaluation.generators.response_schema import schema
+from evaluation.generators.response_schema import build_record_schema
 from models.student.answer_parser import parse_choice
 from tests.evaluation.models.conftest import STUDENT
 
@@ -38,8 +38,8 @@ def test_constrained_decoding_yields_records_only(
         # and control characters, which `strict` would refuse.
         if not row["truncated"]:
             record = json.loads(row["text"], strict=False)
-            jsonschema.validate(record, schema())
-            assert list(record) == list(schema()["properties"])
+            jsonschema.validate(record, build_record_schema())
+            assert list(record) == list(build_record_schema()["properties"])
 
 
 def test_the_log_is_append_only(micro_store, tmp_path) -> None:

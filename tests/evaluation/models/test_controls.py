@@ -15,7 +15,7 @@ from data.tracks.controls import MATCHED_ANCHOR, pair_items
 from evaluation import select
 from evaluation.generators.response_log import score_response
 from evaluation.metrics.results import SelectionResult, from_json
-from evaluation.metrics.selection import Choices, selection_report
+from evaluation.metrics.selection import Choices, build_selection_report
 from evaluation.reporting.selection_report import write_report
 from models.student.responses import GeneratedText
 from tests.user_errors import raises_user_error
@@ -109,7 +109,7 @@ def test_the_questions_of_a_matched_pair_are_compared(benchmark_store, tmp_path)
         Choices.from_answers("one", "answer", control, answers)
         for control in (None, "candidate_only")
     ]
-    report = selection_report(choices, items, "any", "any", 0, MATCHED_ANCHOR)
+    report = build_selection_report(choices, items, "any", "any", 0, MATCHED_ANCHOR)
     write_report(report, tmp_path, MATCHED_ANCHOR)
     _, result = report.rows
     controls = json.loads((tmp_path / "report.json").read_text())["controls"]

@@ -19,7 +19,7 @@ from evaluation import select
 from evaluation.generators.generator import item_sample, response_settings
 from evaluation.generators.openai_server import ServedModel, restore_thought, served_origin
 from evaluation.generators.response_log import ResponseLog, collect_responses, score_response
-from evaluation.generators.response_schema import instruction, schema
+from evaluation.generators.response_schema import build_record_schema, write_record_instruction
 from teacher.servers.responses import TRUNCATED, Response
 from tests.evaluation.generators.test_response_schema import FULL
 from tests.user_errors import raises_user_error
@@ -75,7 +75,7 @@ def test_requests_contain_the_frames_and_times_of_a_sample(
             assert np.array_equal(pixels(png), image)
         texts = [p["text"] for p in parts if p["type"] == "text"]
         assert texts[0].startswith(item.question)
-        assert texts[-1] == f"\n{instruction()}"
+        assert texts[-1] == f"\n{write_record_instruction()}"
         clip = request["media_io_kwargs"]["video"]
         assert clip["frames_indices"] == sample.clip.indices
         assert (clip["fps"], clip["total_num_frames"], clip["num_frames"]) == (25.0, 128, -1)
@@ -100,7 +100,7 @@ def test_constrained_requests_have_the_schema_and_a_seed_per_item(
     answers = [score_response(item, "constrained", text) for item, text in responses]
     assert [(a.letter, a.valid) for a in answers] == [("C", True)] * 6
     response_format = server.requests[0]["response_format"]
-    assert response_format["json_schema"]["schema"] == schema()
+    assert response_format["json_schema"]["schema"] == build_record_schema()
     sampling = {key: server.requests[0][key] for key in ("temperature", "top_p", "top_k")}
     assert sampling == {"temperature": 0.6, "top_p": 0.95, "top_k": 20}
     assert server.requests[0]["chat_template_kwargs"] == {"enable_thinking": True}

@@ -17,7 +17,7 @@ from data.render.frame_cache import FrameReader
 from evaluation import select
 from evaluation.generators.generator import item_sample
 from evaluation.generators.openai_server import request_fields
-from evaluation.generators.response_schema import schema
+from evaluation.generators.response_schema import build_record_schema
 from models import loading
 from models.student.answer_parser import Reason, parse_choice
 from models.student.chat_requests import build_messages
@@ -119,7 +119,11 @@ def test_constrained_responses_of_a_served_model_are_records(
         found = parse_choice(row["text"])
         assert found.letter == row["letter"]
         assert row["valid"] or (row["truncated"] and found.reason is Reason.CUT_OFF)
-        names = [f'"{name}"' for name in schema()["properties"] if f'"{name}"' in row["text"]]
+        names = [
+            f'"{name}"'
+            for name in build_record_schema()["properties"]
+            if f'"{name}"' in row["text"]
+        ]
         assert names == sorted(names, key=row["text"].index)
 
 

@@ -32,9 +32,9 @@ from evaluation.generators.response_log import score_response
 from evaluation.metrics.results import SIMILARITY, compare_retrievers, retrieval_results
 from evaluation.metrics.selection import (
     Choices,
+    build_selection_report,
     choose_letters,
     credit_choices,
-    selection_report,
 )
 from evaluation.reporting.selection_report import write_report
 from evaluation.retrieval import candidate_similarity
@@ -104,7 +104,7 @@ def select_run(
     answers = [score_response(item, mode, GeneratedText(respond(item), False)) for item in items]
     choices = Choices.from_answers(model or "small base", mode, None, answers)
     asked = [(mode, None, "k1")]
-    report = selection_report([choices], items, store.name, store.identity, 0, suite, asked)
+    report = build_selection_report([choices], items, store.name, store.identity, 0, suite, asked)
     write_report(report, folder, items[0].suite)
     keys = {"key": "k1", "mode": mode}
     lines = [{**keys, "asked": {"control": None, "seed": 0}}]
@@ -144,7 +144,7 @@ def similarity_run(
         rows += candidate_similarity.score_rows(title, items, by_item)
     folder = root / "similarity" / (model or name)
     finish(folder, settings)
-    report = selection_report(choices, items, store.name, store.identity, 0)
+    report = build_selection_report(choices, items, store.name, store.identity, 0)
     write_report(report, folder, items[0].suite)
     write_json_lines(folder / "scores.jsonl", rows)
     return folder

@@ -22,7 +22,7 @@ from evaluation.metrics.results import (
     from_json,
     retrieval_results,
 )
-from evaluation.metrics.selection import Choices, selection_report
+from evaluation.metrics.selection import Choices, build_selection_report
 from evaluation.reporting import figures
 from evaluation.reporting.reference import COT_STUDENT
 from evaluation.reporting.tables import rank_differences_table, retrieval_table, selection_table
@@ -46,7 +46,7 @@ def selection() -> SelectionResult:
         for k, family in enumerate(FAMILIES)
     ]  # fmt: skip
     choices = Choices("one", "answer", None, CREDITS, ["A"] * len(items))
-    return selection_report([choices], items, "tiny", "build", seed=4).rows[0]
+    return build_selection_report([choices], items, "tiny", "build", seed=4).rows[0]
 
 
 @pytest.fixture(scope="module")
@@ -162,9 +162,9 @@ def test_differences_between_retrievers_are_paired_by_query():
 
 
 def test_figures_are_written(selection, retrievals, tmp_path):
-    figures.accuracy_figure({"one": selection.families}, tmp_path / "selection.png")
-    figures.accuracy_figure({"one": selection.horizons}, tmp_path / "horizons.png")
-    figures.retrieval_figure([(r.name, r) for r in retrievals], tmp_path / "retrieval.png")
+    figures.plot_accuracies({"one": selection.families}, tmp_path / "selection.png")
+    figures.plot_accuracies({"one": selection.horizons}, tmp_path / "horizons.png")
+    figures.plot_recalls([(r.name, r) for r in retrievals], tmp_path / "retrieval.png")
     plot_curves(
         [{"step": 2, "loss": 1.0}, {"step": 1, "loss": 2.0}, {"step": 2, "eval_loss": 1.5,
          "eval_accuracy": 0.4, "eval_runtime": 3.0}, {"step": 2, "train_runtime": 9.0}],
@@ -180,5 +180,5 @@ def test_figures_are_written(selection, retrievals, tmp_path):
 def test_dollar_signs_in_labels_are_not_parsed_as_math(selection, tmp_path):
     name = r"run $\frac$"
     with matplotlib.rc_context({"svg.fonttype": "none"}):
-        figures.accuracy_figure({name: selection.families}, tmp_path / "accuracy.svg")
+        figures.plot_accuracies({name: selection.families}, tmp_path / "accuracy.svg")
     assert f">{name}<" in (tmp_path / "accuracy.svg").read_text()

@@ -10,7 +10,7 @@ from conf.schema import RelationBounds
 from teacher.narrator import write_rationale
 from teacher.validation.claim_extraction import extract_claims
 from tests.teacher.test_predicates import random_cases
-from train.common.false_words import ALTERNATIVES, SECTIONS, WORD, falsify_words
+from train.common.false_words import ALTERNATIVES, FALSIFIED_SECTIONS, WORD, falsify_words
 
 
 def test_words_are_replaced_by_others_of_their_kind() -> None:
@@ -29,7 +29,7 @@ def test_words_are_replaced_by_others_of_their_kind() -> None:
             end, shift = stop - 1, shift + len(word) - (stop - 1 - start)
             replaced += 1
         assert text[end:] == true[end + shift :]
-        lines = [line for line in true.splitlines() if line.startswith(SECTIONS)]
+        lines = [line for line in true.splitlines() if line.startswith(FALSIFIED_SECTIONS)]
         kept += len(WORD.findall(" ".join(lines))) - len(spans)
     assert 0.4 < replaced / (replaced + kept) < 0.6
 

@@ -24,7 +24,7 @@ from conf.schema import (
 from data.store import Store
 from models import loading
 from models.student.answer_parser import ParsedAnswer
-from models.trained_runs import trained_settings
+from models.trained_runs import read_trained_settings
 from teacher.narrate import ensure_rationales
 from tests.user_errors import raises_user_error
 from train import distill, export, sft
@@ -91,7 +91,7 @@ def test_null_settings_are_those_of_the_students_training() -> None:
 
 
 def test_datasets_can_be_sent_to_worker_processes(settings, student, micro_store) -> None:
-    trained = trained_settings(student, SftCommand, "student")
+    trained = read_trained_settings(student, SftCommand, "student")
     rationales = ensure_rationales(micro_store, trained.teacher)
     training, _ = paired_prompts.load_datasets(settings, trained, micro_store, rationales)
     copy = pickle.loads(pickle.dumps(training))
@@ -183,7 +183,7 @@ def test_the_student_can_be_evaluated_and_exported(settings, student, tmp_path) 
     metrics = distill.main.__wrapped__(settings, run)
     (run.folder / "metrics.json").write_text(json.dumps(metrics))
     # Its settings no longer depend on the run that it continues.
-    source = trained_settings(student, SftCommand, "student")
+    source = read_trained_settings(student, SftCommand, "student")
     student.rename(tmp_path / "moved")
     name, folder, found = find_run(str(run.folder), "student", str(tmp_path))
     (tmp_path / "moved").rename(student)

@@ -15,7 +15,7 @@ from conf.entry import Run
 from conf.runs import open_run
 from conf.schema import ReinforceCommand, ReinforceTrainConfig, RewardWeights, SftCommand
 from data.store import Store
-from models.trained_runs import trained_settings
+from models.trained_runs import read_trained_settings
 from tests.user_errors import raises_user_error
 from train import reinforce, sft
 from train.common.journal import read_journal
@@ -197,6 +197,6 @@ def test_the_student_can_be_evaluated(settings, student, tmp_path) -> None:
         replace(settings, train=replace(settings.train, max_steps=1, evaluations=1)), run
     )
     (run.folder / "metrics.json").write_text(json.dumps(metrics))
-    found = trained_settings(run.folder, SftCommand, "student")
-    assert found.student == trained_settings(student, SftCommand, "student").student
+    found = read_trained_settings(run.folder, SftCommand, "student")
+    assert found.student == read_trained_settings(student, SftCommand, "student").student
     assert "reward" in metrics

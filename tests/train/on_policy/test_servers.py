@@ -26,7 +26,7 @@ from data.store import Store
 from models import loading
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
-from models.trained_runs import trained_settings
+from models.trained_runs import read_trained_settings
 from teacher.narrate import ensure_rationales
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.vllm_server import VllmServer
@@ -85,7 +85,7 @@ def settings(student: Path, micro_store: Store) -> DistillCommand:
 @pytest.fixture
 def samples(settings, student, micro_store) -> list[Sample]:
     """The teacher's prompts about four items, with the narrator's rationales as responses."""
-    trained = trained_settings(student, SftCommand, "student")
+    trained = read_trained_settings(student, SftCommand, "student")
     rationales = ensure_rationales(micro_store, trained.teacher)
     training, _ = load_datasets(settings, trained, micro_store, rationales)
     texts = [r.text for r in rationales if r.accepted]
@@ -99,7 +99,7 @@ def serve(url: str) -> TeacherServerConfig:
 def test_vllm_gives_the_log_probabilities_of_the_same_model(
     teacher: VllmServer, saved_base: str, processor: ProcessorMixin, samples: list[Sample]
 ) -> None:
-    read = ServerTeacher(serve(teacher.url), processor).read([samples[:3], samples[3:]])
+    read = ServerTeacher(serve(teacher.url), processor).prepare([samples[:3], samples[3:]])
     batch = Collator(processor, None)(samples)
     tokens = batch.pop("labels")[:, 1:]
     model = AutoModelForImageTextToText.from_pretrained(saved_base).eval()
@@ -136,7 +136,7 @@ def test_vllm_samples_from_the_current_adapters(
     vllm, settings, student, micro_store, tmp_path
 ) -> None:
     """At a temperature near 0, the tokens have the largest logits of the model in this process."""
-    trained = trained_settings(student, SftCommand, "student")
+    trained = read_trained_settings(student, SftCommand, "student")
     cfg = replace(trained.student, quantization="none", max_new_tokens=12, max_length=4000)
     train = replace(settings.train, temperature=1e-4)
     torch.manual_seed(0)
@@ -207,7 +207,7 @@ def test_unsuitable_servers_are_named(processor, samples, texts, code, message) 
     handler = type("Handler", (FaultyHandler,), {"texts": texts})
     server = LocalServer(handler)
     with raises_user_error(code, contains=message):
-        ServerTeacher(serve(server.url), processor).read([samples])
+        ServerTeacher(serve(server.url), processor).prepare([samples])
     server.stop()
 
 
@@ -232,7 +232,7 @@ class FixedHandler(JsonHandler):
 def test_servers_that_cannot_sample_are_named(
     settings, student, samples, loads, code, message, tmp_path
 ) -> None:
-    trained = trained_settings(student, SftCommand, "student")
+    trained = read_trained_settings(student, SftCommand, "student")
     model, processor = loading.load_student(trained.student, "fp32", list)
     server = LocalServer(type("Handler", (FixedHandler,), {"loads": loads}))
     servers = SamplingServerConfig(url=server.url, unreachable_timeout=5)

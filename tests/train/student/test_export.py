@@ -31,13 +31,13 @@ from models import compat, loading
 from models.resolved_settings import resolve_run
 from models.student.collator import encode
 from models.student.prompts import selection_sample
-from models.trained_runs import run_title, trained_settings
+from models.trained_runs import read_trained_settings, run_title
 from teacher.narrate import ensure_rationales
 from tests.children import run_child
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import export
-from train.common.model_card import model_card
+from train.common.model_card import build_model_card
 from train.common.output_comparison import ModelOutputs, compare_outputs
 from train.student.merge import StudentMerge
 
@@ -257,7 +257,9 @@ def test_the_card_describes_the_run(settings, runs, exports) -> None:
     ):
         assert row in card.text
     hub = replace(settings, student=replace(settings.student, model="Qwen/Qwen3-VL-2B-Instruct"))
-    card = model_card("run", hub, runs / "sft" / "run", "bf16", {"answer_logit_difference": 0.0125})
+    card = build_model_card(
+        "run", hub, runs / "sft" / "run", "bf16", {"answer_logit_difference": 0.0125}
+    )
     assert card.data.base_model == "Qwen/Qwen3-VL-2B-Instruct"
     assert "| answer logit difference | 0.0125 |" in card.text
     assert "unquantised base" not in card.text
@@ -312,14 +314,14 @@ def test_a_damaged_export_is_refused(settings, exports, tmp_path) -> None:
     shutil.copytree(exports["bf16"][1], tmp_path / "export")
     weights = tmp_path / "export" / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:5000])
-    trained = trained_settings(tmp_path / "export", SftCommand, "student")
+    trained = read_trained_settings(tmp_path / "export", SftCommand, "student")
     assert asdict(trained) == asdict(settings)
     with raises_user_error("damaged-file"):
         loading.load_trained(trained.student, "fp32", tmp_path / "export")
     (tmp_path / "config.yaml").write_text("format: bf16")
     (tmp_path / "export").rename(tmp_path / "student")
     with raises_user_error("missing-run", contains="student"):
-        trained_settings(tmp_path, SftCommand, "student")
+        read_trained_settings(tmp_path, SftCommand, "student")
     (tmp_path / "student" / "export.json").write_text("{")
     with raises_user_error("damaged-file"):
         run_title(tmp_path / "student")

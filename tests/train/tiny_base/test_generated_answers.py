@@ -25,7 +25,7 @@ def measure(micro_store: Store, model, processor, student_cfg, monkeypatch: pyte
     def measure_answers(change) -> dict[str, float]:
         true = [
             sampler.ask_question(item, kind, "held out")[1].answer
-            for kind in (*generated_answers.SECTIONS, "explain")
+            for kind in (*generated_answers.SECTION_PREFIXES, "explain")
             for item in items[: generated_answers.BATCH]
         ]
         batches = iter(
