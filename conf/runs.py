@@ -27,10 +27,12 @@ log = logging.getLogger(__name__)
 
 RESULT_NEUTRAL_KEYS = {
     "run", "store", "checkpoints", "workers", "train.workers", "host", "port", "public",
-    "teacher_server.url", "teacher_server.concurrency", "teacher_server.timeout",
-    "teacher_server.unreachable_timeout",
-    "sampling_server.url", "sampling_server.model", "sampling_server.concurrency",
-    "sampling_server.timeout", "sampling_server.unreachable_timeout",
+    "train.report_to", "teacher_server.url", "sampling_server.url", "sampling_server.model",
+    *(
+        f"{servers}.{setting}"
+        for servers in ("server", "teacher", "teacher_server", "sampling_server")
+        for setting in ("concurrency", "timeout", "unreachable_timeout")
+    ),
 }  # fmt: skip
 """Keys that do not change the result of a run. Their values may differ when a run is resumed, and
 they are not part of the run's name."""

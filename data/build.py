@@ -20,7 +20,7 @@ from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.parallel import Workers
 from data.records import SPLITS
 from data.releases.transfer_suites import suite_name
-from data.render.prerender import RECORD, prerender_frames
+from data.render.prerender import FRAMES_RECORD, prerender_frames
 from data.store import (
     FRAMES_FOLDER,
     MANIFEST,
@@ -71,7 +71,7 @@ def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
 def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
     """Open a benchmark as `ensure_items` does, and render the frames that its records refer to."""
     store = ensure_items(cfg, root, Workers(workers))
-    if not (store.folder / FRAMES_FOLDER / RECORD).exists():
+    if not (store.folder / FRAMES_FOLDER / FRAMES_RECORD).exists():
         prerender_frames(store, "named", None, Workers(workers))
     return store
 
@@ -243,7 +243,7 @@ def check_same_settings(old: dict[str, Any], new: dict[str, Any], folder: Path) 
         raise UserError(
             f"{folder} was built with other settings: {changes[0]}. Use the earlier value, "
             f"choose another name with benchmark.name=NAME, or delete {folder}",
-            code="different-settings",
+            code="other-settings",
         )
 
 

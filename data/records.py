@@ -21,7 +21,8 @@ FPS = 25
 """Frame rate of scenes of the suite `dynapix`. A second in the questions of retrieval queries is
 this number of frames."""
 SELECTION_SECOND = 26
-"""Frames that the time family of selection items counts as a second (128 frames in about 5 s)."""
+"""Frames that the time family of selection items counts as a second: 128 frames in 5 s, rounded up.
+This is one more than FPS."""
 SPEED_BOUNDS = (0.6, 1.5, 3.0)
 """Default upper bounds of the speeds that rationales call slow, steady and quick, simulator units
 per second."""

@@ -24,7 +24,8 @@ def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
     store = ensure_items(cfg.benchmark, Path(cfg.store), Workers(cfg.workers))
     if not store.selection():
         raise UserError(
-            f"{store.folder} has no selection items, so there are no statistics to report",
+            f"{store.folder} has no selection items, so there are no statistics to report: "
+            "choose a benchmark with quotas in benchmark.selection",
             code="empty-split",
         )
     statistics = compute_statistics(store, cfg.blind)

@@ -8,7 +8,7 @@ from dynapix.benchmark import preset_names
 COMMANDS = {
     "data.build": "build a benchmark: scenes, items, queries, frames",
     "data.statistics": "report a benchmark's statistics and the accuracy of baselines",
-    "data.gallery": "draw contact sheets of scenes, items and queries",
+    "data.gallery": "draw contact sheets of items and queries",
     "data.export": "write a Hugging Face dataset",
     "teacher.narrate": "write rationales with the built-in narrator or a served model",
     "teacher.serve": "serve a model with vLLM",

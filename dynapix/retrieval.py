@@ -154,7 +154,7 @@ def _rows(embeddings: Embeddings, names: Sequence[str], kind: str) -> np.ndarray
     if not finite.all():
         raise UserError(
             f"{int((~finite).sum())} {kind} embeddings have NaN or infinite entries, such as that "
-            f"of {names[int(np.argmin(finite))]}",
+            f"of {names[int(np.argmin(finite))]}: embed these again, in fp32 if they overflow",
             code="invalid-embeddings",
         )
     return rows

@@ -11,7 +11,7 @@ import asyncio
 import logging
 import time
 from collections import Counter, defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -149,7 +149,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
                     *_, last = _write_rationales(item, store, grader)
                     if last.accepted:
                         attempt = cfg.attempts + last.attempt
-                        record([replace(last, fallback=True, attempt=attempt)])
+                        record([grader.mark_fallback(last, attempt)])
         rationales = select_accepted(items, responses)
         save_accepted(rationales, store.folder / "rationales.parquet")
     return Narration(rationales, summarize(items, responses))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from conf.schema.servers import NARRATOR_WORDS
 from data.records import SelectionItem
 from teacher.deciding import Decision, choose_statements
 from teacher.predicates.facts import Predicates, RelationalPredicates
@@ -15,7 +16,7 @@ from teacher.writers.paper import Detail, Writer, join_sentences
 from teacher.writers.relational import RelationalWriter
 
 NARRATOR_VERSION = "16"
-SHORT, LONG, RELATIONAL_LONG = 110, 250, 235
+SHORT, LONG, RELATIONAL_LONG = 110, NARRATOR_WORDS[1], 235
 """A rationale with more than LONG words, or RELATIONAL_LONG in the relational vocabulary, is
 written again with less detail, one of fewer than SHORT words with more. RELATIONAL_LONG keeps
 relational rationales shorter on average than those of the paper's vocabulary. SHORT is well above

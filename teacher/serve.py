@@ -163,7 +163,9 @@ def vllm_arguments(
         arguments += ["--enable-lora", "--max-lora-rank", str(max_rank)]
     if (cfg.gpus or 0) > available:
         raise UserError(
-            f"gpus={cfg.gpus}: vLLM finds only {available} on this machine", code="too-few-gpus"
+            f"gpus={cfg.gpus}: vLLM finds only {available} on this machine: lower it, or check the "
+            "variable CUDA_VISIBLE_DEVICES",
+            code="too-few-gpus",
         )
     if not available:
         cache = round(cfg.cache_gb * 2**30)

@@ -51,7 +51,8 @@ class Search:
     n_jobs: int | None
     seed: int
     params: dict[str, str] | None
-    """The sweeps of a sweep preset by key. They reach `run` through `Sweep.overrides`."""
+    """The sweeps of a sweep preset by key. `Sweep` adds them to its overrides; the field exists so
+    that Hydra accepts the key."""
 
     def run(
         self, command: str, overrides: dict[str, Override], folder: Path, run_jobs: RunJobs

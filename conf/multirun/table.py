@@ -77,6 +77,6 @@ def varying_overrides(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
 
 
 def is_lower_better(metric: str) -> bool:
-    """Return whether lower values of a metric are better: losses, ranks, and the numbers of
+    """Return whether lower values of a metric are better: losses, errors, ranks, and the numbers of
     rejected responses, of items that were set aside, and of items whose prefix is too short."""
     return re.search(LOWER_IS_BETTER, metric) is not None

@@ -99,7 +99,8 @@ def store_name(benchmark: str, world: str) -> str:
 @dataclass
 class BenchmarkConfig(Settings):
     name: str = MISSING
-    """Folder of the benchmark below `store`."""
+    """Name of the benchmark. Its folder below `store` is NAME-WORLD; or NAME, if the world is
+    clevrer or NAME ends with the name of the world."""
     simulator: str = setting("bullet", SIMULATORS)
     """Source of the scenes: bullet simulates them; the others read a release from `folder`."""
     world: WorldConfig = field(default_factory=WorldConfig)
@@ -167,8 +168,9 @@ class BenchmarkConfig(Settings):
             )
         if self.distractors == "balanced" and (recipe != "dynapix" or self.simulator != "bullet"):
             yield (
-                f"{group}distractors=balanced with {simulator} and {group}recipe={recipe}: other "
-                f"futures are simulated; set {group}simulator=bullet and {group}recipe=dynapix"
+                f"{group}distractors=balanced with {simulator} and {group}recipe={recipe}: "
+                "balanced distractors are frames of simulated futures; set "
+                f"{group}simulator=bullet and {group}recipe=dynapix, or {group}distractors=paper"
             )
         if recipe != "dynapix":
             if self.selection.observation:

@@ -10,6 +10,9 @@ from omegaconf import MISSING
 
 from conf.schema.settings import Settings, is_url, setting
 
+NARRATOR_WORDS = (80, 250)
+"""Minimum and maximum number of words of the built-in narrator's rationales."""
+
 
 @dataclass
 class ServersConfig(Settings):
@@ -164,9 +167,9 @@ class TeacherConfig(ServersConfig):
     """Bounds of the words for relations."""
     sufficient: bool = False
     """Reject rationales whose prediction fits a distractor as well."""
-    min_words: int = 80
+    min_words: int = NARRATOR_WORDS[0]
     """Minimum length of a rationale (words)."""
-    max_words: int = 250
+    max_words: int = NARRATOR_WORDS[1]
     """Maximum length of a rationale (words)."""
     attempts: int = setting(4, least=1)
     """Maximum number of responses for an item. If the validator rejects all of them, the item is
@@ -192,11 +195,21 @@ class TeacherConfig(ServersConfig):
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
         if (self.url is None) != (self.model is None):
-            yield f"{group}url and {group}model: set both, to use a server, or neither"
+            yield (
+                f"{group}url={self.url} and {group}model={self.model}: set both, to use a server, "
+                "or neither"
+            )
         if not 0 < self.min_words <= self.max_words:
             yield (
                 f"{group}min_words={self.min_words} and {group}max_words={self.max_words}: "
                 "need 0 < min <= max"
+            )
+        shortest, longest = NARRATOR_WORDS
+        if self.url is None and (self.min_words > shortest or self.max_words < longest):
+            yield (
+                f"{group}min_words={self.min_words} and {group}max_words={self.max_words}: the "
+                f"built-in narrator writes {shortest} to {longest} words, so lower the minimum and "
+                f"raise the maximum to these, or give {group}url"
             )
         for name in ("grammar", "fallback"):
             if getattr(self, name) and self.url is None:

@@ -211,7 +211,8 @@ class LightConfig(Settings):
         key = f"{group}direction"
         yield from check_vector(key, self.direction, "x y z")
         if len(self.direction) == 3 and not self.direction[2] > 0.2 * hypot(*self.direction[:2]):
-            yield f"{key}={self.direction}: the light is too low; raise z"
+            lowest = 0.2 * hypot(*self.direction[:2])
+            yield f"{key}={self.direction}: the light is too low; z must be above {lowest:.3g}"
 
 
 @dataclass
@@ -277,8 +278,9 @@ class WorldConfig(Settings):
                 f"{group}physics.frames={self.physics.frames} with {group}start.kind=slide: "
                 f"objects that slide need at least {SLIDE_FRAMES} frames"
             )
-        radius = RADIUS * max(self.objects.scale)
-        if self.start.kind != "slide" and min(self.start.height) < radius:
+        # Empty ranges are named by the checks of their groups.
+        radius = RADIUS * max(self.objects.scale, default=0)
+        if self.start.kind != "slide" and min(self.start.height, default=radius) < radius:
             yield (
                 f"{group}start.height={self.start.height}: the centre of an object with the radius "
                 f"{radius:g} would start inside the surface; raise it"

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RECORD, CARD = "export.json", "README.md"
+EXPORT_RECORD, CARD = "export.json", "README.md"
 EXPORT_VERSION = "2"
 """Changes whenever the same store would give another dataset."""
 GROUP_IMAGES = 512
@@ -179,13 +179,13 @@ def _count_rows(records: Iterable[SelectionItem | RetrievalQuery], *axes: str) -
 
 
 def _write_record(folder: Path, record: dict[str, Any]) -> None:
-    write_atomically(folder / RECORD, json.dumps(record, indent=1).encode())
+    write_atomically(folder / EXPORT_RECORD, json.dumps(record, indent=1).encode())
 
 
 def _read_record(folder: Path) -> dict[str, Any]:
     """Return the content of export.json; an empty dict if it is missing or cannot be read."""
     try:
-        return dict(json.loads((folder / RECORD).read_text()))
+        return dict(json.loads((folder / EXPORT_RECORD).read_text()))
     except (OSError, ValueError, TypeError):
         return {}
 
@@ -203,7 +203,7 @@ def _verify(folder: Path, plan: dict[str, Any]) -> None:
             raise UserError(
                 f"{folder} contains an export with {key}={record.get(key)}, not {key}={value}: "
                 f"choose another folder with folder=FOLDER, or delete {folder}",
-                code="different-settings",
+                code="other-settings",
             )
     expected = {CARD: record["card"]} | {s["path"]: s["sha256"] for s in record["shards"]}
     for name, sha256 in expected.items():

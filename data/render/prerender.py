@@ -18,7 +18,7 @@ from data.tracks.controls import MATCHED_ANCHOR
 
 log = logging.getLogger(__name__)
 
-RECORD = "frames.json"
+FRAMES_RECORD = "frames.json"
 """File with the options and results of the last prerendering, which is not repeated."""
 
 
@@ -28,10 +28,11 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
     Args:
         which: `all`, `none`, or `named` for those that items, queries and databases refer to.
         limit_gb: Maximum total size of these frames on disk. Rendering stops when the next scene
-            would exceed it; the remaining frames are rendered on demand.
+            would exceed it. The archives of the remaining scenes are deleted, and their frames are
+            rendered on demand.
     """
     options = {"frames": which, "frames_gb": limit_gb, "renderer": store.manifest["renderer"]}
-    path = store.folder / FRAMES_FOLDER / RECORD
+    path = store.folder / FRAMES_FOLDER / FRAMES_RECORD
     if path.exists() and options.items() <= json.loads(path.read_text()).items():
         return
     config = store.manifest["config"]
@@ -39,17 +40,19 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
         scene: partial(_render_scene, store.folder, config, scene, frames)
         for scene, frames in frames_to_render(store, which).items()
     }
-    total, rendered = 0.0, 0
+    total, kept = 0.0, set()
     for scene, size in workers.run(jobs, "rendering scenes", "scene"):
         if limit_gb is not None and total + size > limit_gb * 1e9:
-            frames_path(store.folder, scene).unlink()
+            for other in jobs.keys() - kept:
+                frames_path(store.folder, other).unlink(missing_ok=True)
             log.info(
                 "frames_gb=%g: the frames of %d of %d scenes are on disk; the others are rendered "
-                "on demand", limit_gb, rendered, len(jobs),
+                "on demand", limit_gb, len(kept), len(jobs),
             )  # fmt: skip
             break
-        total, rendered = total + size, rendered + 1
-    record = {**options, "scenes": rendered, "bytes": total}
+        total += size
+        kept.add(scene)
+    record = {**options, "scenes": len(kept), "bytes": total}
     write_atomically(path, json.dumps(record, indent=1).encode())
 
 

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 GENERATOR_VERSION = "2"
 """Changes whenever the same seed and index give a different scene."""
 ROLLING_VERSION = "2"
-"""Changes whenever this is so only in worlds with rolling friction."""
+"""Version for worlds with rolling friction. It changes whenever the same seed and index give a
+different scene in these worlds alone."""
 
 SOLVER_ITERATIONS = 20
 CONTACT_FREE_FRAMES = 5

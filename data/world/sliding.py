@@ -164,8 +164,8 @@ class _Slide:
     def _resting(self, added: SizedObject, motion: Motion) -> Body | None:
         """Sample a body at rest on screen; return None if it is off screen or near another's
         path."""
-        rng, (left, near, right, far) = self.rng, self.world.start.area
-        place = np.array([rng.uniform(left, right), rng.uniform(near, far)])
+        rng, (x_min, y_min, x_max, y_max) = self.rng, self.world.start.area
+        place = np.array([rng.uniform(x_min, x_max), rng.uniform(y_min, y_max)])
         distance = np.linalg.norm(motion.positions[..., :2] - place, axis=-1).min()
         if distance <= CLEAR * self.world.objects.scale[1] or not self._is_on_screen(place, added):
             return None

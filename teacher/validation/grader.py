@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
-from conf.schema import TeacherConfig
+from conf.schema import RelationBounds, TeacherConfig
 from data.records import Rationale, SelectionItem
 from teacher.cited import CITED_VERSION
 from teacher.deciding import choose_statements
@@ -23,6 +23,8 @@ from teacher.vocabulary import choose_vocabulary, name_vocabulary
 
 MAX_CHARACTERS = 20_000
 """Maximum length of a response. A longer one is rejected, and the record has its beginning only."""
+NARRATOR_ORIGIN = {"prompt_version": NARRATOR_VERSION}
+"""Fields of records of texts by the built-in narrator."""
 
 
 class RationaleGrader:
@@ -33,12 +35,14 @@ class RationaleGrader:
         self.grammar_version = GRAMMAR_VERSION if cfg.grammar else None
         self.origin = {
             "teacher": cfg.name,
-            "prompt_version": NARRATOR_VERSION if cfg.url is None else PROMPT_VERSION,
+            "prompt_version": PROMPT_VERSION,
             "validator_version": VALIDATOR_VERSION,
             "settings": self._hash_settings(),
             "seed": cfg.seed,
             "predicates": name_vocabulary(cfg),
         }
+        if cfg.url is None:
+            self.origin |= NARRATOR_ORIGIN
         """Fields that every new record has. An earlier record with another value in one of them is
         ignored, and a new response is requested."""
 
@@ -92,13 +96,18 @@ class RationaleGrader:
 
     def is_current(self, rationale: Rationale) -> bool:
         """Return whether a rationale was recorded with the current versions, settings and seed."""
-        return all(getattr(rationale, name) == value for name, value in self.origin.items())
+        origin = {**self.origin, **NARRATOR_ORIGIN} if rationale.fallback else self.origin
+        return all(getattr(rationale, name) == value for name, value in origin.items())
+
+    def mark_fallback(self, rationale: Rationale, attempt: int) -> Rationale:
+        """Return the record of a rationale that the built-in narrator wrote instead of a server."""
+        return replace(rationale, fallback=True, attempt=attempt, grammar=None, **NARRATOR_ORIGIN)
 
     def _hash_settings(self) -> str:
         """Return a short hash of the settings that affect a response or its validation."""
         cfg = self.cfg
         settings = [cfg.min_words, cfg.max_words]
-        if cfg.predicates == "relational" or cfg.sufficient:
+        if cfg.predicates == "relational" or cfg.sufficient or cfg.bounds != RelationBounds():
             settings += [cfg.sufficient, *astuple(cfg.bounds)]
         if cfg.url is not None:
             settings += [cfg.model, cfg.temperature, cfg.top_p, cfg.top_k, cfg.max_tokens]

@@ -106,7 +106,7 @@ def test_partial_build_with_other_scenes_is_kept(tmp_path) -> None:
         build(small(**nothing), tmp_path / "small", Workers(1))
     assert not (tmp_path / "small").exists()
     fewer = WorldConfig(objects=ObjectsConfig(max_count=5))
-    with raises_user_error("different-settings", contains="world.objects.max_count was 6"):
+    with raises_user_error("other-settings", contains="world.objects.max_count was 6"):
         build(small(world=fewer), tmp_path / "small", Workers(1))
     scenes = tmp_path / ".small.partial" / "scenes"
     first = {p.name: p.stat().st_mtime_ns for p in scenes.iterdir()}
@@ -233,7 +233,7 @@ def test_damaged_or_old_manifest_is_refused(copy, damage, code, name) -> None:
 def test_different_settings_are_named(copy) -> None:
     cfg = small(selection=SelectionConfig(time={"in_1s": Quota(train=3, test=1)}))
     key = "benchmark.selection.time.in_1s.train was 2"
-    with raises_user_error("different-settings", contains=key):
+    with raises_user_error("other-settings", contains=key):
         ensure_benchmark(cfg, copy.parent, 1)
 
 

@@ -11,6 +11,7 @@ from conf.schema import RelationBounds, TeacherConfig
 from data.records import Rationale
 from teacher.journal import Journal, read_rationales
 from teacher.narrate import ensure_rationales, narrate_store
+from teacher.narrator import NARRATOR_VERSION
 from teacher.sections import GRAMMAR, GRAMMAR_VERSION
 from teacher.vocabulary import name_vocabulary
 from tests.teacher import synthetic
@@ -256,6 +257,9 @@ def test_fallback_is_marked_and_optional(store, start_server):
     assert len(server.requests) == requests
     assert (len(narration.rationales), figures["fallback"], figures["set_aside"]) == (12, 12, 0)
     assert all(r.fallback and r.teacher == "served" for r in narration.rationales)
+    assert {(r.prompt_version, r.grammar) for r in narration.rationales} == {
+        (NARRATOR_VERSION, None)
+    }
     assert figures["responses"] == without.figures["responses"]
     again = narrate_store(store, replace(cfg, fallback=True))
     assert again.rationales == narration.rationales

@@ -222,6 +222,8 @@ def test_bounds_of_displacements_are_those_of_the_paper_by_default() -> None:
 def test_invalid_bounds_are_named() -> None:
     [problem] = TeacherConfig(name="t", bounds=RelationBounds(against=2.0)).check("teacher.")
     assert "teacher.bounds.against=2" in problem
+    [problem] = TeacherConfig(name="t", min_words=240).check("teacher.")
+    assert "teacher.min_words=240" in problem
     [problem] = TeacherConfig(name="t", bounds=RelationBounds(clearly=0.3)).check("teacher.")
     assert "teacher.bounds.clearly=0.3 and teacher.bounds.far=0.25" in problem
 

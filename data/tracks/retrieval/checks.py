@@ -31,7 +31,9 @@ def check_test(
     training scene, or the database lacks a target."""
     if not queries:
         raise UserError(
-            f"{store.folder} has no queries of the standard test", code="missing-queries"
+            f"{store.folder} has no queries of the standard test: choose a benchmark whose "
+            "benchmark.retrieval.standard is above 0, such as benchmark=tiny",
+            code="missing-queries",
         )
     repeated = _find_repeated("retrieval", queries) + _find_repeated("database", database)
     _refuse(store, "duplicate-record", repeated)

@@ -138,7 +138,7 @@ def test_an_existing_export_is_kept_and_other_content_is_refused(micro_store, tm
     made = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
     assert ensure_export(micro_store, out, images=False) == first
     assert made == {p: p.stat().st_mtime_ns for p in out.rglob("*")}
-    with raises_user_error("different-settings", contains=("images=False", "images=True")):
+    with raises_user_error("other-settings", contains=("images=False", "images=True")):
         ensure_export(micro_store, out, images=True)
     (out / "selection" / "test-00000-of-00001.parquet").write_bytes(b"")
     with raises_user_error("damaged-file", contains="test-00000-of-00001.parquet"):

@@ -319,6 +319,8 @@ def test_world_whose_objects_are_all_hidden_is_refused(tmp_path: Path) -> None:
         ({"world": WorldConfig(objects=ObjectsConfig(shapes=["cone"]))}, "objects.shapes"),
         ({"world": WorldConfig(objects=ObjectsConfig(max_count=49))}, "max_count=49"),
         ({"world": WorldConfig(objects=ObjectsConfig(scale=[2.0, 1.0]))}, "objects.scale"),
+        ({"world": WorldConfig(objects=ObjectsConfig(scale=[]))}, "objects.scale"),
+        ({"world": WorldConfig(start=StartConfig(kind="throw", height=[]))}, "start.height"),
     ],
 )  # fmt: skip
 def test_invalid_world_settings_are_refused(changes: dict[str, Any], key: str) -> None:
