@@ -104,7 +104,7 @@ def allow_new_key(override: str, schema: type) -> str:
     return override
 
 
-def preflight(command: str, schema: type, overrides: list[str]) -> None:
+def check_run_settings(command: str, schema: type, overrides: list[str]) -> None:
     """Check the settings of a single run. Raises SettingsError, also for a `+sweep=` preset."""
     if presets := [o for o in overrides if o.startswith("+sweep=")]:
         raise SettingsError(f"{presets[0]} is a sweep: run it with -m", code="needs-multirun")

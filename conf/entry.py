@@ -21,7 +21,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from conf.compose import allow_new_key, config_name, preflight, register, validate_settings
+from conf.compose import allow_new_key, check_run_settings, config_name, register, validate_settings
 from conf.errors import SettingsError, UserError
 from conf.failures import report_failures
 from conf.files import write_json
@@ -79,7 +79,7 @@ def _start(name: str, schema: type, main: Main) -> None:
         run_sweep(name, schema, args.overrides)
         return
     if not (args.hydra_help or args.info or args.shell_completion):
-        preflight(name, schema, args.overrides)
+        check_run_settings(name, schema, args.overrides)
 
     def task(cfg: DictConfig) -> Metrics | None:
         with report_failures(HydraConfig.get().run.dir):

@@ -15,6 +15,7 @@ from typing import Any
 
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
+from conf.files import write_bytes
 from conf.runs import compare_settings, flatten, wait_for_lock
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.parallel import Workers
@@ -36,7 +37,6 @@ from data.store import (
     save_rows,
     scene_path,
     with_checksum,
-    write_atomically,
 )
 from data.tracks.build_items import (
     OBSERVATIONS,
@@ -151,7 +151,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
             "scenes": scene_ids,
             "files": hash_files(partial, built_files(partial)),
         }
-        write_atomically(partial / MANIFEST, json.dumps(with_checksum(manifest), indent=1).encode())
+        write_bytes(partial / MANIFEST, json.dumps(with_checksum(manifest), indent=1).encode())
         partial.rename(folder)
         shutil.rmtree(folder / PARTS)
         (folder / PLAN).unlink()
@@ -231,7 +231,7 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
             check_same_settings(json.loads((partial / PLAN).read_text()), plan, partial)
         for leftover in partial.rglob(".*.partial"):
             leftover.unlink()
-        write_atomically(partial / PLAN, json.dumps(plan).encode())
+        write_bytes(partial / PLAN, json.dumps(plan).encode())
         yield partial
     finally:
         os.close(handle)

@@ -8,9 +8,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from conf.entry import Run, command
-from conf.files import write_text
+from conf.files import write_bytes, write_text
 from conf.schema import GalleryCommand
-from data.store import write_atomically
 
 log = logging.getLogger(__name__)
 
@@ -23,7 +22,7 @@ def main(cfg: GalleryCommand, run: Run) -> dict[str, float]:
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     sheets = []
     for sheet in tqdm(draw_sheets(store, cfg.examples, cfg.seed), desc="drawing", unit="sheet"):
-        write_atomically(run.folder / sheet.file, sheet.png)
+        write_bytes(run.folder / sheet.file, sheet.png)
         sheets.append(sheet)
     page = run.folder / "index.html"
     write_text(page, render_page(store, sheets))

@@ -25,7 +25,6 @@ import contextlib
 import hashlib
 import io
 import json
-import os
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
@@ -36,6 +35,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from conf.errors import UserError
+from conf.files import write_bytes
 from data.records import (
     Collision,
     FrameRef,
@@ -76,22 +76,6 @@ def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a killed process leaves either the complete file or none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        # When the disk is full, the error does not name the file.
-        raise OSError(error.errno, error.strerror, str(path)) from error
-
-
 def scene_path(folder: Path, scene_id: str) -> Path:
     """Return the path of a scene's oracle in a store or a partial build."""
     return folder / SCENES_FOLDER / f"{scene_id}.npz"
@@ -115,7 +99,7 @@ def save_scene(scene: Scene, path: Path) -> None:
     arrays = {name: getattr(scene, name) for name in Scene.ARRAYS}
     buffer = io.BytesIO()
     np.savez(buffer, header=np.array(json.dumps(header, default=vars)), **arrays)
-    write_atomically(path, buffer.getvalue())
+    write_bytes(path, buffer.getvalue())
 
 
 def load_scene(path: Path) -> Scene:
@@ -141,7 +125,7 @@ def save_rows(rows: list[dict[str, Any]], path: Path, schema: pa.Schema | None =
 
     sink = io.BytesIO()
     pq.write_table(pa.Table.from_pylist(rows, schema=schema), sink, compression="zstd")
-    write_atomically(path, sink.getvalue())
+    write_bytes(path, sink.getvalue())
 
 
 def load_rows(path: Path) -> list[dict[str, Any]]:
@@ -314,4 +298,4 @@ def _read_checked(folder: Path) -> dict[str, list[str | int]]:
 def _write_checked(folder: Path, checked: dict[str, list[str | int]]) -> None:
     # A store may be read-only: its files are then hashed each time.
     with contextlib.suppress(OSError):
-        write_atomically(folder / CHECKED, json.dumps(checked).encode())
+        write_bytes(folder / CHECKED, json.dumps(checked).encode())

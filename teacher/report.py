@@ -226,8 +226,8 @@ def write_report(
     sampled with `cfg.seed`. Return the path of report.html."""
     import jinja2
 
+    from conf.files import write_bytes
     from data.publish.contact_sheets import SheetRows, draw_sheet
-    from data.store import write_atomically
 
     text = f"predicates: {name_vocabulary(cfg)}\n\n{format_figures(figures)}"
     write_json(folder / "report.json", figures)
@@ -236,7 +236,7 @@ def write_report(
     rows, examples = SheetRows(store), []
     for k in sorted(np.random.default_rng(cfg.seed).permutation(len(accepted))[:count].tolist()):
         item = items[accepted[k].item_id]
-        write_atomically(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.make(item)]))
+        write_bytes(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.make(item)]))
         predicates = describe_item(item, store, cfg)
         facts = predicates and choose_vocabulary(predicates, cfg)
         examples.append((accepted[k], json.dumps(facts and format_facts(facts), indent=1)))

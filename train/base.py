@@ -12,13 +12,13 @@ from pathlib import Path
 
 from conf.entry import Run, command
 from conf.runs import rank, read_finished_metrics
-from conf.schema import BaseCommand
+from conf.schema import TinyBaseCommand
 
 log = logging.getLogger(__name__)
 
 
-@command("train.base", BaseCommand)
-def main(cfg: BaseCommand, run: Run) -> dict[str, float]:
+@command("train.base", TinyBaseCommand)
+def main(cfg: TinyBaseCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics
 

@@ -1,7 +1,7 @@
-"""Rewards of a student's responses: what the simulator finds true, and what the form requires.
+"""Rewards of a student's responses: what the oracle supports, and what the form requires.
 
 Each reward is a function of a `JudgedResponse`. A reward cannot be raised by empty text: a response
-that repeats itself, copies the question, states nothing that the simulator can check, or names all
+that repeats itself, copies the question, states nothing that the oracle can check, or names all
 letters earns no more than the answer line alone.
 """
 

@@ -20,6 +20,7 @@ from typing import Any
 import pandas as pd
 
 from conf.compose import compose
+from conf.files import write_bytes
 from conf.schema import BenchmarkConfig, SelectCommand
 from data.store import Store, open_store
 from evaluation.metrics.results import SelectionReport, from_json, variant_name
@@ -135,10 +136,7 @@ class Experiment:
         shared = {"variant": variant, "settings": self.settings[variant], "seed": seed}
         rows = pd.DataFrame([{**self.identity, **shared, **row} for row in rows])
         table = pd.concat([self.read_record(), rows])
-        # A kill while the record is written loses no results.
-        part = self.args.record.with_suffix(".tmp")
-        table.to_parquet(part, index=False, compression="zstd")
-        part.replace(self.args.record)
+        write_bytes(self.args.record, table.to_parquet(index=False, compression="zstd"))
 
     def train(self, command: str, name: str, overrides: Sequence[str]) -> Path:
         """Train with a command unless the run is finished, and return the folder of the run.

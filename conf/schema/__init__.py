@@ -8,7 +8,6 @@ each invalid value or combination of values; a message names keys as the user ty
 from conf.schema.benchmark import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from conf.schema.commands import (
     PARALLEL_BACKENDS,
-    BaseCommand,
     BuildCommand,
     CommandConfig,
     ContrastiveCommand,
@@ -21,6 +20,7 @@ from conf.schema.commands import (
     ServeCommand,
     SftCommand,
     StatisticsCommand,
+    TinyBaseCommand,
 )
 from conf.schema.evaluation import (
     EmbedderConfig,
@@ -48,7 +48,6 @@ from conf.schema.servers import (
     TeacherServerConfig,
 )
 from conf.schema.training import (
-    BaseTrainConfig,
     ContrastiveTrainConfig,
     DistillTrainConfig,
     ReinforceTrainConfig,
@@ -56,6 +55,7 @@ from conf.schema.training import (
     SftTrainConfig,
     StageConfig,
     StudentTrainConfig,
+    TinyBaseTrainConfig,
     TrainConfig,
 )
 from conf.schema.world import CameraConfig, PartConfig, PhysicsConfig, WorldConfig

@@ -13,11 +13,11 @@ from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import SamplingServerConfig, TeacherConfig, TeacherServerConfig
 from conf.schema.settings import Settings, check_run, setting
 from conf.schema.training import (
-    BaseTrainConfig,
     ContrastiveTrainConfig,
     DistillTrainConfig,
     ReinforceTrainConfig,
     SftTrainConfig,
+    TinyBaseTrainConfig,
 )
 
 PARALLEL_BACKENDS = ("loky", "ray")
@@ -193,10 +193,10 @@ class ReinforceCommand(ContinuationCommand):
 
 
 @dataclass
-class BaseCommand(CommandConfig):
+class TinyBaseCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     student: StudentConfig = MISSING
-    train: BaseTrainConfig = field(default_factory=BaseTrainConfig)
+    train: TinyBaseTrainConfig = field(default_factory=TinyBaseTrainConfig)
     seed: int = setting(0, least=0)
     """Seed of the order of the items, of the questions and of the heads."""
 

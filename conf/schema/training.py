@@ -239,7 +239,7 @@ def stage(steps: int, batch: int, lr: float) -> StageConfig:
 
 
 @dataclass
-class BaseTrainConfig(Settings):
+class TinyBaseTrainConfig(Settings):
     vision: StageConfig = stage(3000, 16, 2e-3)
     """The vision tower learns to see objects in single pictures."""
     motion: StageConfig = stage(2000, 8, 1e-3)

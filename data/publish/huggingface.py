@@ -24,6 +24,7 @@ from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from conf.errors import UserError
+from conf.files import write_bytes
 from conf.runs import lock_folder
 from data.publish.columns import (
     DESCRIPTIONS,
@@ -33,7 +34,7 @@ from data.publish.columns import (
     list_columns,
 )
 from data.records import POOLS, SPLITS, RetrievalQuery, SelectionItem
-from data.store import DATABASES, Store, component_versions, hash_file, write_atomically
+from data.store import DATABASES, Store, component_versions, hash_file
 from data.tracks.controls import MATCHED_ANCHOR
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def ensure_export(store: Store, folder: Path, images: bool) -> list[Shard]:
         with tqdm(total=rows, desc="exporting", unit="row", mininterval=1.0) as bar:
             for (configuration, split), records in tables.items():
                 shards += _write_table(partial, configuration, split, records, builder, bar)
-        write_atomically(partial / CARD, render_card(store, shards, images).encode())
+        write_bytes(partial / CARD, render_card(store, shards, images).encode())
         _write_record(partial, plan | {"shards": shards, "card": hash_file(partial / CARD)})
         partial.rename(folder)
     return shards
@@ -179,7 +180,7 @@ def _count_rows(records: Iterable[SelectionItem | RetrievalQuery], *axes: str) -
 
 
 def _write_record(folder: Path, record: dict[str, Any]) -> None:
-    write_atomically(folder / EXPORT_RECORD, json.dumps(record, indent=1).encode())
+    write_bytes(folder / EXPORT_RECORD, json.dumps(record, indent=1).encode())
 
 
 def _read_record(folder: Path) -> dict[str, Any]:

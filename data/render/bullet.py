@@ -21,7 +21,7 @@ from data.render.appearance import RGB, Mesh, box_mesh, mesh, texture
 from data.render.floor import Floor
 from data.world.camera import Camera
 from data.world.parts import Box, world_boxes
-from data.world.physics import connect
+from data.world.physics import start_bullet
 
 if TYPE_CHECKING:
     from conf.schema import WorldConfig
@@ -51,7 +51,7 @@ class BulletRenderer:
 
     def __init__(self, width: int, height: int, world: WorldConfig) -> None:
         self._world = world
-        self._bullet = connect()
+        self._bullet = start_bullet()
         camera = Camera.from_settings(world.camera)
         self._fine = camera.sized(width * OVERSAMPLING, height * OVERSAMPLING)
         self._view_matrix = self._bullet.computeViewMatrix(camera.eye, camera.aim, [0, 0, 1])

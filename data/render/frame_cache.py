@@ -22,9 +22,10 @@ import pyarrow as pa
 from PIL import Image
 
 from conf.errors import UserError
+from conf.files import write_bytes
 from data.records import Scene
 from data.render import get_renderer
-from data.store import FRAMES_FOLDER, Store, write_atomically
+from data.store import FRAMES_FOLDER, Store
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,7 @@ def save_frames(frames: dict[int, np.ndarray], path: Path) -> None:
             packed = pa.compress(np.ascontiguousarray(difference), codec=_CODEC, asbytes=True)
             # ZipInfo has a fixed date, so that the same frames give the same bytes.
             archive.writestr(zipfile.ZipInfo(f"{frame:03d}"), packed)
-    write_atomically(path, buffer.getvalue())
+    write_bytes(path, buffer.getvalue())
 
 
 def load_frames(path: Path, wanted: Iterable[int] | None = None) -> dict[int, np.ndarray]:

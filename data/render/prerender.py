@@ -10,10 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from conf.files import write_bytes
 from data.parallel import Workers
 from data.records import POOLS, original_scene_id, sample_prefix_frames
 from data.render.frame_cache import frames_path, load_frames, render_frames, save_frames
-from data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path, write_atomically
+from data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path
 from data.tracks.controls import MATCHED_ANCHOR
 
 log = logging.getLogger(__name__)
@@ -53,7 +54,7 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
         total += size
         kept.add(scene)
     record = {**options, "scenes": len(kept), "bytes": total}
-    write_atomically(path, json.dumps(record, indent=1).encode())
+    write_bytes(path, json.dumps(record, indent=1).encode())
 
 
 def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:

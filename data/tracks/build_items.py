@@ -20,19 +20,12 @@ from typing import Any
 
 import numpy as np
 
+from conf.files import write_bytes
 from conf.schema import BenchmarkConfig, Quota
 from data.parallel import Workers
 from data.records import ALTERNATIVE, FAMILIES, RetrievalQuery, Scene, SelectionItem
 from data.releases.transfer_suites import TRANSFER_SUITES, suite_name
-from data.store import (
-    PARTS,
-    SCENES_FOLDER,
-    load_scene,
-    part_path,
-    save_scene,
-    scene_path,
-    write_atomically,
-)
+from data.store import PARTS, SCENES_FOLDER, load_scene, part_path, save_scene, scene_path
 from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota, named_rng, shuffle_candidates
 from data.tracks.retrieval import counterfactual, future
@@ -238,4 +231,4 @@ def _run_job(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> N
             scene_of = partial(_load, path.parents[1])
             part["scores"] = [item_scores(i, scene_of, asdict(cfg)).tolist() for i in made]
     part |= {"rows": [row.to_row() for row in made], "dropped": dropped}
-    write_atomically(path, json.dumps(part).encode())
+    write_bytes(path, json.dumps(part).encode())

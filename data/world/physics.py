@@ -92,7 +92,7 @@ def generator_version(rolling_friction: float) -> str:
     return f"{GENERATOR_VERSION}.{ROLLING_VERSION}" if rolling_friction else GENERATOR_VERSION
 
 
-def connect() -> BulletClient:
+def start_bullet() -> BulletClient:
     """Start a Bullet client without a window, and suppress what it prints."""
     with silence(1), silence(2):
         import pybullet
@@ -122,7 +122,7 @@ class Simulator:
     """A Bullet client that runs one simulation after another."""
 
     def __init__(self) -> None:
-        self._bullet = connect()
+        self._bullet = start_bullet()
 
     def simulate(
         self,
@@ -182,7 +182,7 @@ class Simulator:
             is_rejected=rejected,
         )
 
-    def branch(
+    def simulate_branches(
         self,
         objects: Sequence[SceneObject],
         scales: Sequence[float],

@@ -12,13 +12,14 @@ from typing import TypeVar
 import numpy as np
 
 from conf.errors import UserError
+from conf.files import write_bytes
 from conf.schema import BenchmarkConfig
 from data.parallel import Workers
 from data.records import SPLITS
 from data.releases.readers import READERS
 from data.releases.transfer_suites import suite_name
 from data.releases.validation import RecordError
-from data.store import part_path, save_scene, scene_path, write_atomically
+from data.store import part_path, save_scene, scene_path
 from data.tracks.retrieval import counterfactual
 from data.world.sampling import format_scene_id, record_scene, sample_scene, simulate_without
 
@@ -169,4 +170,4 @@ def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: 
     else:
         save_scene(scene, scene_path(folder, scene.scene_id))
         outcome = {"scene_id": scene.scene_id}
-    write_atomically(part, json.dumps(outcome).encode())
+    write_bytes(part, json.dumps(outcome).encode())

@@ -2,7 +2,7 @@
 
 import pytest
 
-from conf.compose import REMOVED_KEYS, compose, preflight
+from conf.compose import REMOVED_KEYS, check_run_settings, compose
 from conf.errors import SettingsError
 from conf.multirun.sweep import Sweep
 from conf.schema import BuildCommand, ContrastiveCommand, Quota, SftCommand
@@ -76,7 +76,7 @@ def test_removed_key_names_its_replacement(monkeypatch):
 )
 def test_invalid_value_is_named(override, code, contains):
     with raises_user_error(code, contains):
-        preflight("train.sft", SftCommand, [override])
+        check_run_settings("train.sft", SftCommand, [override])
 
 
 @pytest.mark.parametrize("setting", ["train.facts=true", "train.false_words=0.2"])

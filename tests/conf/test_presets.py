@@ -23,7 +23,7 @@ SCHEMAS = {
     "data.gallery": schema.GalleryCommand,
     "teacher.narrate": schema.NarrateCommand,
     "teacher.serve": schema.ServeCommand,
-    "train.base": schema.BaseCommand,
+    "train.base": schema.TinyBaseCommand,
     "train.sft": schema.SftCommand,
     "train.distill": schema.DistillCommand,
     "train.reinforce": schema.ReinforceCommand,

@@ -48,7 +48,7 @@ def test_record_lists_every_start(tmp_path):
     open_run(run, SETTINGS | {"workers": 8, "store": "/big"}, "train.sft")
     again = json.loads((run.folder / "run.json").read_text())
     assert again["earlier_starts"] == [first["started"]]
-    assert not list(run.folder.glob("*.tmp"))
+    assert not list(run.folder.glob(".*.partial"))
 
 
 def test_other_settings_are_refused_with_both_values(tmp_path):

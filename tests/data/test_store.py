@@ -12,20 +12,13 @@ from pathlib import Path
 import psutil
 import pytest
 
+from conf.files import write_bytes
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from conf.schema.world import ObjectsConfig, WorldConfig
 from data import store as stores
 from data.build import build, ensure_benchmark, ensure_items, lock_partial_build
 from data.parallel import Workers
-from data.store import (
-    CHECKED,
-    MANIFEST,
-    built_files,
-    hash_file,
-    hash_files,
-    open_store,
-    write_atomically,
-)
+from data.store import CHECKED, MANIFEST, built_files, hash_file, hash_files, open_store
 from data.world.sampling import format_scene_id
 from data.world.scenes import split_scenes
 from tests.user_errors import raises_user_error
@@ -251,5 +244,5 @@ def test_failed_write_leaves_no_file(tmp_path, monkeypatch) -> None:
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        write_atomically(tmp_path / "part.npz", b"content")
+        write_bytes(tmp_path / "part.npz", b"content")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Reinforcement learning with TRL's GRPOTrainer, on responses that the simulator judges.
+"""Reinforcement learning with TRL's GRPOTrainer, on responses that are judged with the oracle.
 
 TRL 1.16 passes images to the model, but no videos with true times (huggingface/trl issues 4144 and
 5373), and it casts the adapters of a 4-bit base to bf16, in which small updates vanish. Both are

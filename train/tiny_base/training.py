@@ -32,7 +32,7 @@ from transformers import PreTrainedModel, ProcessorMixin
 from conf.entry import Run
 from conf.errors import UserError
 from conf.runs import rank
-from conf.schema import BaseCommand, BaseTrainConfig, StageConfig
+from conf.schema import StageConfig, TinyBaseCommand, TinyBaseTrainConfig
 from data.records import SelectionItem
 from models.distributed import average_gradients
 from models.student.collator import IGNORED
@@ -154,7 +154,7 @@ class BaseTrainer:
 
     def __init__(
         self,
-        cfg: BaseTrainConfig,
+        cfg: TinyBaseTrainConfig,
         model: PreTrainedModel,
         heads: OracleHeads,
         collate: OracleCollator,
@@ -303,7 +303,7 @@ def learning_rate_factor(step: int, steps: int) -> float:
 
 
 def build_trainer(
-    cfg: BaseCommand,
+    cfg: TinyBaseCommand,
     run: Run,
     model: PreTrainedModel,
     processor: ProcessorMixin,

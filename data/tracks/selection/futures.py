@@ -114,7 +114,7 @@ def simulate_futures(
     Returns:
         (K, last - frame + 1, N, 13) states.
     """
-    return shared_simulator().branch(
+    return shared_simulator().simulate_branches(
         scene.objects,
         scene.object_scales,
         scene_states(scene)[frame].astype(float),

@@ -14,7 +14,7 @@ from transformers import set_seed
 from conf.compose import compose
 from conf.errors import SettingsError
 from conf.runs import Run
-from conf.schema import BaseCommand, BaseTrainConfig, StageConfig
+from conf.schema import StageConfig, TinyBaseCommand, TinyBaseTrainConfig
 from data.render.frame_cache import FrameReader
 from data.store import Store
 from models import loading
@@ -32,18 +32,18 @@ STAGE = StageConfig(steps=4, batch=2, lr=1e-3)
 
 
 @pytest.fixture
-def cfg(micro, micro_store: Store, student_cfg) -> BaseCommand:
-    train = BaseTrainConfig(
+def cfg(micro, micro_store: Store, student_cfg) -> TinyBaseCommand:
+    train = TinyBaseTrainConfig(
         vision=STAGE, motion=STAGE, words=replace(STAGE, steps=8), precision="fp32",
         evaluations=2, checkpoint_steps=3, validation_items=4, log_steps=1,
     )  # fmt: skip
     student = replace(student_cfg, architecture=SIZES, frames=4)
-    return BaseCommand(
+    return TinyBaseCommand(
         benchmark=micro, student=student, train=train, store=str(micro_store.folder.parent)
     )
 
 
-def start(cfg: BaseCommand, store: Store, folder: Path) -> BaseTrainer:
+def start(cfg: TinyBaseCommand, store: Store, folder: Path) -> BaseTrainer:
     """Return the trainer of a run, with the same initial weights for the same settings."""
     folder.mkdir(exist_ok=True)
     frames = FrameReader(store, cfg.student.image_size)
@@ -58,7 +58,7 @@ def start(cfg: BaseCommand, store: Store, folder: Path) -> BaseTrainer:
 
 @pytest.mark.parametrize("stopped_after", [3, 6, 13])
 def test_killed_run_resumes_as_if_it_had_never_stopped(
-    cfg: BaseCommand,
+    cfg: TinyBaseCommand,
     micro_store: Store,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -143,7 +143,7 @@ def test_no_held_out_scene_is_trained_on(micro_store: Store, frames: FrameReader
 )
 def test_unsuitable_models_are_refused(override: str, message: str) -> None:
     with pytest.raises(SettingsError, match=message):
-        compose("train.base", BaseCommand, [override])
+        compose("train.base", TinyBaseCommand, [override])
 
 
 def test_schedule_warms_up_and_decays() -> None:
