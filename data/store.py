@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 MANIFEST = "manifest.json"
 CHECKED = "checked.json"
-"""Hash, size and time of change of each file when it was last hashed; made by `open_store`."""
+"""Hash, size and modification time of each file when it was last hashed; made by `open_store`."""
 CHECKSUM_KEY = "sha256"
 PLAN = "plan.json"
 """Settings of a build in progress; absent from a complete store."""
@@ -224,7 +224,7 @@ cached_scene = lru_cache(maxsize=512)(load_scene)
 def open_store(folder: Path, verify: bool = False) -> Store:
     """Open a built benchmark, and check every file that its manifest lists.
 
-    A file is hashed if its size or its time of change differs from those at the last check. Thus
+    A file is hashed if its size or its modification time differs from those at the last check. Thus
     all files are hashed when a benchmark is opened for the first time, and few or none later.
 
     Args:
@@ -279,7 +279,7 @@ def open_store(folder: Path, verify: bool = False) -> Store:
 
 
 def _size_and_time(path: Path) -> tuple[int, int] | None:
-    """Size in bytes and time of change in ns of a file; None if it is missing."""
+    """Size in bytes and modification time in ns of a file; None if it is missing."""
     try:
         stat = path.stat()
     except FileNotFoundError:
@@ -288,7 +288,7 @@ def _size_and_time(path: Path) -> tuple[int, int] | None:
 
 
 def _read_checked(folder: Path) -> dict[str, list[str | int]]:
-    """Hash, size and time of change of each file at the last check, by relative path."""
+    """Hash, size and modification time of each file at the last check, by relative path."""
     try:
         return dict(json.loads((folder / CHECKED).read_text()))
     except (OSError, ValueError, TypeError):

@@ -86,7 +86,7 @@ def evaluate(
             or returns anything else, the items count as wrong and are in `Result.failures`.
         batch_size: The number of items per call; None passes one item at a time.
         name: The model's name in tables.
-        seed: Seed of the resampling of scenes.
+        seed: Seed of the bootstrap over scenes.
         progress: Whether to show a progress bar.
 
     Raises:
@@ -195,7 +195,7 @@ class Result:
         name: The model's name.
         items: The items, in the order of evaluation.
         outcomes: The model's prediction for each item, with its credit.
-        seed: Seed of the resampling of scenes.
+        seed: Seed of the bootstrap over scenes.
     """
 
     benchmark: Benchmark

@@ -52,7 +52,7 @@ class BuildCommand(CommandConfig):
     strict: bool = False
     """Stop the build at an invalid record of a release instead of logging and skipping it."""
     verify: bool = False
-    """Hash every file of a built benchmark. Otherwise, only files whose size or time of change
+    """Hash every file of a built benchmark. Otherwise, only files whose size or modification time
     differs from the last check are hashed."""
     parallel: str = setting("loky", PARALLEL_BACKENDS)
     """loky runs the work in processes of this machine, ray on a Ray cluster."""

@@ -1,5 +1,6 @@
 """Baselines that answer selection items from the oracle by simple rules, without simulating the
-scene. A high accuracy of a baseline shows that items can be answered by a shortcut."""
+scene. A high accuracy of one that does not predict shows that items can be answered by a shortcut;
+`velocity` predicts."""
 
 from __future__ import annotations
 
