@@ -80,8 +80,8 @@ SFT = {
     ],
 }  # fmt: skip
 """Overrides of `train.sft` by variant, and those of the teacher."""
-DISTILL = ["+exp=on_policy", "train.max_steps=60", "train.evaluations=2"]
-REINFORCE = ["+exp=grpo", "train.max_steps=30", "train.evaluations=2"]
+DISTILL = ["+exp=on_policy", "train.lr=1e-3", "train.max_steps=60", "train.evaluations=2"]
+REINFORCE = ["+exp=grpo", "train.lr=3e-4", "train.max_steps=20", "train.evaluations=2"]
 
 
 def main() -> None:

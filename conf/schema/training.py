@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
+from typing import ClassVar
 
 from conf.schema.settings import Settings, setting
 
@@ -118,6 +119,8 @@ class SftTrainConfig(StudentTrainConfig):
 
 @dataclass
 class DistillTrainConfig(StudentTrainConfig):
+    LR_SHARE: ClassVar[float] = 0.5
+    """Share of the peak learning rate of the student's training that `lr` is by default."""
     lr: float | None = setting(None, above=0)
     """Peak learning rate. null takes half of that of the student's training."""
     micro_batch: int | None = setting(None, least=1)
@@ -161,8 +164,11 @@ class RewardWeights(Settings):
 
 @dataclass
 class ReinforceTrainConfig(TrainConfig):
+    # With half of it, the rewards of a tiny student fell by 40% in 15 steps.
+    LR_SHARE: ClassVar[float] = 0.15
+    """Share of the peak learning rate of the student's training that `lr` is by default."""
     lr: float | None = setting(None, above=0)
-    """Peak learning rate. null takes half of that of the student's training."""
+    """Peak learning rate. null takes 0.15 times that of the student's training."""
     gradient_checkpointing: bool | None = None
     """Recompute activations in the backward pass; null does as the student's training did."""
     epochs: float = 1.0

@@ -66,15 +66,11 @@ def read_source_settings(model: str | None) -> tuple[Path, SftCommand]:
     return source, trained
 
 
-LR_SHARE = 0.5
-"""Share of the peak learning rate of a student's training with which it is trained further."""
-
-
 def inherit_settings(cfg: Command, trained: SftCommand) -> Command:
     """Return a run's settings in which those of the student's training replace null. The
-    learning rate is `LR_SHARE` of that of the student's training."""
+    learning rate is the share `LR_SHARE` of that of the student's training."""
     inherited = {
-        "lr": LR_SHARE * trained.train.lr,
+        "lr": cfg.train.LR_SHARE * trained.train.lr,
         "micro_batch": trained.train.micro_batch,
         "gradient_checkpointing": trained.train.gradient_checkpointing,
         "permute_candidates": trained.train.permute_candidates,

@@ -19,6 +19,7 @@ from conf.schema import (
     DistillTrainConfig,
     ExportModelCommand,
     ReinforceCommand,
+    ReinforceTrainConfig,
     SftCommand,
 )
 from data.store import Store
@@ -83,7 +84,8 @@ def test_null_settings_are_those_of_the_students_training() -> None:
     inherited = inherit_settings(DistillCommand(model="run"), trained).train
     assert inherited.lr == trained.train.lr / 2
     assert all(getattr(inherited, name) == getattr(trained.train, name) for name in names)
-    assert inherit_settings(ReinforceCommand(model="run"), trained).train.lr == inherited.lr
+    rewarded = inherit_settings(ReinforceCommand(model="run"), trained).train
+    assert rewarded.lr == ReinforceTrainConfig.LR_SHARE * trained.train.lr
     given = DistillTrainConfig(
         lr=1, micro_batch=2, gradient_checkpointing=True, permute_candidates=False
     )
