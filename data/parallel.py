@@ -111,6 +111,8 @@ class Workers:
         parallel = Parallel(self.count, backend=self.engine, **options)
         # Loky restarts a worker whose memory grows; workers grow because they cache scenes.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs")
+        # A caller may stop before the last result.
+        warnings.filterwarnings("ignore", r"\d+ tasks have been successfully executed")
         for batch in batched(list(jobs.items()), CHUNK * self.count):
             yield from parallel(delayed(_run_job)(name, job) for name, job in batch)
 

@@ -14,7 +14,7 @@ COMMANDS = {
     "teacher.serve": "serve a model with vLLM",
     "train.sft": "train a student",
     "train.distill": "train a student further on its own responses",
-    "train.reinforce": "train a student further with the simulator's rewards",
+    "train.reinforce": "train a student further with rewards from the oracle",
     "train.contrastive": "train a retriever",
     "train.base": "train the tiny base from random weights",
     "train.export": "export a trained model",

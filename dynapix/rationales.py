@@ -1,4 +1,4 @@
-"""Score a rationale by what the simulator knows about its item."""
+"""Score a rationale by what the oracle knows about its item."""
 
 from __future__ import annotations
 

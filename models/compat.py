@@ -1,9 +1,10 @@
 """Functions that rely on private or version-dependent parts of libraries ("hooks").
 
 All hooks were checked with torch 2.14 to 2.15, transformers 5.18 to 5.23, peft 0.19 to 0.21.2,
-accelerate 1.12 to 1.15, sentence-transformers 6.2 and bitsandbytes 0.49 to 0.50.2, unless
+accelerate 1.12 to 1.15, sentence-transformers 6.2, trl 1.16 and bitsandbytes 0.49 to 0.50.2, unless
 a docstring says otherwise. `pyproject.toml` excludes later versions. Before it admits them, all
-tests must pass with them; tests/models/test_compat.py names a hook that a library changed.
+tests must pass with them; tests/models/test_compat.py names most hooks that a library changed, and
+the tests of the modules below fail for the others.
 
 Hooks in other modules, which subclass a library's classes or depend on how it passes its inputs:
 
@@ -22,9 +23,9 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
 - `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer, and
   `train.on_policy.distillation` overrides `get_batch_samples` and calls `_get_num_items_in_batch`.
 - `train.on_policy.reinforcement` overrides `_generate_and_score_completions`, `_calculate_rewards`,
-  `_compute_loss`, `_get_per_token_logps_and_entropies`, `_get_train_sampler` and `_send_telemetry`
-  of TRL's GRPOTrainer, uses its `rollout_func` and `_metrics`, and the `generator` of its
-  RepeatSampler.
+  `_compute_loss`, `_get_per_token_logps_and_entropies`, `_get_train_sampler`, `_send_telemetry`
+  and `create_model_card` of TRL's GRPOTrainer, uses its `rollout_func` and `_metrics`, and the
+  `generator` of its RepeatSampler.
 - `models.student.kv_cache` subclasses transformers' `DynamicLayer`.
 - `train.tiny_base.trace` records the outputs of `q_norm` and `k_norm` in Qwen3-VL's attention, and
   the keyword `position_embeddings` that it takes.

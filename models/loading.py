@@ -117,8 +117,8 @@ def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
     """Make a processor resize frames to one size in images and in videos of up to `frames` frames.
 
     Its edge is the multiple of the edge of a visual token (patch size x merge size) nearest to
-    image_size. By default, a video
-    has another pixel budget than an image, and one frame could get two sizes.
+    image_size. By default, a video has another pixel budget than an image, and one frame could get
+    two sizes.
     """
     step = processor.image_processor.patch_size * processor.image_processor.merge_size
     edge = round(image_size / step) * step

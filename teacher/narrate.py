@@ -116,6 +116,11 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
         for rationale in journal.rationales:
             if grader.is_current(rationale) and (cfg.fallback or not rationale.fallback):
                 responses[rationale.item_id].append(rationale)
+        for records in responses.values():
+            own = [r for r in records if not r.fallback]
+            if len(own) < cfg.attempts:
+                # The server has attempts left, for example because its responses are out of date.
+                records[:] = own
 
         def is_settled(item: SelectionItem) -> bool:
             return any(r.accepted for r in responses[item.item_id])

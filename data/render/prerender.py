@@ -6,6 +6,7 @@ import json
 import logging
 from collections import defaultdict
 from collections.abc import Mapping
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,17 +43,20 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
         for scene, frames in frames_to_render(store, which).items()
     }
     total, kept = 0.0, set()
-    for scene, size in workers.run(jobs, "rendering scenes", "scene"):
-        if limit_gb is not None and total + size > limit_gb * 1e9:
-            for other in jobs.keys() - kept:
-                frames_path(store.folder, other).unlink(missing_ok=True)
-            log.info(
-                "frames_gb=%g: the frames of %d of %d scenes are on disk; the others are rendered "
-                "on demand", limit_gb, len(kept), len(jobs),
-            )  # fmt: skip
-            break
-        total += size
-        kept.add(scene)
+    # Closing the results stops the workers, which could write further archives.
+    with closing(workers.run(jobs, "rendering scenes", "scene")) as results:
+        for scene, size in results:
+            if limit_gb is not None and total + size > limit_gb * 1e9:
+                break
+            total += size
+            kept.add(scene)
+    if others := jobs.keys() - kept:
+        for scene in others:
+            frames_path(store.folder, scene).unlink(missing_ok=True)
+        log.info(
+            "frames_gb=%g: the frames of %d of %d scenes are on disk; the others are rendered on "
+            "demand", limit_gb, len(kept), len(jobs),
+        )  # fmt: skip
     record = {**options, "scenes": len(kept), "bytes": total}
     write_bytes(path, json.dumps(record, indent=1).encode())
 

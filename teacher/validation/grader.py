@@ -41,10 +41,11 @@ class RationaleGrader:
             "seed": cfg.seed,
             "predicates": name_vocabulary(cfg),
         }
+        """Fields that every new record of the teacher has; those of a fallback differ by
+        `NARRATOR_ORIGIN`. An earlier record with another value in one of them is ignored, and a new
+        response is requested."""
         if cfg.url is None:
             self.origin |= NARRATOR_ORIGIN
-        """Fields that every new record has. An earlier record with another value in one of them is
-        ignored, and a new response is requested."""
 
     def grade(
         self,

@@ -12,7 +12,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from conf.files import write_bytes
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from conf.schema.world import ObjectsConfig, WorldConfig
 from data import store as stores
@@ -236,13 +235,3 @@ def test_unknown_cell_is_refused(tmp_path) -> None:
     with raises_user_error("unknown-option", contains=names):
         build(small(selection=unknown), tmp_path / "small", Workers(1))
     assert not list(tmp_path.iterdir())
-
-
-def test_failed_write_leaves_no_file(tmp_path, monkeypatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device", "store")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        write_bytes(tmp_path / "part.npz", b"content")
-    assert list(tmp_path.iterdir()) == []

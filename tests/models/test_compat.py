@@ -128,7 +128,7 @@ def test_overridden_methods_exist(kind, names) -> None:
 
 def test_grpo_trainer_keeps_measures_and_an_order_that_can_be_seeded() -> None:
     initialised = inspect.getsource(GRPOTrainer.__init__)
-    for name in ("self._metrics =", "rollout_func"):
+    for name in ("self._metrics =", "self.rollout_func ="):
         assert name in initialised, f"{CHANGED} GRPOTrainer has no {name}"
     sampler = RepeatSampler(range(4), mini_repeat_count=1, seed=0)
     assert isinstance(sampler.generator, torch.Generator), (

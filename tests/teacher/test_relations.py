@@ -222,10 +222,16 @@ def test_bounds_of_displacements_are_those_of_the_paper_by_default() -> None:
 def test_invalid_bounds_are_named() -> None:
     [problem] = TeacherConfig(name="t", bounds=RelationBounds(against=2.0)).check("teacher.")
     assert "teacher.bounds.against=2" in problem
-    [problem] = TeacherConfig(name="t", min_words=240).check("teacher.")
-    assert "teacher.min_words=240" in problem
     [problem] = TeacherConfig(name="t", bounds=RelationBounds(clearly=0.3)).check("teacher.")
     assert "teacher.bounds.clearly=0.3 and teacher.bounds.far=0.25" in problem
+
+
+@pytest.mark.parametrize("words", [{"min_words": 100}, {"max_words": 200}])
+def test_narrator_refuses_limits_that_its_rationales_exceed(words: dict[str, int]) -> None:
+    [problem] = TeacherConfig(name="t", **words).check("teacher.")
+    assert "80 to 250 words" in problem
+    served = TeacherConfig(name="t", url="http://127.0.0.1:8000/v1", model="m", **words)
+    assert served.check("teacher.") == []
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,10 @@ from data.store import Store
 HELD_OUT_SHARE = 0.1
 """Share of the training scenes that are held out."""
 
-REPORTS = {"data.build": "shortfalls", "teacher.narrate": "rejected rationales"}
+REPORTS = {
+    "data.build": "shortfalls",
+    "teacher.narrate": "rejected rationales and items with too short a prefix",
+}
 """What the commands that make training data report."""
 
 Row = TypeVar("Row")

@@ -81,8 +81,8 @@ def load_items(
         return selection_sample(item, "reasoning", regime, frames, count)
 
     training, validation = map(with_predicates, split_items(store, cfg.validation_items, seed))
-    check_not_empty(len(training), "training items with predicates")
-    check_not_empty(len(validation), "held-out items with predicates")
+    check_not_empty(len(training), "training items with predicates", "teacher.narrate")
+    check_not_empty(len(validation), "held-out items with predicates", "teacher.narrate")
     return training, validation
 
 

@@ -193,7 +193,9 @@ def load_datasets(
     variation = Variation(cfg.seed, train.permute_candidates, train.false_words)
     training, validation = samples_of(training_items, variation), samples_of(validation_items)
     samples = [sample for part in training.values() for sample in part]
-    check_not_empty(len(samples), f"samples for train.regime={train.regime}")
+    # With facts, items without rationale are left out.
+    source = "teacher.narrate" if train.facts else "data.build"
+    check_not_empty(len(samples), f"samples for train.regime={train.regime}", source)
     check_not_empty(sum(map(len, validation.values())), "items of held-out training scenes")
     return StudentDataset(samples), {m: StudentDataset(v) for m, v in validation.items() if v}
 

@@ -53,8 +53,8 @@ def split_items(
     training = [item for item in items if uses_only(item, training_scenes)]
     # A distractor may show another scene: an item that shows both kinds of scenes is left out.
     validation = [item for item in items if uses_only(item, held_out)]
-    check_not_empty(len(training), "training items")
-    check_not_empty(len(validation), "items of held-out training scenes")
+    check_not_empty(len(training), "training items", "teacher.narrate")
+    check_not_empty(len(validation), "items of held-out training scenes", "teacher.narrate")
     return training, validation
 
 

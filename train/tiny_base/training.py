@@ -143,7 +143,7 @@ LOSSES: dict[str, Callable[..., dict[str, Tensor]]] = {
 }  # fmt: skip
 
 
-class BaseTrainer:
+class TinyBaseTrainer:
     """Trains a model and the heads through all stages, with checkpoints.
 
     Args:
@@ -309,7 +309,7 @@ def build_trainer(
     processor: ProcessorMixin,
     sampler: ItemSampler,
     held_out: Sequence[SelectionItem],
-) -> BaseTrainer:
+) -> TinyBaseTrainer:
     """Return the trainer of a run.
 
     Args:
@@ -328,7 +328,7 @@ def build_trainer(
     probe = Probe(model, heads, collate, samples, worded, words, cfg.train.precision == "bf16")
     tokenizer = processor.tokenizer.backend_tokenizer.to_str()
     digest = hashlib.sha256(tokenizer.encode()).hexdigest()[:16]
-    return BaseTrainer(cfg.train, model, heads, collate, sampler, probe, run.folder, digest)
+    return TinyBaseTrainer(cfg.train, model, heads, collate, sampler, probe, run.folder, digest)
 
 
 def first_token_ids(processor: ProcessorMixin) -> dict[str, list[int]]:

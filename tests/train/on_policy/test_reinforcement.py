@@ -130,7 +130,7 @@ def test_a_run_resumes_in_its_second_epoch(settings, tmp_path, monkeypatch, shor
 
     def recorded(self, prompts, trainer):
         if self.model.training:
-            seen[current].append([judged.item.item_id for judged in self._judged[::4]])
+            seen[current].append([entry.item.item_id for entry in self._batch_items[::4]])
         return respond(self, prompts, trainer)
 
     def four_items(*arguments):

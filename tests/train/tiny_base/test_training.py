@@ -23,7 +23,12 @@ from tests.user_errors import raises_user_error
 from train.base import main
 from train.common.held_out import held_out_scenes
 from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
-from train.tiny_base.training import CHECKPOINT, BaseTrainer, build_trainer, learning_rate_factor
+from train.tiny_base.training import (
+    CHECKPOINT,
+    TinyBaseTrainer,
+    build_trainer,
+    learning_rate_factor,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -43,7 +48,7 @@ def cfg(micro, micro_store: Store, student_cfg) -> TinyBaseCommand:
     )
 
 
-def start(cfg: TinyBaseCommand, store: Store, folder: Path) -> BaseTrainer:
+def start(cfg: TinyBaseCommand, store: Store, folder: Path) -> TinyBaseTrainer:
     """Return the trainer of a run, with the same initial weights for the same settings."""
     folder.mkdir(exist_ok=True)
     frames = FrameReader(store, cfg.student.image_size)
