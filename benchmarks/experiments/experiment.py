@@ -144,20 +144,28 @@ class Experiment:
         The run's name contains the key of the settings that decide its result, so a finished run
         with other such settings is never reused.
         """
-        folder = self.args.checkpoints / command.partition(".")[2] / name
-        if (folder / "metrics.json").exists():
-            return folder
+        folder = self._find_folder(command, name)
         interrupted, started = folder.exists(), read_cpu_minutes()
-        run_command([command, *overrides, f"run={name}"])
-        if not interrupted:
-            (folder / MINUTES).write_text(f"{read_cpu_minutes() - started}\n")
+        if not is_finished(folder):
+            run_command([command, *overrides, f"run={name}"])
+            if not interrupted:
+                (folder / MINUTES).write_text(f"{read_cpu_minutes() - started}\n")
         return folder
 
     def evaluate(self, command: str, name: str, overrides: Sequence[str]) -> Path:
-        """Evaluate with a command, and return the folder of the run."""
-        # The command itself reuses the answers of the same model.
-        run_command([command, *overrides, *self.shared_overrides, f"run={name}"])
+        """Evaluate with a command unless the run is finished, and return the folder of the run."""
+        folder = self._find_folder(command, name)
+        if not is_finished(folder):
+            run_command([command, *overrides, *self.shared_overrides, f"run={name}"])
+        return folder
+
+    def _find_folder(self, command: str, name: str) -> Path:
         return self.args.checkpoints / command.partition(".")[2] / name
+
+
+def is_finished(folder: Path) -> bool:
+    """Return whether a folder has the metrics of a finished run."""
+    return (folder / "metrics.json").exists()
 
 
 def training_key(
