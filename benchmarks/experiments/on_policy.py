@@ -97,8 +97,9 @@ def main() -> None:
         overrides = [f"model={trained[-1]}", f"modes=[{','.join(BOTH)}]", *EVALUATION]
         folder = experiment.evaluate("evaluation.select", experiment.run_name(*job), overrides)
         minutes = sum_minutes(trained)
-        rows = read_rows(folder, open_benchmark(Path(args.store), args.benchmark))
-        return [{"cpu_minutes": minutes, **row} for row in rows]
+        rows = [*read_rows(folder, open_benchmark(Path(args.store), args.benchmark))]
+        distinct = share_of_distinct_4grams([row.pop("text") for row in rows])
+        return [{"cpu_minutes": minutes, "distinct_4grams": distinct, **row} for row in rows]
 
     jobs = [(variant, seed) for seed in range(args.seeds) for variant in args.variants]
     results = experiment.run(jobs, run_variant)
@@ -152,7 +153,7 @@ def sum_minutes(trained: Sequence[Path]) -> float | None:
 
 
 def read_rows(folder: Path, store: Store) -> Iterator[dict[str, Any]]:
-    """Yield a row for each test item of an evaluation: the chosen letter, and what the response
+    """Yield a row for each test item of an evaluation: the chosen letter, the response, and what it
     claims."""
     responses = read_item_responses(folder, "reasoning")
     for item in store.selection("test"):
@@ -209,14 +210,14 @@ def print_responses(results: pd.DataFrame) -> None:
             rows.follows.astype(float).mean(),
             rows.true_reasons.astype(float).mean(),
             rows.numbers.mean(),
-            rows.groupby("seed").text.apply(share_of_distinct_4grams).mean(),
+            rows.groupby("seed").distinct_4grams.first().mean(),
             rows.unseen_claims.sum() / (rows.prefix_claims + rows.prediction_claims).sum(),
         )
         cells = [f"{100 * share:.1f}" for share in shares]
         print_row(variant, f"{claims / len(rows):.1f}", *cells)
 
 
-def share_of_distinct_4grams(texts: pd.Series) -> float:
+def share_of_distinct_4grams(texts: Sequence[str]) -> float:
     """Return the number of distinct 4-grams (sequences of four words), as a share of all in the
     texts."""
     words = [re.findall(r"[\w-]+", text.lower()) for text in texts]
