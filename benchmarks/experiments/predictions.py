@@ -152,13 +152,13 @@ def read_predictions(run: Path, store: Store) -> Iterator[Predicted]:
 def find_described(predicted: Sequence[Claim], claims: Sequence[Claim]) -> tuple[str, ...]:
     """Return the letters of the candidates that show all that is predicted, according to the
     claims about them."""
-    shown = {(c.candidate, statement(c)) for c in claims if c.candidate is not None}
+    shown = {(c.candidate, read_statement(c)) for c in claims if c.candidate is not None}
     return tuple(
-        letter for letter in LETTERS if all((letter, statement(c)) in shown for c in predicted)
+        letter for letter in LETTERS if all((letter, read_statement(c)) in shown for c in predicted)
     )
 
 
-def statement(claim: Claim) -> tuple[object, ...]:
+def read_statement(claim: Claim) -> tuple[object, ...]:
     """Return what a claim states, without the candidate or the moment that it is about."""
     relation = Relation(claim.kind, claim.subjects, claim.value)
     return (normalize_relation(relation) if claim.kind in VALUES else relation, claim.affirmed)

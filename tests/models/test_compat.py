@@ -111,10 +111,7 @@ def test_qwen3_vl_takes_the_vision_towers_outputs_instead_of_pixels(model) -> No
         (MultiVectorEncoder, ["_load_with_module_classes"]),
         (Trainer, ["_get_train_sampler", "_load_from_checkpoint", "get_batch_samples",
                    "_get_num_items_in_batch"]),
-        (GRPOTrainer,
-         ["_generate_and_score_completions", "_calculate_rewards", "_compute_loss",
-          "_get_per_token_logps_and_entropies", "_get_train_sampler", "_send_telemetry"]),
-        (DynamicLayer, ["lazy_initialization", "get_mask_sizes", "get_seq_length", "update"]),
+        (GRPOTrainer, ["_send_telemetry", "create_model_card"]),
         (SentenceTransformerTrainer,
          ["_load_from_checkpoint", "_load_best_model", "get_batch_sampler", "collect_features",
           "add_model_card_callback"]),
@@ -124,6 +121,20 @@ def test_qwen3_vl_takes_the_vision_towers_outputs_instead_of_pixels(model) -> No
 def test_overridden_methods_exist(kind, names) -> None:
     for name in names:
         assert hasattr(kind, name), f"{CHANGED} {kind.__name__}.{name} is gone"
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        (GRPOTrainer,
+         ["_generate_and_score_completions", "_calculate_rewards", "_compute_loss",
+          "_get_per_token_logps_and_entropies", "_get_train_sampler"]),
+        (DynamicLayer, ["lazy_initialization", "get_mask_sizes", "get_seq_length", "update"]),
+    ],
+)  # fmt: skip
+def test_classes_define_methods_that_their_bases_have_too(kind, names) -> None:
+    for name in names:
+        assert name in vars(kind), f"{CHANGED} {kind.__name__} inherits {name}"
 
 
 def test_grpo_trainer_keeps_measures_and_an_order_that_can_be_seeded() -> None:

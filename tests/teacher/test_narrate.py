@@ -245,10 +245,10 @@ def test_incompatible_server_is_reported(store, start_server, reply):
     assert read_rationales(journal_path(store)) == []
 
 
-def test_fallback_is_marked_and_optional(store, start_server):
+def test_fallback_is_marked_and_optional(store, start_server, monkeypatch):
     """All responses of the server contain a number, so all items are set aside."""
     server = start_server(*["number"] * 40)
-    cfg = teacher_at(server, attempts=2, samples=1)
+    cfg = teacher_at(server, attempts=2, samples=1, grammar=True)
     without = narrate_store(store, cfg)
     assert (without.rationales, without.figures["set_aside"]) == ([], 12)
     requests = len(server.requests)
@@ -264,6 +264,10 @@ def test_fallback_is_marked_and_optional(store, start_server):
     again = narrate_store(store, replace(cfg, fallback=True))
     assert again.rationales == narration.rationales
     assert narrate_store(store, cfg).rationales == []
+    # With another prompt, the server is asked again for items with fallbacks.
+    monkeypatch.setattr("teacher.validation.grader.PROMPT_VERSION", "another")
+    narrate_store(store, replace(cfg, fallback=True))
+    assert len(server.requests) > requests
 
 
 def still_store(folder):
