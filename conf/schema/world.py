@@ -22,7 +22,8 @@ MAX_TILT = 45.0
 """Maximum tilt of a part, degrees. On steeper ramps, cubes tumble and leave the surface instead of
 sliding."""
 RADIUS = 0.2
-"""Radius of an object of scale 1, simulator units."""
+"""Radius of spheres and cylinders, and half the height of cylinders, of scale 1, simulator units.
+In the world of CLEVRER, all objects have scale 1."""
 SLIDE_FRAMES = 33
 """Minimum number of frames of scenes in which objects slide; see `data.world.sliding`."""
 MAX_ROW = 6

@@ -6,9 +6,8 @@ from functools import reduce
 
 import numpy as np
 
-RADIUS = 0.2
-"""Radius of spheres and cylinders, and half the height of cylinders, simulator units. In the world
-of CLEVRER, all objects have scale 1."""
+from conf.schema.world import RADIUS
+
 CUBE_HALF = 0.18
 """Half of a cube's edge, simulator units."""
 BOUNDING_RADIUS = {"sphere": RADIUS, "cylinder": RADIUS * 2**0.5, "cube": CUBE_HALF * 3**0.5}

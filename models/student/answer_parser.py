@@ -132,13 +132,12 @@ _SECOND_THOUGHT = re.compile(
 )
 
 
-def parse_choice(raw: str, letters: str = LETTERS, truncated: bool = False) -> ParsedAnswer:
+def parse_choice(raw: str, truncated: bool = False) -> ParsedAnswer:
     """Read the chosen letter from a response.
 
     Args:
         raw: The whole response. If the prompt ends with `<think>`, prepend the tag to the response;
             otherwise a thought that was cut off is read as an answer.
-        letters: The letters of the candidates, upper case.
         truncated: Whether generation stopped at the token limit, so that the last word may be
             incomplete.
     """
@@ -146,22 +145,22 @@ def parse_choice(raw: str, letters: str = LETTERS, truncated: bool = False) -> P
     if text is None:
         return ParsedAnswer(None, Reason.CUT_OFF)
     repaired = _quote(text)
-    choices, records, flag, prose = _read_records(repaired, letters)
+    choices, records, flag, prose = _read_records(repaired)
     if repaired != text:
         if choices:
             flag = flag or Reason.MALFORMED
         else:
-            choices, records, flag, prose = _read_records(text, letters)
+            choices, records, flag, prose = _read_records(text)
     prose = _ANSWER_TAG.sub(r"\nAnswer: \1\n", prose)
     if choices:
-        answer = _agreed([_read_statement(choice, letters) for choice in choices])
+        answer = _agreed([_read_statement(choice) for choice in choices])
         record = records[0] if len(records) == 1 and flag is None else None
         broken = answer.reason in (None, Reason.MALFORMED) and flag
         return ParsedAnswer(answer.letter, broken or answer.reason, record)
     if flag is Reason.CUT_OFF:
         return ParsedAnswer(None, flag)
     # With "xx" appended, a last word that may have been cut off cannot be read as a letter.
-    answer = _read_prose(f"{prose}xx" if truncated else prose, letters)
+    answer = _read_prose(f"{prose}xx" if truncated else prose)
     if truncated and answer.reason is Reason.NO_ANSWER:
         return ParsedAnswer(None, Reason.CUT_OFF)
     return answer
@@ -180,9 +179,7 @@ def _quote(text: str) -> str:
     return _BARE_KEY.sub(r'\1"\2"', text) if _BARE_START.search(text) else text
 
 
-def _read_records(
-    text: str, letters: str
-) -> tuple[list[str | None], list[str], Reason | None, str]:
+def _read_records(text: str) -> tuple[list[str | None], list[str], Reason | None, str]:
     """Return the choices of all records (None for an unreadable one), the complete records with a
     choice, what is wrong with the records (None if nothing is), and the text outside of records.
 
@@ -194,7 +191,7 @@ def _read_records(
         between = text[position : match.start()]
         prose.append(between)
         values, end = _read_record(text, match.start())
-        if values and choices and (_CORRECTION.search(between) or _is_template(choices, letters)):
+        if values and choices and (_CORRECTION.search(between) or _is_template(choices)):
             choices, records = [], []
         choices += values
         position = len(text) if end is None else end
@@ -231,12 +228,12 @@ def _read_record(text: str, start: int) -> tuple[list[str | None], int | None]:
     return [value for _, value in choices] if has_choice else [], end
 
 
-def _is_template(choices: Sequence[str | None], letters: str) -> bool:
+def _is_template(choices: Sequence[str | None]) -> bool:
     """Return whether each choice lists all letters, such as "A|B|C|D", and nothing else."""
     return all(
         choice is not None
         and _ONLY_LETTERS.fullmatch(choice)
-        and {found.upper() for found in _ANY_LETTER.findall(choice)} == {*letters}
+        and {found.upper() for found in _ANY_LETTER.findall(choice)} == {*LETTERS}
         for choice in choices
     )
 
@@ -256,19 +253,19 @@ def _is_json(text: str) -> bool:
     return True
 
 
-def _read_prose(prose: str, letters: str) -> ParsedAnswer:
+def _read_prose(prose: str) -> ParsedAnswer:
     """Read answer lines, such as "Answer: B"; without these, a text that is only a letter."""
     lines = [*_ANSWER_LINE.finditer(prose)]
     if not lines:
-        return _read_lone_letter(prose, letters)
-    answer = _agreed([_read_statement(line["value"], letters) for line in lines])
+        return _read_lone_letter(prose)
+    answer = _agreed([_read_statement(line["value"]) for line in lines])
     if answer.reason is Reason.NO_ANSWER and not lines[-1]["value"].strip():
         return ParsedAnswer(None, Reason.CUT_OFF)
     next_line = prose[lines[-1].end() :].strip().partition("\n")[0]
-    return _apply_second_thought(answer, next_line, letters) if answer.letter else answer
+    return _apply_second_thought(answer, next_line) if answer.letter else answer
 
 
-def _apply_second_thought(answer: ParsedAnswer, line: str, letters: str) -> ParsedAnswer:
+def _apply_second_thought(answer: ParsedAnswer, line: str) -> ParsedAnswer:
     """Discard the letter of an answer if the next line withdraws it or names another letter."""
     opening = _SECOND_THOUGHT.match(line)
     rest = line[opening.end() :] if opening else line
@@ -276,22 +273,22 @@ def _apply_second_thought(answer: ParsedAnswer, line: str, letters: str) -> Pars
         rest.strip(f"{string.punctuation} ")
     ):
         return ParsedAnswer(None, Reason.REFUSAL)
-    corrected = _read_statement(rest, letters).letter if opening else None
+    corrected = _read_statement(rest).letter if opening else None
     return answer if corrected in (None, answer.letter) else ParsedAnswer(None, Reason.SEVERAL)
 
 
-def _read_lone_letter(text: str, letters: str) -> ParsedAnswer:
+def _read_lone_letter(text: str) -> ParsedAnswer:
     """Read a text that is nothing but a letter, such as "(B)" or "Option b"."""
     value = _strip_markup(text)
     if len(value.split()) > 5:
         return ParsedAnswer(None, Reason.REFUSAL if _REFUSAL.search(value) else Reason.NO_ANSWER)
-    answer = _read_statement(value, letters)
+    answer = _read_statement(value)
     if answer.letter and _STATEMENT.fullmatch(value)["rest"].strip(" .,;!?。"):
         return ParsedAnswer(None, Reason.NO_ANSWER)
     return answer
 
 
-def _read_statement(value: str | None, letters: str) -> ParsedAnswer:
+def _read_statement(value: str | None) -> ParsedAnswer:
     """Read a short statement, such as "B", "option (C)" or "B, because the cube has turned"; None
     stands for an unreadable statement."""
     if value is None:
@@ -304,7 +301,7 @@ def _read_statement(value: str | None, letters: str) -> ParsedAnswer:
     if match is None or refused:
         return ParsedAnswer(None, Reason.REFUSAL if refused else Reason.NO_ANSWER)
     letter = match["letter"].upper()
-    return ParsedAnswer(letter) if letter in letters else ParsedAnswer(None, Reason.BAD_LETTER)
+    return ParsedAnswer(letter) if letter in LETTERS else ParsedAnswer(None, Reason.BAD_LETTER)
 
 
 def _named_letters(value: str, match: re.Match[str] | None) -> set[str]:
