@@ -27,7 +27,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from conf.errors import SettingsError
-from conf.runs import flatten
+from conf.runs import flatten, resolve_run_name, run_name, runs_folder
+
+for resolver in (run_name, resolve_run_name, runs_folder):
+    OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 CONFIG_NAMES = {"train.export": "export_model", "evaluation.study.export": "export_study"}
 """Config names of the commands whose module, like data.export, is named `export`."""

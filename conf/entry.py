@@ -60,7 +60,10 @@ def _start(name: str, schema: type, main: Main) -> None:
     """Read the command line: print the help, run a sweep, or check all settings and start Hydra."""
     register(name, schema)
     sys.argv[1:] = [allow_new_key(argument, schema) for argument in sys.argv[1:]]
-    args = get_args_parser().parse_args()
+    args = get_args_parser().parse_intermixed_args()
+    # Hydra's own parser accepts overrides only behind the options.
+    options = [argument for argument in sys.argv[1:] if argument not in args.overrides]
+    sys.argv[1:] = [*options, *args.overrides]
     if args.help:
         _print(help_text(name, schema, args.overrides))
         return

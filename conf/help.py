@@ -22,26 +22,33 @@ ALL = "all"
 COMMON = (
     "run", "seed", "limit", "model", "modes", "suite", "control", "runs", "items", "annotators",
     "host", "port", "public", "folder", "format", "product", "verify", "frames", "frames_gb",
-    "examples", "gpus", "routes", "benchmark.name", "benchmark.scenes", "benchmark.seed",
+    "examples", "gpus", "routes", "images", "benchmark.name", "benchmark.scenes", "benchmark.seed",
     "benchmark.folder", "benchmark.renderer", "teacher.url", "teacher.model", "teacher.attempts",
-    "teacher_model", "server.url", "server.model", "student.model", "student.quantization",
+    "teacher.predicates", "teacher_model", "teacher_server.url", "sampling_server.url",
+    "server.url", "server.model", "student.model", "student.quantization", "student.lora.rank",
     "student.frames", "student.image_size", "student.temperature", "retriever.model",
-    "retriever.widths", "matcher.model", "train.regime", "train.beta", "train.responses",
-    "train.lr", "train.epochs", "train.max_steps", "train.batch", "train.micro_batch",
-    "train.mini_batch", "train.hard_negatives", "train.precision", "train.report_to", "batch",
-    "workers",
+    "retriever.widths", "matcher.model", "batch", "workers",
 )  # fmt: skip
 """Keys that users change often; `--help` lists those of the command."""
+TRAINING = (
+    "train.regime", "train.beta", "train.responses", "train.rewards.answer", "train.rewards.truth",
+    "train.rewards.following", "train.rewards.no_numbers", "train.rewards.form", "train.lr",
+    "train.epochs", "train.max_steps", "train.batch", "train.micro_batch", "train.mini_batch",
+    "train.hard_negatives", "train.precision", "train.evaluations", "train.generated_items",
+    "train.best_metric", "train.report_to",
+)  # fmt: skip
+"""Such keys of the commands that train. Other commands have them too, but use few of them."""
 
 
 def help_text(command: str, schema: type, overrides: list[str]) -> str:
     """Help of a command, with the values that result from `overrides`. Raises SettingsError.
 
-    It lists the settings of `COMMON`, or every setting if `overrides` contain `ALL`.
+    It lists the settings of `COMMON` and `TRAINING`, or every setting if `overrides` contain `ALL`.
     """
     settings = compose(command, schema, [o for o in overrides if o != ALL])
     entries = list(_entries(settings))
-    common = [entry for entry in entries if entry[0] in COMMON]
+    keys = (*COMMON, *TRAINING) if command.startswith("train.") else COMMON
+    common = [entry for entry in entries if entry[0] in keys]
     purpose = (sys.modules["__main__"].__doc__ or "").strip()
     groups = list_presets(command, schema)
     presets = [f"  {g}: {', '.join(groups[g])}" for g in groups if g not in OVERLAYS]

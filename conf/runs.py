@@ -18,8 +18,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from conf.errors import SettingsError, UserError
 from conf.files import write_json, write_text
 
@@ -134,11 +132,6 @@ def read_finished_metrics(run: Run) -> dict[str, float] | None:
     return json.loads(path.read_text())
 
 
-OmegaConf.register_new_resolver("run_name", run_name, replace=True)
-OmegaConf.register_new_resolver("resolve_run_name", resolve_run_name, replace=True)
-OmegaConf.register_new_resolver("runs_folder", runs_folder, replace=True)
-
-
 def open_run(run: Run, settings: dict[str, Any], command: str) -> None:
     """Write the settings (config.yaml) and the record (run.json) of a run that starts or resumes.
 
@@ -147,6 +140,8 @@ def open_run(run: Run, settings: dict[str, Any], command: str) -> None:
     Raises:
         SettingsError: The folder contains results of a run with other settings.
     """
+    from omegaconf import OmegaConf
+
     if other := changed_settings(run.folder, settings):
         if {path.name for path in run.folder.iterdir()} - BOOKKEEPING_FILES:
             raise other_settings_error(f"{run.folder} contains a run", other)
@@ -214,6 +209,8 @@ def wait_for_lock(handle: int, busy: str) -> None:
 
 def changed_settings(folder: Path, settings: dict[str, Any]) -> list[str]:
     """Return `compare_settings` of the run in `folder` and `settings`; empty if there is no run."""
+    from omegaconf import OmegaConf
+
     path = folder / "config.yaml"
     if not path.exists():
         return []

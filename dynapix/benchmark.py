@@ -13,8 +13,10 @@ from typing import Any, Generic, TypeVar, overload
 import numpy as np
 
 from conf.errors import UserError
+from conf.schema.benchmark import store_name
 from data.records import (
     FAMILIES,
+    LETTERS,
     SPLITS,
     FrameRef,
     RetrievalQuery,
@@ -23,6 +25,7 @@ from data.records import (
 )
 from data.render.frame_cache import FrameReader
 from data.store import MANIFEST, Store, open_store
+from teacher.journal import read_accepted
 
 Record = TypeVar("Record")
 
@@ -32,7 +35,7 @@ def load(
     split: str = "test",
     *,
     store: str | Path = "store",
-    frames: int = 12,
+    frames: int | None = None,
     image_size: int | None = None,
 ) -> Benchmark:
     """Open a benchmark, and build it first if it is a preset that has not been built.
@@ -43,7 +46,7 @@ def load(
         split: `train` or `test`.
         store: The folder of the built benchmarks.
         frames: The number of frames of a prefix, evenly spaced. A shorter prefix has all its
-            frames.
+            frames. None takes the benchmark's own number, `prefix_frames`.
         image_size: Frames are resized to `image_size` x `image_size` px; None keeps their size.
 
     Raises:
@@ -65,9 +68,10 @@ def load(
     folder = Path(benchmark)
     if not (folder / MANIFEST).exists():
         folder = Path(store) / benchmark
-    if not (folder / MANIFEST).exists():
-        return Benchmark(_build(str(benchmark), Path(store)), split, frames, image_size)
-    return Benchmark(open_store(folder), split, frames, image_size)
+    is_built = (folder / MANIFEST).exists()
+    opened = open_store(folder) if is_built else _open_preset(str(benchmark), Path(store))
+    count = frames or opened.manifest["config"]["prefix_frames"]
+    return Benchmark(opened, split, count, image_size)
 
 
 def preset_names(group: str = "benchmark") -> list[str]:
@@ -75,7 +79,8 @@ def preset_names(group: str = "benchmark") -> list[str]:
     return sorted(p.name.removesuffix(".yaml") for p in (files("conf") / group).iterdir())
 
 
-def _build(name: str, root: Path) -> Store:
+def _open_preset(name: str, root: Path) -> Store:
+    """Return the benchmark of a preset, and build it first if it is missing."""
     presets, worlds = preset_names(), preset_names("world")
     preset, _, world = name.partition("-")
     if preset not in presets or (world and world not in worlds):
@@ -91,14 +96,30 @@ def _build(name: str, root: Path) -> Store:
         from conf.schema import BuildCommand
         from data.build import ensure_benchmark
     except ImportError as error:
+        folder = root / store_name(preset, world or _preset_world(preset))
+        if (folder / MANIFEST).exists():
+            return open_store(folder)
         raise UserError(
-            f"{root / name} is not built, and building it needs {error.name}: "
+            f"{folder} is not built, and building it needs {error.name}: "
             "pip install -e '.[simulate]'",
             code="missing-package",
         ) from error
     overrides = [f"benchmark={preset}", *([f"world={world}"] if world else [])]
     cfg = compose("data.build", BuildCommand, overrides)
     return ensure_benchmark(cfg.benchmark, root, cfg.workers)
+
+
+def _preset_world(preset: str) -> str:
+    """Return the world of a benchmark's preset, without Hydra."""
+    import yaml
+
+    text = (files("conf") / "benchmark" / f"{preset}.yaml").read_text(encoding="utf-8")
+    for default in yaml.safe_load(text).get("defaults", ()):
+        if isinstance(default, dict):
+            return default["override /world"]
+        if default != "_self_":
+            return _preset_world(default)
+    return "clevrer"
 
 
 class Lazy(Sequence, Generic[Record]):
@@ -181,6 +202,29 @@ class Item(PrefixQuestion):
         reader = self._benchmark.reader
         return [reader.array(c.scene_id, c.frame) for c in self.record.candidates]
 
+    def messages(self, mode: str = "reasoning") -> list[dict[str, Any]]:
+        """Return the prompt as a chat request in the format of OpenAI's API, with frames as PNGs.
+
+        The prefix is a sequence of images, each after its time, instead of a video. The question,
+        the candidates and the instruction are those of the commands.
+
+        Args:
+            mode: `reasoning` asks for a rationale and the letter, `answer` for the letter alone.
+        """
+        from models.student.chat_requests import image_part
+        from models.student.prompts import MODES, choose_instruction
+
+        if mode not in MODES:
+            raise UserError(f"mode={mode!r}: choose {' or '.join(MODES)}", code="unknown-option")
+        parts: list[dict[str, Any]] = []
+        for time, frame in zip(self.times, self.prefix, strict=True):
+            parts += [_text_part(f"Frame at {time:.2f} seconds:"), image_part(frame)]
+        parts.append(_text_part(self.question))
+        for letter, candidate in zip(LETTERS, self.candidates, strict=True):
+            parts += [_text_part(f"Candidate {letter}:"), image_part(candidate)]
+        parts.append(_text_part(choose_instruction(mode, "cot")))
+        return [{"role": "user", "content": parts}]
+
     @property
     def answer(self) -> str:
         """The letter of the right candidate, A to D."""
@@ -200,6 +244,10 @@ class Item(PrefixQuestion):
     def subtype(self) -> str:
         """The kind of item within its family."""
         return self.record.subtype
+
+
+def _text_part(text: str) -> dict[str, Any]:
+    return {"type": "text", "text": text}
 
 
 class Query(PrefixQuestion):
@@ -287,6 +335,16 @@ class Benchmark:
         the database of all future-state queries."""
         name = "test" if self.split == "test" else "future"
         return Lazy(lambda ref: Frame(ref, self), self.store.database(name))
+
+    @cached_property
+    def rationales(self) -> dict[str, str]:
+        """The texts that the last `python -m teacher.narrate` accepted, by the id of the item or
+        query, for both splits.
+
+        Raises:
+            UserError: There has been no narration of this benchmark.
+        """
+        return read_accepted(self.store.folder)
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{self._count(family)} {family}" for family in FAMILIES)

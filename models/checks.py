@@ -37,12 +37,15 @@ POOLING = "lasttoken"
 """Sentence-transformers' name of the pooling of a single-vector retriever."""
 
 
-def check_vision_tower(model: str, config: PreTrainedConfig) -> None:
-    """Raise UserError if a student's base has no vision tower."""
-    if getattr(config, "vision_config", None) is None:
+def check_family(model: str, config: PreTrainedConfig) -> None:
+    """Raise UserError if a student's base is not a Qwen vision-language model, whose prompts have
+    clips with true times."""
+    has_vision = getattr(config, "vision_config", None) is not None
+    if not (has_vision and config.model_type.startswith("qwen")):
+        kind = config.model_type if has_vision else f"{config.model_type}, without a vision tower"
         raise UserError(
-            f"student.model={model} ({config.model_type}) has no vision tower: give a "
-            "vision-language model, such as Qwen3-VL",
+            f"student.model={model} ({kind}): students are vision-language models of Qwen, such as "
+            "Qwen3-VL. Measure another model with dynapix.evaluate (docs/evaluation.md)",
             code="unsupported-model",
         )
 

@@ -95,13 +95,16 @@ def split_batch(batch: int, micro_batch: int = 1, key: str = "train.batch") -> i
     Raises:
         UserError: The batch cannot be split into full micro-batches, equally many on each rank.
     """
-    samples = micro_batch * world_size()
+    ranks, samples = world_size(), micro_batch * world_size()
     if batch % samples:
         parts = f" in micro-batches of train.micro_batch={micro_batch}" if micro_batch > 1 else ""
+        multiple = max(1, round(batch / samples)) * samples
+        remedies = [f"{key} to a multiple of {samples}, such as {multiple}"]
+        if smaller := [n for n in range(1, micro_batch) if batch % (n * ranks) == 0]:
+            remedies.insert(0, f"train.micro_batch to {max(smaller)}")
         raise UserError(
-            f"{key}={batch} cannot be split over {world_size()} ranks{parts}: set "
-            f"{key} to a multiple of {samples}, such as "
-            f"{max(1, round(batch / samples)) * samples}, or change the number of ranks",
+            f"{key}={batch} cannot be split over {ranks} ranks{parts}: set "
+            f"{' or '.join(remedies)}, or change the number of ranks",
             code="uneven-batch",
         )
     return batch // samples

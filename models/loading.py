@@ -30,8 +30,8 @@ from models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
     check_adapters,
+    check_family,
     check_processor,
-    check_vision_tower,
 )
 from models.compat import keep_differentiable
 from models.fingerprints import find_commit
@@ -63,7 +63,8 @@ def load_base(
 
     Raises:
         UserError: The model is neither a local folder nor in the hub's cache and cannot be
-            downloaded, it has no vision tower, or its processor belongs to another model.
+            downloaded, it is no vision-language model of Qwen, or its processor belongs to another
+            model.
     """
     if cfg.architecture is not None:
         sizes = cfg.architecture
@@ -75,7 +76,7 @@ def load_base(
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     with explain_unloadable("student", cfg.model):
         config = AutoConfig.from_pretrained(cfg.model, **origin)
-        check_vision_tower(cfg.model, config)
+        check_family(cfg.model, config)
         processor = AutoProcessor.from_pretrained(cfg.model, **origin)
         check_processor("student", cfg.model, config, processor)
         model = AutoModelForImageTextToText.from_pretrained(

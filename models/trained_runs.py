@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,8 @@ from yaml import YAMLError
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig
 from models.resolved_settings import read_resolved, with_resolved_commit
+
+log = logging.getLogger(__name__)
 
 EXPORT = "export.json"
 """A file that only the folders that `train.export` writes contain."""
@@ -154,6 +157,11 @@ def resolve_model(
     if product == "student":
         check_sees_frames(folder, settings.train.facts, key)
     check_unseen(f"{key}={folder}", settings.benchmark, benchmark)
+    if settings.benchmark.store_name != benchmark.store_name:
+        log.warning(
+            "%s was trained on %s and is evaluated on %s: benchmark= and world= choose another",
+            folder, settings.benchmark.store_name, benchmark.store_name,
+        )  # fmt: skip
     _check_base_unseen(getattr(settings, product).model, benchmark)
     _apply_overrides(settings, cfg, product, overrides, key)
     return folder, settings

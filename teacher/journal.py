@@ -16,6 +16,8 @@ from data.records import Rationale
 from data.store import save_rows
 from teacher.sections import SECTIONS
 
+ACCEPTED = "rationales.parquet"
+"""Table of the rationales that the last narration accepted, in the folder of the benchmark."""
 DIGEST = "sha256"
 """Key of the checksum in a line of the journal."""
 LINE_ERRORS = (ValueError, TypeError, KeyError, AttributeError)
@@ -118,3 +120,23 @@ def save_accepted(rationales: list[Rationale], path: Path) -> None:
     names = [f.name for f in fields(Rationale) if f.name != "claims"]
     schema = pa.schema([(name, types.get(name, pa.string())) for name in names])
     save_rows([vars(r) for r in rationales], path, schema)
+
+
+def read_accepted(folder: Path) -> dict[str, str]:
+    """Return the texts that the last narration accepted, by the id of the item or query.
+
+    Args:
+        folder: The folder of a benchmark.
+
+    Raises:
+        UserError: There has been no narration.
+    """
+    import pyarrow.parquet as pq
+
+    if not (folder / ACCEPTED).exists():
+        raise UserError(
+            f"{folder} has no {ACCEPTED}: write rationales with python -m teacher.narrate",
+            code="no-rationales",
+        )
+    table = pq.read_table(folder / ACCEPTED, columns=["item_id", "text"])
+    return dict(zip(table["item_id"].to_pylist(), table["text"].to_pylist(), strict=True))

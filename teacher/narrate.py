@@ -22,7 +22,7 @@ from conf.entry import Run, command
 from conf.errors import UserError
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.journal import Journal, save_accepted
+from teacher.journal import ACCEPTED, Journal, save_accepted
 from teacher.narrator import write_rationale
 from teacher.report import (
     Figures,
@@ -156,7 +156,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
                         attempt = cfg.attempts + last.attempt
                         record([grader.mark_fallback(last, attempt)])
         rationales = select_accepted(items, responses)
-        save_accepted(rationales, store.folder / "rationales.parquet")
+        save_accepted(rationales, store.folder / ACCEPTED)
     return Narration(rationales, summarize(items, responses))
 
 

@@ -5,6 +5,7 @@ The instructions come first and are the same for every item, so that the server 
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -19,12 +20,14 @@ from teacher.predicates.facts import Predicates, Relation, RelationalPredicates
 from teacher.predicates.relations import find_topic
 from teacher.sections import SECTIONS
 
-PROMPT_VERSION = "3"
-
 SYSTEM = (files("teacher") / "templates" / "system_prompt.txt").read_text().rstrip()
 CITED = (files("teacher") / "templates" / "cited_prompt.txt").read_text().rstrip()
 RELATIONAL = (files("teacher") / "templates" / "relational_prompt.txt").read_text().rstrip() + "\n"
 """The part of the instructions that explains relational predicates."""
+_TEXTS = "\0".join([SYSTEM, CITED, RELATIONAL])
+PROMPT_VERSION = f"3-{hashlib.sha256(_TEXTS.encode()).hexdigest()[:8]}"
+"""Version of the prompts: a number, which changes with the code of this module, and a hash of the
+templates. Responses to prompts of another version are not reused."""
 
 
 def build_messages(

@@ -18,11 +18,13 @@ from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.types import Override, RangeSweep
 
+from conf.compose import compose
 from conf.errors import SettingsError, UserError, import_extra
 from conf.files import write_json
 from conf.gpus import visible_gpus
 from conf.multirun.table import is_lower_better
 from conf.runs import compare_settings, other_settings_error
+from conf.schema import SftCommand
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -34,12 +36,12 @@ RunJobs = Callable[[list[list[str]], int], list[dict[str, Any]]]
 """`Sweep.run_jobs`: runs jobs, given their overrides and the first one's number."""
 STUDY_FILE = "study.json"
 METRICS = {
-    "train.sft": "answer_letter_accuracy",
-    "train.distill": "answer_letter_accuracy",
+    "train.sft": "reasoning_generated_accuracy",
+    "train.distill": "reasoning_generated_accuracy",
     "train.reinforce": "reward",
     "train.contrastive": "mrr",
 }
-"""Default of hydra.sweeper.metric for each command."""
+"""Default of hydra.sweeper.metric for each command, unless `default_metric` chooses another."""
 
 
 @dataclass(frozen=True)
@@ -61,21 +63,21 @@ class Search:
 
         `overrides` contains the swept and the fixed overrides by key.
         """
-        metric = self.metric or METRICS.get(command)
+        swept = {key: o for key, o in overrides.items() if o.is_sweep_override()}
+        fixed = [str(o.input_line) for key, o in overrides.items() if key not in swept]
+        metric = self.metric or default_metric(command, fixed)
         if metric is None:
             raise SettingsError(
                 f"{command} has no default metric to optimise: give hydra.sweeper.metric=NAME, the "
                 "name of a metric in the metrics.json of a run",
                 code="missing-metric",
             )
-        swept = {key: o for key, o in overrides.items() if o.is_sweep_override()}
         if not swept:
             raise SettingsError(
                 "the search has no parameters: give at least one key several values, or an "
                 "interval such as 'train.lr=tag(log,interval(1e-5,1e-3))'",
                 code="nothing-to-search",
             )
-        fixed = [str(o.input_line) for key, o in overrides.items() if key not in swept]
         optuna = import_extra("optuna", "hydra/sweeper=optuna")
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         space = {key: distribution(override) for key, override in swept.items()}
@@ -102,6 +104,17 @@ class Search:
             best = study.best_trial
             params = " ".join(f"{key.lstrip('+')}={value}" for key, value in best.params.items())
             log.info("best: #%d %s, %s %.4g", best.number, params, metric, best.value)
+
+
+def default_metric(command: str, fixed: list[str]) -> str | None:
+    """Return the metric that a search optimises by default, or None if a command has none.
+
+    Args:
+        fixed: The overrides that all jobs share.
+    """
+    if command == "train.sft" and compose(command, SftCommand, fixed).train.regime == "answer_only":
+        return "answer_letter_accuracy"
+    return METRICS.get(command)
 
 
 def _run_trials(study: Study, first: int, fixed: list[str], metric: str, run_jobs: RunJobs) -> None:

@@ -10,9 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
 
-from omegaconf import MISSING
-
-from conf.schema.settings import Settings, setting
+from conf.schema.settings import MISSING, Settings, setting
 from conf.schema.world import WorldConfig
 
 RENDERERS = ("bullet", "blender")

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from omegaconf import MISSING
-
 from conf.runs import TRAINER_FOLDERS, is_inside, runs_folder
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import SamplingServerConfig, TeacherConfig, TeacherServerConfig
-from conf.schema.settings import Settings, check_run, setting
+from conf.schema.settings import MISSING, Settings, check_run, setting
 from conf.schema.training import (
     ContrastiveTrainConfig,
     DistillTrainConfig,

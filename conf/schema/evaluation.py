@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 from urllib.parse import urlsplit
 
-from omegaconf import MISSING
-
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.commands import CommandConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import ServerConfig
-from conf.schema.settings import Settings, check_choices, check_run, is_url, setting
+from conf.schema.settings import MISSING, Settings, check_choices, check_run, is_url, setting
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
 
 RESPONSE_MODES = ("reasoning", "answer", "record", "constrained")

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from omegaconf import MISSING
-
-from conf.schema.settings import Settings, setting
+from conf.schema.settings import MISSING, Settings, setting
 
 ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")
 

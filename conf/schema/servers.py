@@ -6,9 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from omegaconf import MISSING
-
-from conf.schema.settings import Settings, is_url, setting
+from conf.schema.settings import MISSING, Settings, is_url, setting
 
 NARRATOR_WORDS = (80, 250)
 """Minimum and maximum number of words of the built-in narrator's rationales."""

@@ -10,6 +10,10 @@ from urllib.parse import urlsplit
 
 from conf.runs import is_run_name, resolve_run_name
 
+MISSING: Any = "???"
+"""Default of a required setting. It equals `omegaconf.MISSING`, but importing the schema does not
+import OmegaConf, which a minimal installation lacks."""
+
 BOUNDS = {
     "least": (operator.ge, "{} or more"),
     "above": (operator.gt, "above {}"),

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import base64
 import io
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
 
-from conf.schema import StudentConfig
 from models.student.prompts import Clip, Sample
-from teacher.servers.server import Messages, RequestFields
+
+if TYPE_CHECKING:
+    from conf.schema import StudentConfig
+    from teacher.servers.server import Messages, RequestFields
 
 
 def build_messages(sample: Sample) -> Messages:
@@ -25,13 +27,18 @@ def build_messages(sample: Sample) -> Messages:
         if part["type"] == "text":
             parts.append(part)
         elif part["type"] == "image":
-            url = f"data:image/png;base64,{_encode_png(next(images))}"
-            parts.append({"type": "image_url", "image_url": {"url": url}})
+            parts.append(image_part(next(images)))
         else:
             frames = ",".join(map(_encode_png, sample.clip.pixels))
             url = f"data:video/jpeg;base64,{frames}"
             parts.append({"type": "video_url", "video_url": {"url": url}})
     return [{"role": "user", "content": parts}]
+
+
+def image_part(pixels: np.ndarray) -> dict[str, Any]:
+    """Return an (H, W, 3) uint8 image as a part of a message."""
+    url = f"data:image/png;base64,{_encode_png(pixels)}"
+    return {"type": "image_url", "image_url": {"url": url}}
 
 
 def _encode_png(pixels: np.ndarray) -> str:

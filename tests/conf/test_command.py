@@ -6,6 +6,7 @@ import shutil
 import sys
 
 import pytest
+import yaml
 
 from conf.failures import report_failures
 from tests.children import run_child
@@ -90,6 +91,15 @@ def test_help_describes_the_settings_and_imports_nothing_heavy(folder):
     brief = run_child([sys.executable, "-m", "toy", "--help"], check=True, cwd=folder)
     assert "--help all lists the other" in brief.stdout
     assert "Number to square" not in brief.stdout
+
+
+def test_options_may_stand_among_the_overrides(folder):
+    for arguments in (("x=5", "--cfg", "job", "workers=1"), ("--cfg", "job", "x=5", "workers=1")):
+        done = run_toy(folder, *arguments)
+        settings = yaml.safe_load(done.stdout)
+        assert (settings["x"], settings["workers"]) == (5, 1)
+    for arguments in (("x=5", "--help", "all"), ("--help", "all", "x=5")):
+        assert "x = 5.0" in run_toy(folder, *arguments).stdout
 
 
 def test_help_can_be_piped_to_head(folder):

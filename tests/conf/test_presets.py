@@ -12,7 +12,7 @@ import pytest
 from conf import schema
 from conf.compose import compose, config_name, list_presets
 from conf.errors import SettingsError
-from conf.help import COMMON, description
+from conf.help import COMMON, TRAINING, description
 from data.tracks.selection.window import CELLS
 
 CONF = Path(str(files("conf")))
@@ -175,7 +175,7 @@ def test_quotas_add_up_to_the_papers_totals():
 
 def test_every_common_setting_exists_in_a_command() -> None:
     keys = {key for schema in SCHEMAS.values() for key in schema_keys(schema)}
-    assert set(COMMON) <= keys
+    assert {*COMMON, *TRAINING} <= keys
 
 
 def schema_keys(schema: type, group: str = "") -> Iterator[str]:

@@ -17,7 +17,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from conf.compose import compose
 from conf.errors import import_extra
 from conf.gpus import visible_gpus
-from conf.multirun.search import STUDY_FILE, distribution
+from conf.multirun.search import STUDY_FILE, default_metric, distribution
 from conf.multirun.sweep import Sweep
 from conf.multirun.table import JOB_FILE, is_lower_better, read_jobs
 from conf.schema import ContrastiveCommand, SftCommand
@@ -28,6 +28,19 @@ from tests.user_errors import raises_user_error
 SEARCH = ("-m", "x=interval(0.5,3.0)", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2")
 BY_LOSS = "hydra.sweeper.metric=loss"
 TWO_GPUS = {**os.environ, "CUDA_VISIBLE_DEVICES": "0,1"}
+
+
+@pytest.mark.parametrize(
+    ("command", "fixed", "metric"),
+    [
+        ("train.sft", ["+exp=cot"], "reasoning_generated_accuracy"),
+        ("train.sft", ["+exp=answer_only", "seed=1"], "answer_letter_accuracy"),
+        ("train.contrastive", [], "mrr"),
+        ("data.build", [], None),
+    ],
+)
+def test_a_search_optimises_the_accuracy_of_generated_answers(command, fixed, metric) -> None:
+    assert default_metric(command, fixed) == metric
 
 
 def wait_for(*paths: Path) -> None:

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import dynapix
+from conf.compose import compose
+from conf.schema import BuildCommand
+from data.records import Rationale
 from data.render.frame_cache import FrameReader
 from data.store import MANIFEST
 from dynapix.__main__ import COMMANDS, overview
+from dynapix.benchmark import _preset_world, preset_names
 from dynapix.selection import MIN_FAILURES_TO_STOP
 from evaluation.metrics.selection import Choices, build_selection_report
 from evaluation.reporting.tables import selection_table
+from teacher.journal import ACCEPTED, save_accepted
 from tests.dynapix.models import always_a, nearest
 from tests.test_house import COMMANDS as ALL_COMMANDS
 from tests.user_errors import raises_user_error
 
 READING = {"numpy", "pyarrow", "PIL"}
 """The packages that reading a benchmark may import."""
+PRESETS = ["tiny_balanced", "tiny_balanced-above", "small", "small-clevrer"]
+"""Names that open the folders tiny_balanced-above and small."""
 OWN = {"conf", "data", "dynapix", "evaluation", "models", "teacher"}
 
 
@@ -57,6 +67,40 @@ def test_reading_a_benchmark_needs_three_packages(micro_store) -> None:
         "bench.retrieval[0].target.image, bench.database[0].image"
     )
     assert imported_packages(code, Path.cwd()) == READING
+
+
+def test_evaluating_and_scoring_need_no_extra(micro_store) -> None:
+    code = (
+        f"import dynapix; bench = dynapix.load({str(micro_store.folder)!r})\n"
+        "items = bench.selection[:8]; results = [\n"
+        "    dynapix.evaluate(items, lambda item, letter=letter: letter, progress=False)\n"
+        "    for letter in 'AB'\n"
+        "]\n"
+        "str(results[0]), str(results[0].compare(results[1])), items[0].messages()\n"
+        "dynapix.score_rationale(items[0], 'Prediction: the cube stops.')"
+    )
+    imported = imported_packages(code, Path.cwd())
+    assert READING <= imported <= READING | {"yaml", "tqdm"}
+
+
+def test_a_built_preset_opens_without_the_extra_that_builds(micro_store, tmp_path) -> None:
+    shutil.copytree(micro_store.folder, tmp_path / "tiny_balanced-above")
+    shutil.copytree(micro_store.folder, tmp_path / "small")
+    code = (
+        "import sys\n"
+        "sys.modules |= dict.fromkeys(['hydra', 'omegaconf'])\n"
+        f"import dynapix; names = {PRESETS}\n"
+        f"print([len(dynapix.load(name, store={str(tmp_path)!r}).selection) for name in names])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    items = len(micro_store.selection("test"))
+    assert json.loads(done.stdout) == [items] * len(PRESETS)
+
+
+def test_presets_have_the_worlds_that_hydra_composes() -> None:
+    for name in preset_names():
+        cfg = compose("data.build", BuildCommand, [f"benchmark={name}"])
+        assert _preset_world(name) == cfg.benchmark.world.name, name
 
 
 def test_every_public_name_exists_and_has_a_docstring() -> None:
@@ -228,17 +272,16 @@ def test_sufficiency_of_a_rationale_is_that_of_its_prediction(micro_store) -> No
 
 
 def test_name_of_a_preset_and_a_world_builds_the_benchmark_in_the_world(
-    tmp_path, monkeypatch
+    micro_store, tmp_path, monkeypatch
 ) -> None:
     built = []
 
     def remember(cfg, root, workers):
         built.append((cfg.store_name, cfg.world.physics.rolling_friction, root))
-        return micro
+        return micro_store
 
-    micro = object()
     monkeypatch.setattr("data.build.ensure_benchmark", remember)
-    assert dynapix.load("tiny-settling", store=tmp_path).store is micro
+    assert dynapix.load("tiny-settling", store=tmp_path).store is micro_store
     assert built == [("tiny-settling", 0.025, tmp_path)]
 
 
@@ -260,6 +303,39 @@ def test_unknown_and_damaged_benchmarks_are_refused(micro_store, tmp_path) -> No
     (copy / MANIFEST).write_text("{")
     with raises_user_error("damaged-file", contains=MANIFEST):
         dynapix.load(copy)
+
+
+def test_messages_show_the_item_in_the_order_of_the_prompt(bench) -> None:
+    item = bench.selection[0]
+    [message] = item.messages()
+    parts = message["content"]
+    urls = [part["image_url"]["url"] for part in parts if part["type"] == "image_url"]
+    images = [Image.open(BytesIO(base64.b64decode(url.partition(",")[2]))) for url in urls]
+    expected = [*item.prefix, *item.candidates]
+    assert all(map(np.array_equal, map(np.asarray, images), expected))
+    assert len(images) == len(expected)
+    texts = [part["text"] for part in parts if part["type"] == "text"]
+    times = [f"Frame at {time:.2f} seconds:" for time in item.times]
+    letters = [f"Candidate {letter}:" for letter in "ABCD"]
+    assert texts[:-1] == [*times, item.question, *letters]
+    assert "step by step" in texts[-1]
+    assert "step by step" not in item.messages("answer")[0]["content"][-1]["text"]
+    with raises_user_error("unknown-option", contains="reasoning or answer"):
+        item.messages("record")
+
+
+def test_rationales_are_those_of_the_last_narration(micro_store, tmp_path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(micro_store.folder, folder)
+    (folder / ACCEPTED).unlink(missing_ok=True)
+    with raises_user_error("no-rationales", contains="teacher.narrate"):
+        dynapix.load(folder).rationales  # noqa: B018
+    written = [
+        Rationale(f"item-{k}", 0, True, f"Text {k}.", "A", "template", "1", "1", "0", 0)
+        for k in range(3)
+    ]
+    save_accepted(written, folder / ACCEPTED)
+    assert dynapix.load(folder).rationales == {r.item_id: r.text for r in written}
 
 
 def test_items_of_two_benchmarks_and_wrong_batches_are_refused(bench, micro_store) -> None:
