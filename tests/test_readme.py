@@ -3,6 +3,7 @@ produced by other documented commands."""
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import subprocess
@@ -16,6 +17,7 @@ from conf.compose import check_run_settings, config_name
 from conf.multirun.sweep import Sweep
 from conf.runs import TRAINER_FOLDERS, run_name
 from tests.conf.test_presets import SCHEMAS
+from tests.evaluation.chat_server import ChatServer
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
@@ -87,12 +89,19 @@ def test_python_examples_run(micro_store, tmp_path, monkeypatch, capsys) -> None
     (tmp_path / "store").mkdir()
     (tmp_path / "store" / "tiny").symlink_to(micro_store.folder)
     monkeypatch.chdir(tmp_path)
+    server = ChatServer(lambda request: f"Answer: {'ABCD'[len(server.requests) % 4]}")
+    monkeypatch.setenv("OPENAI_BASE_URL", server.url)
+    monkeypatch.setenv("OPENAI_API_KEY", "none")
     examples = [code for page in PAGES for code in PYTHON.findall(page.read_text())]
     assert examples
     for code in examples:
         exec(compile(code, "example", "exec"), {})
     assert "Selection accuracy (%)" in capsys.readouterr().out
     assert (tmp_path / "runs" / "nearest" / "report.json").exists()
+    server.stop()
+    assert len(server.requests) == len(micro_store.selection("test"))
+    report = json.loads((tmp_path / "runs" / "MODEL" / "report.json").read_text())
+    assert report["rows"][0]["parse_rate"] == 1
 
 
 def test_the_readme_fits_its_length() -> None:
