@@ -12,6 +12,7 @@ from conf.schema import RelationBounds
 from data.records import SelectionItem
 from evaluation.metrics.intervals import Interval, SceneBootstrap
 from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.facts import RelationalPredicates
 from teacher.reading.claims import Claim
 from teacher.validation.reasons import (
     CONTRADICTED,
@@ -78,9 +79,15 @@ def read_reasons(
 ) -> ResponseReasons | None:
     """Read the reasons of a response; None if the item has no predicates, because its prefix is
     too short."""
-    scene = store.scene(item.scene_id)
-    predicates = extract_predicates(item, scene, store.scene, RelationBounds())
+    predicates = item_predicates(item, store)
     return None if predicates is None else read_response(text, letter, item.letter, predicates)
+
+
+def item_predicates(item: SelectionItem, store: Store) -> RelationalPredicates | None:
+    """Return all predicates of an item, with which claims are compared; None if the item has no
+    predicates, because its prefix is too short."""
+    scene = store.scene(item.scene_id)
+    return extract_predicates(item, scene, store.scene, RelationBounds())
 
 
 def _summarize_part(claims: Sequence[Sequence[Claim]], scenes: SceneBootstrap) -> PartSummary:

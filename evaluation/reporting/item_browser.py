@@ -19,11 +19,12 @@ from data.store import Store, open_store
 from data.tracks.controls import MATCHED_ANCHOR
 from data.tracks.quota import interleave
 from evaluation.metrics.baselines import baseline_results
-from evaluation.metrics.reasons import read_reasons
+from evaluation.metrics.reasons import item_predicates, read_reasons
 from evaluation.metrics.results import SelectionResult
 from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting.measurements import Measurement, compare_models
 from evaluation.reporting.run_responses import ItemResponse, Responses
+from teacher.cited import list_facts
 from teacher.reading.claims import Claim
 from teacher.sections import SECTIONS
 
@@ -158,6 +159,7 @@ def page_entries(
             ],
             "answer": item.letter,
             "truth": describe_truth(item, store),
+            "facts": list_oracle_facts(item, store),
             "responses": [
                 _response_entry(label, r[item.item_id], item, store)
                 for label, r in responses.items()
@@ -179,6 +181,13 @@ def describe_truth(item: SelectionItem, store: Store) -> list[str]:
             first, second = (scene.objects[k].noun_phrase for k in collision.objects)
             sentences.append(f"The {first} and the {second} collide at frame {collision.frame}.")
     return sentences
+
+
+def list_oracle_facts(item: SelectionItem, store: Store) -> list[str]:
+    """Return in words the main facts of the oracle with which the claims about an item are
+    compared; none if the item has no predicates."""
+    predicates = item_predicates(item, store)
+    return [] if predicates is None else [*list_facts(predicates, item).values()]
 
 
 def _response_entry(

@@ -100,6 +100,15 @@ function responseBlock(response) {
   return block;
 }
 
+// The facts of the oracle, folded.
+function factList(facts) {
+  const folded = element("details", "facts");
+  const entries = element("ul");
+  entries.append(...facts.map((fact) => element("li", "", fact)));
+  folded.append(element("summary", "", "Facts of the oracle"), entries);
+  return folded;
+}
+
 function itemArticle(item) {
   const article = element("article");
   article.dataset.id = item.id;
@@ -119,6 +128,7 @@ function itemArticle(item) {
   );
   article.append(prefix, element("div", "note", "Candidates (the target is framed):"), candidates);
   article.append(...item.truth.map((sentence) => element("p", "truth", sentence)));
+  if (item.facts.length) article.append(factList(item.facts));
   article.append(...visibleResponses(item).map(responseBlock));
   return article;
 }

@@ -13,6 +13,7 @@ from PIL import Image
 from conf.errors import UserError
 from data.records import LETTERS
 from data.render.frame_cache import FrameReader
+from evaluation.metrics.reasons import item_predicates, read_reasons
 from evaluation.reporting import item_browser
 from evaluation.reporting.run_responses import nearest_candidates, parse_response
 
@@ -114,6 +115,19 @@ def test_the_verdict_on_a_response_is_that_of_its_parsed_answer(micro_store, ite
     assert (shown["model"], shown["verdict"]) == ("one", verdict)
     assert (shown["letter"] is None) == (verdict == "unparsed")
     assert entry["truth"][0].startswith(f"{item.letter} is correct: frame {item.target_frame}")
+
+
+def test_the_facts_of_an_item_contradict_no_claim_that_they_make(micro_store, items):
+    described = {item: item_browser.list_oracle_facts(item, micro_store) for item in items[:20]}
+    assert any(described.values())
+    for item, facts in described.items():
+        assert bool(facts) == (item_predicates(item, micro_store) is not None)
+        analysis = [fact for fact in facts if fact.startswith("candidate ")]
+        text = "Candidate analysis: " + " ".join(f"C{fact[1:]}." for fact in analysis)
+        reasons = read_reasons(item, text, None, micro_store)
+        claims = reasons.claims["candidates"] if reasons else []
+        assert bool(claims) == bool(facts)
+        assert not any(claim.verdict == "contradicted" for claim in claims)
 
 
 def test_tied_candidates_share_the_credit():
