@@ -114,7 +114,7 @@ def reward_no_numbers(response: JudgedResponse) -> float:
 
 def reward_form(response: JudgedResponse) -> float:
     """Return -1 for a response that was cut off, or whose sections and answer are out of order or
-    occur twice, otherwise 0. A response without sections has no form that it could miss."""
+    occur twice, otherwise 0. Without sections, only the cut counts."""
     headings = [name for name, _, _ in split_sections(response.text)]
     in_order = headings == [name for name in (*SECTIONS, "Answer") if name in headings]
     return -float(response.truncated or not in_order)
