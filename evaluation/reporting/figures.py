@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from textwrap import fill
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 INK, GRID = "#333333", "#eeeeee"
 GRAY = "#999999"
 """Color of untrained retrievers."""
+LEGEND_WIDTH = 100
+"""Maximum characters of a line of a legend."""
+LEGEND_ROWS, LEGEND_LINE = 4, 0.18
+"""Number of rows of a legend for which a figure has room, and the height of another row, inches."""
 
 
 def plot_accuracies(
@@ -43,7 +48,10 @@ def plot_accuracies(
         xs = [k + (i - len(accuracy) / 2) * width for k, _ in bars]
         heights, low, high = 100 * np.array([(a.value, a.low, a.high) for _, a in bars]).T
         color = GRAY if label.startswith(UNTRAINED) else COLORS[i % len(COLORS)]
-        axes.bar(xs, heights, width * 0.9, color=color, label=label)
+        hatch = "//" * (i // len(COLORS))
+        axes.bar(
+            xs, heights, width * 0.9, color=color, hatch=hatch, edgecolor="#ffffff", label=label
+        )
         middle, half_length = (high + low) / 2, (high - low) / 2
         axes.errorbar(xs, middle, half_length, fmt="none", ecolor=INK, capsize=3, elinewidth=1.2)
     paper = cot_student() if with_paper else {}
@@ -101,7 +109,10 @@ def plot_recalls(rows: Iterable[tuple[str, RetrievalResult]], file: Path | IO[by
 def _legend_above(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     # Matplotlib would read the text between two dollar signs as a formula.
-    labels = [label.replace("$", r"\$") for label in labels]
+    labels = [fill(label.replace("$", r"\$"), LEGEND_WIDTH) for label in labels]
+    columns = 2 if max(map(len, labels)) <= LEGEND_WIDTH / 2 else 1
+    rows = sum(label.count("\n") + 1 for label in labels) / columns
+    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, rows - LEGEND_ROWS))
     figure.legend(
-        handles, labels, loc="outside upper left", ncols=2, fontsize=9, frameon=False
+        handles, labels, loc="outside upper left", ncols=columns, fontsize=9, frameon=False
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """The results, tables and figures of single evaluations."""
 
 import json
+import re
 from dataclasses import asdict, replace
 from types import SimpleNamespace
 
@@ -182,3 +183,17 @@ def test_dollar_signs_in_labels_are_not_parsed_as_math(selection, tmp_path):
     with matplotlib.rc_context({"svg.fonttype": "none"}):
         figures.plot_accuracies({name: selection.families}, tmp_path / "accuracy.svg")
     assert f">{name}<" in (tmp_path / "accuracy.svg").read_text()
+
+
+def test_the_whole_names_of_many_runs_are_in_the_legend(selection, tmp_path):
+    words = " ".join(f"word{k}" for k in range(30))
+    names = [f"{words} of run {k}" for k in range(8)]
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        figures.plot_accuracies(dict.fromkeys(names, selection.families), tmp_path / "many.svg")
+    text = (tmp_path / "many.svg").read_text()
+    for k in range(8):
+        assert f"of run {k}<" in text
+    legend = re.findall(r'<text [^>]*translate\(([\d.]+) ([\d.]+)\)"[^>]*>word0', text)
+    width, height = map(float, re.search(r'width="([\d.]+)pt" height="([\d.]+)pt"', text).groups())
+    assert len(legend) == 8
+    assert all(0 < float(x) < width / 4 and 0 < float(y) < height for x, y in legend)
