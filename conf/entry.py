@@ -65,7 +65,7 @@ def _start(name: str, schema: type, main: Main) -> None:
     options = [argument for argument in sys.argv[1:] if argument not in args.overrides]
     sys.argv[1:] = [*options, *args.overrides]
     if args.help:
-        _print(help_text(name, schema, args.overrides))
+        print(help_text(name, schema, args.overrides))
         return
     modes = [f"--{mode}" for mode in HYDRA_MODES if getattr(args, mode)]
     if len(modes) > 1:
@@ -117,12 +117,3 @@ def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None
         if metrics is not None:
             write_json(run.folder / "metrics.json", metrics)
     return metrics
-
-
-def _print(text: str) -> None:
-    """Print to standard output; it is no error if a reader such as `head` closes the pipe early."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        # At exit Python flushes standard output again, which would fail on the closed pipe.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

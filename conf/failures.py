@@ -6,7 +6,9 @@ import errno
 import logging
 import os
 import re
+import select
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -36,7 +38,8 @@ WRITE_ERRORS = {
 @contextmanager
 def report_failures(folder: str = ".") -> Iterator[None]:
     """Exit with a message after a UserError, an interruption, a failed write or an import of a
-    package that is not installed.
+    package that is not installed. Exit without one if nobody reads the output any more, as after
+    `| head`.
 
     Any other exception is a bug and keeps its traceback. With several ranks, one rank prints.
 
@@ -46,6 +49,7 @@ def report_failures(folder: str = ".") -> Iterator[None]:
     """
     try:
         yield
+        sys.stdout.flush()
     except UserError as error:
         lines = [f"error: {line}  [{error.code}]" for line in str(error).splitlines()]
         _exit(2 if isinstance(error, SettingsError) else 1, "\n".join(lines))
@@ -60,6 +64,10 @@ def report_failures(folder: str = ".") -> Iterator[None]:
         )
     except KeyboardInterrupt:
         _exit(130, "interrupted; run the same command again to resume")
+    except BrokenPipeError:
+        if not _output_is_closed():
+            raise
+        _end_process(128 + signal.SIGPIPE)
     except OSError as error:
         if errno.errorcode.get(error.errno) not in WRITE_ERRORS:
             raise
@@ -72,6 +80,16 @@ def report_failures(folder: str = ".") -> Iterator[None]:
         if not re.search(FAILED_WRITE, str(error)):
             raise
         _exit_after_failed_write(folder, f"a file was not written ({error})")
+
+
+def _output_is_closed() -> bool:
+    """Return whether the reader of standard output, such as `head`, has ended. If so, discard the
+    rest of the output, which Python would otherwise try to write at its exit."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), select.POLLOUT)
+    if is_closed := any(event & select.POLLERR for _, event in poll.poll(0)):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return is_closed
 
 
 def _exit_after_failed_write(path: str, reason: str) -> NoReturn:
