@@ -21,7 +21,7 @@ from hydra import initialize_config_module
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -156,6 +156,9 @@ def open_hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
             yield GlobalHydra.instance().config_loader()
         except (HydraException, OmegaConfBaseException) as error:
             raise _settings_error(command, error) from error
+        except yaml.YAMLError as error:
+            problem = " ".join(str(error).split())
+            raise SettingsError(f"a file of settings is no valid YAML: {problem}") from error
 
 
 def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.RUN) -> DictConfig:
@@ -168,6 +171,8 @@ def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.R
     hydra = GlobalHydra.instance().hydra
     try:
         return hydra.compose_config(config_name(command), overrides, mode, from_shell=False)
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"a file of settings is no UTF-8 text: {error}") from error
     except ValueError as error:
         parts = {o: o.lstrip("+").partition("=") for o in overrides}
         unnamed = " ".join(
@@ -186,6 +191,11 @@ def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.R
 
 def _settings_error(command: str, error: Exception) -> SettingsError:
     """Return a SettingsError with a one-line message for an error of Hydra or OmegaConf."""
+    if isinstance(error, OverrideParseException):
+        return SettingsError(
+            f"{error.override}: give KEY=VALUE without spaces, and put quotes around a value with "
+            """special characters, as in 'run="a=b"'"""
+        )
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     text = " ".join(str(error).partition("Config search path")[0].split())
     unknown = re.search(r"Key '.*' (?:is )?not in .*\s+full_key: (\S+)", str(cause)) or re.match(
@@ -196,15 +206,31 @@ def _settings_error(command: str, error: Exception) -> SettingsError:
         return SettingsError(preset + _unknown_key(command, unknown[1]), code="unknown-key")
     text = re.sub(r" (full_key:|See https).*", "", text).removeprefix("Error merging override ")
     text = text.replace(" Available options", "; available options")
+    if hint := _type_hint(str(cause)):
+        return SettingsError(f"{text}: {hint}")
     if cause is not error:
         return SettingsError(f"{text}: {str(cause).splitlines()[0]}")
     key = getattr(error, "override", None) or getattr(error, "full_key", None)
     return SettingsError(f"{key}: {text}" if key else text)
 
 
+def _type_hint(message: str) -> str | None:
+    """Return what to give instead of a value whose type OmegaConf refuses with a message."""
+    if "is not a ListConfig, list or tuple" in message:
+        return "give a list, such as [VALUE]"
+    if "is not a subclass of" in message:
+        return "this is a group of settings: set one of them with GROUP.NAME=VALUE"
+    return None
+
+
 def _unknown_key(command: str, key: str) -> str:
     if key in REMOVED_KEYS:
         return f"{key} was removed: {REMOVED_KEYS[key]}"
+    if key.partition(".")[0] == "world":
+        return (
+            f"{command} has no key {key}: give benchmark.{key}, or begin your file in conf/world/ "
+            "with the line # @package benchmark.world"
+        )
     if key.startswith("hydra."):
         return f"Hydra has no key {key}"
     defaults = flatten(OmegaConf.to_container(hydra_compose(config_name(command))))

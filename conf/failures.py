@@ -107,8 +107,16 @@ def _exit(status: int, message: str) -> NoReturn:
         time.sleep(MAIN_RANK_GRACE)
         # The cursor may be at the end of the main rank's progress bar: start a new line.
         print(file=sys.stderr)
+    _close_progress_bars()
     print(message, file=sys.stderr)
     _end_process(status)
+
+
+def _close_progress_bars() -> None:
+    """Print open progress bars for the last time, so that a message begins on a new line."""
+    if "tqdm" in sys.modules:
+        for bar in [*sys.modules["tqdm"].tqdm._instances]:
+            bar.close()
 
 
 def _end_process(status: int) -> NoReturn:

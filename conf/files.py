@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from conf.errors import UserError
+
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file so that a killed process leaves either the complete file or none."""
@@ -38,6 +40,27 @@ def write_json(path: Path, value: Any) -> None:
 def write_json_lines(path: Path, rows: Iterable[dict[str, Any]]) -> None:
     """Write one JSON object per line, atomically."""
     write_text(path, "".join(f"{json.dumps(row)}\n" for row in rows))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file of a run or of a build.
+
+    Raises:
+        UserError: The file is damaged or missing.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(value, dict):
+            return value
+        problem = "it is no JSON object"
+    except FileNotFoundError:
+        problem = "there is no such file"
+    except ValueError as error:
+        problem = str(error)
+    raise UserError(
+        f"{path} cannot be read ({problem}): restore it, or delete {path.parent} and start again",
+        code="damaged-file",
+    )
 
 
 def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from conf.errors import SettingsError, UserError
-from conf.files import write_json, write_text
+from conf.files import read_json, write_json, write_text
 
 log = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ def read_finished_metrics(run: Run) -> dict[str, float] | None:
     if not path.exists():
         return None
     log.info("%s is finished; to train again, delete it or give run=NAME", run.folder)
-    return json.loads(path.read_text())
+    return read_json(path)
 
 
 def open_run(run: Run, settings: dict[str, Any], command: str) -> None:
@@ -149,7 +149,7 @@ def open_run(run: Run, settings: dict[str, Any], command: str) -> None:
     run.folder.mkdir(parents=True, exist_ok=True)
     write_text(run.folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(settings)))
     path = run.folder / "run.json"
-    earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    earlier = read_json(path) if path.exists() else None
     record = {
         "command": command,
         "overrides": list(run.overrides),
@@ -208,13 +208,25 @@ def wait_for_lock(handle: int, busy: str) -> None:
 
 
 def changed_settings(folder: Path, settings: dict[str, Any]) -> list[str]:
-    """Return `compare_settings` of the run in `folder` and `settings`; empty if there is no run."""
+    """Return `compare_settings` of the run in `folder` and `settings`; empty if there is no run.
+
+    Raises:
+        UserError: The settings of the run are damaged.
+    """
     from omegaconf import OmegaConf
+    from yaml import YAMLError
 
     path = folder / "config.yaml"
     if not path.exists():
         return []
-    return compare_settings(OmegaConf.to_container(OmegaConf.load(path)), settings)
+    try:
+        return compare_settings(OmegaConf.to_container(OmegaConf.load(path)), settings)
+    except (YAMLError, ValueError) as error:
+        raise UserError(
+            f"{path} is damaged ({str(error).partition(chr(10))[0]}): restore it, or delete "
+            f"{folder} and start again",
+            code="damaged-file",
+        ) from error
 
 
 def flatten(value: Any, key: str = "") -> dict[str, Any]:
@@ -245,7 +257,7 @@ def compare_settings(before: Any, now: Any) -> list[str]:
 def run_id(run: Run) -> str:
     """Return the unique id of a run, from its folder and the time of its first start; resuming
     keeps it."""
-    record = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))
+    record = read_json(run.folder / "run.json")
     first = [*record["earlier_starts"], record["started"]][0]
     return hashlib.sha256(f"{run.folder.resolve()} {first}".encode()).hexdigest()[:16]
 

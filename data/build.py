@@ -15,7 +15,7 @@ from typing import Any
 
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
-from conf.files import write_bytes
+from conf.files import read_json, write_bytes
 from conf.runs import compare_settings, flatten, wait_for_lock
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.parallel import Workers
@@ -228,7 +228,7 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
             return
         if (partial / PLAN).exists() and any((partial / SCENES_FOLDER).glob("*.npz")):
             # Simulating scenes can take hours, so a changed setting must not discard them silently.
-            check_same_settings(json.loads((partial / PLAN).read_text()), plan, partial)
+            check_same_settings(read_json(partial / PLAN), plan, partial)
         for leftover in partial.rglob(".*.partial"):
             leftover.unlink()
         write_bytes(partial / PLAN, json.dumps(plan).encode())

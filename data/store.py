@@ -241,9 +241,10 @@ def open_store(folder: Path, verify: bool = False) -> Store:
         return UserError(f"{problem}; {advice}", code=code)
 
     if not path.exists():
+        advice = "delete it, or choose another folder" if folder.exists() else "build one"
         raise UserError(
-            f"{folder} is not a benchmark, because {MANIFEST} is missing: choose another folder, "
-            "or build a benchmark with python -m data.build benchmark=NAME store=FOLDER",
+            f"{folder} is not a benchmark, because {MANIFEST} is missing: {advice} (python -m "
+            "data.build benchmark=NAME store=FOLDER)",
             code="missing-file",
         )
     try:

@@ -29,6 +29,10 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     modes = cfg.modes or default_modes
     if folder is not None:
         check_modes(folder, regime, modes)
+    elif student.model is not None and not cfg.server.urls:
+        from models.loading import check_available
+
+        check_available("student", student.model)
 
     from data.build import ensure_benchmark
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,6 +48,17 @@ def check_family(model: str, config: PreTrainedConfig) -> None:
             f"student.model={model} ({kind}): students are vision-language models of Qwen, such as "
             "Qwen3-VL. Measure another model with dynapix.evaluate (docs/evaluation.md)",
             code="unsupported-model",
+        )
+
+
+def check_complete(model: str, missing: Collection[str]) -> None:
+    """Raise UserError if weights of a student's base are missing from its files. transformers would
+    give them random values."""
+    if missing:
+        raise UserError(
+            f"student.model={model} lacks the weights of {len(missing)} parameters, such as "
+            f"{min(missing)}: restore config.json and the *.safetensors files that belong together",
+            code="missing-weights",
         )
 
 

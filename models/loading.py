@@ -30,6 +30,7 @@ from models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
     check_adapters,
+    check_complete,
     check_family,
     check_processor,
 )
@@ -79,9 +80,10 @@ def load_base(
         check_family(cfg.model, config)
         processor = AutoProcessor.from_pretrained(cfg.model, **origin)
         check_processor("student", cfg.model, config, processor)
-        model = AutoModelForImageTextToText.from_pretrained(
-            cfg.model, **weight_options(cfg, precision), **origin
+        model, info = AutoModelForImageTextToText.from_pretrained(
+            cfg.model, **weight_options(cfg, precision), **origin, output_loading_info=True
         )
+        check_complete(cfg.model, info["missing_keys"])
     choose_attention(model, precision, cfg.max_length)
     pin_sizes(processor, cfg.image_size, cfg.frames)
     processor.tokenizer.padding_side = "left"

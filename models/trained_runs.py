@@ -14,6 +14,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from conf.errors import UserError
+from conf.files import read_json
+from conf.runs import TRAINER_FOLDERS
 from conf.schema import BenchmarkConfig
 from models.resolved_settings import read_resolved, with_resolved_commit
 
@@ -103,6 +105,19 @@ def read_trained_settings(
                 f"{key}={folder} is not a run that trained a {product}: give the folder of one",
                 code="missing-run",
             )
+        if (folder / "config.json").exists() and not (folder / EXPORT).exists():
+            raise UserError(
+                f"{key}={folder} is a base, not a run: give {product}.model={folder}",
+                code="missing-run",
+            )
+        record = folder / "run.json"
+        command = read_json(record).get("command", "train.") if record.exists() else "train."
+        if not command.startswith("train."):
+            raise UserError(
+                f"{key}={folder} is a run of {command}: give the folder of a run that trained a "
+                f"{product}",
+                code="missing-run",
+            )
         finished = (folder / "metrics.json").exists() and (folder / product).is_dir()
         if not finished and not (folder / EXPORT).exists():
             raise UserError(
@@ -110,13 +125,20 @@ def read_trained_settings(
                 code="unfinished-run",
             )
         settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), saved))
-    except FileNotFoundError as error:
+        if problems := settings.check():
+            raise ValueError(problems[0])
+    except (FileNotFoundError, NotADirectoryError) as error:
+        if folder.name == product and settings_file(folder.parent).exists():
+            advice = f"give the folder of its run, {key}={folder.parent}"
+        elif (folder / "config.json").exists():
+            advice = f"this is a base, so give {product}.model={folder}"
+        else:
+            advice = f"give the folder of a run, such as checkpoints/{TRAINER_FOLDERS[product]}/RUN"
         raise UserError(
-            f"{key}={folder} is not the folder of a trained {product}: {config} is missing; give "
-            "the folder that the training command printed, below checkpoints/",
+            f"{key}={folder} is not the run of a trained {product} ({config} is missing): {advice}",
             code="missing-run",
         ) from error
-    except (YAMLError, OmegaConfBaseException) as error:
+    except (YAMLError, OmegaConfBaseException, ValueError) as error:
         first = str(error).partition("\n")[0]
         raise UserError(
             f"{config} is damaged or of another version of DynaPix ({first}); train again",
@@ -177,7 +199,7 @@ def _check_base_unseen(base: str | None, tested: BenchmarkConfig) -> None:
             return
         schema = OmegaConf.structured(BenchmarkConfig)
         trained = OmegaConf.to_object(OmegaConf.merge(schema, saved.benchmark))
-    except (YAMLError, OmegaConfBaseException) as error:
+    except (YAMLError, OmegaConfBaseException, ValueError) as error:
         first = str(error).partition("\n")[0]
         raise UserError(
             f"{config} is damaged or of another version of DynaPix ({first}), so that the scenes "

@@ -30,6 +30,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from models.compat import keep_freed_memory
     from models.distributed import is_sharded, main_first, split_batch
     from models.fast_layers import use_fast_layers
+    from models.loading import check_available
     from models.resolved_settings import data_digest, resolve_run
     from models.retriever.embedder import load_retriever, tokenizer_texts
     from train.common.checkpoints import newest_checkpoint
@@ -45,7 +46,10 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
             "sharded checkpoint: replace --use_fsdp by --multi_gpu, which works on CPUs too",
             code="unsupported-with-fsdp",
         )
+    # Check the batch and the base now, because building the benchmark may take long.
     rank_batch = split_batch(cfg.train.batch)
+    if cfg.retriever.model is not None:
+        check_available("retriever", cfg.retriever.model)
 
     # The main rank builds the benchmark if it is missing; then every rank reads it from the disk.
     with main_first():

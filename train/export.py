@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
 from conf.errors import UserError
-from conf.files import write_json
+from conf.files import read_json, write_json
 from conf.runs import lock_folder, resolve_run_name, runs_folder
 from conf.schema import ContrastiveCommand, ExportModelCommand, SftCommand
 
@@ -93,9 +93,12 @@ def find_run(
 
     Raises:
         UserError: The run does not exist, is not finished or trained all weights; its adapters are
-            missing; or its base has changed.
+            missing; its base has changed; or a file is damaged.
     """
+    from safetensors import safe_open
+
     from models.checks import ADAPTER_WEIGHTS
+    from models.loading import explain_damage
     from models.resolved_settings import check_base
     from models.trained_runs import read_trained_settings
 
@@ -110,11 +113,15 @@ def find_run(
             f"to merge: {folder / product} is the model itself",
             code="nothing-to-merge",
         )
-    if not (folder / product / ADAPTER_WEIGHTS).exists():
+    if not (adapters := folder / product / ADAPTER_WEIGHTS).exists():
         raise UserError(
             f"{folder / product} holds no adapters: delete the run and train again",
             code="missing-adapters",
         )
+    with explain_damage(folder), safe_open(adapters, "pt"):
+        pass
+    for record in RECORDS:
+        read_json(folder / record)
     check_base(folder, preset)
     return name, folder, settings
 
@@ -156,7 +163,7 @@ def write_merged(
 @contextmanager
 def renamed_when_complete(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder, and rename it to `folder` at the end of the block. It is deleted
-    after a UserError or Ctrl-C, and emptied first if a killed export left files in it."""
+    after an exception, and emptied first if a killed export left files in it."""
     partial = folder.with_name(f".{folder.name}.partial")
     partial.mkdir(exist_ok=True)
     with lock_folder(partial, f"{folder} is being written by another process"):
@@ -164,7 +171,7 @@ def renamed_when_complete(folder: Path) -> Iterator[Path]:
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         try:
             yield partial
-        except (UserError, KeyboardInterrupt):
+        except BaseException:
             shutil.rmtree(partial)
             raise
         partial.rename(folder)

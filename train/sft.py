@@ -38,8 +38,10 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train.student.trainer_setup import build_trainer
 
     compat.keep_freed_memory()
-    # Check the batch now, because building the benchmark may take long.
+    # Check the batch and the base now, because building the benchmark may take long.
     distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)
+    if cfg.student.model is not None:
+        loading.check_available("student", cfg.student.model)
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.
     with distributed.main_first():

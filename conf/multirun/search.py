@@ -7,7 +7,6 @@ it first completes the recorded trials, and then samples the same trials as an u
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import random
@@ -20,7 +19,7 @@ from hydra.core.override_parser.types import Override, RangeSweep
 
 from conf.compose import compose
 from conf.errors import SettingsError, UserError, import_extra
-from conf.files import write_json
+from conf.files import read_json, write_json
 from conf.gpus import visible_gpus
 from conf.multirun.table import is_lower_better
 from conf.runs import compare_settings, other_settings_error
@@ -65,6 +64,10 @@ class Search:
         """
         swept = {key: o for key, o in overrides.items() if o.is_sweep_override()}
         fixed = [str(o.input_line) for key, o in overrides.items() if key not in swept]
+        for key in ("n_trials", "n_jobs"):
+            value = getattr(self, key)
+            if value is not None and not (isinstance(value, int) and value > 0):
+                raise SettingsError(f"hydra.sweeper.{key}={value}: give 1 or more")
         metric = self.metric or default_metric(command, fixed)
         if metric is None:
             raise SettingsError(
@@ -150,7 +153,7 @@ def _recorded_trials(folder: Path, settings: dict[str, str]) -> list[dict[str, A
     path = folder / STUDY_FILE
     if not path.exists():
         return []
-    record = json.loads(path.read_text(encoding="utf-8"))
+    record = read_json(path)
     if other := compare_settings(record["settings"], settings):
         raise other_settings_error(f"{folder} contains a search", other)
     return record["trials"]

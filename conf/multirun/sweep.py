@@ -83,6 +83,16 @@ class Sweep:
         self.folder = Path(cfg.hydra.sweep.dir)
         self.name = run_name(cfg.run, self.task_overrides)
         self.jobs = self._list_jobs()
+        if "run" in self.overrides and self.overrides["run"].is_sweep_override():
+            raise SettingsError(
+                "run= has several values: the jobs of a sweep are numbered, and run=NAME names the "
+                "sweep; repeat a job with seed=0,1",
+                code="swept-run",
+            )
+        if not self.jobs:
+            raise SettingsError(
+                "the sweep has no jobs: give every swept key at least one value", code="no-jobs"
+            )
         for job in self.jobs:
             compose(command, schema, job)
 

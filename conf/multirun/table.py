@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from conf.files import write_text
+from conf.files import read_json, write_text
 
 JOB_FILE = "job.json"
 AT_START_SUFFIX = "_at_start"
@@ -28,9 +27,9 @@ def read_jobs(folder: Path) -> list[dict[str, Any]]:
 def read_job(folder: Path) -> dict[str, Any]:
     """Return the record of an ended job: its number (`job`), `overrides`, `status` (done or failed)
     and `metrics`, without those that are measured before training."""
-    job = json.loads((folder / JOB_FILE).read_text())
+    job = read_json(folder / JOB_FILE)
     path = folder / "metrics.json"
-    metrics = json.loads(path.read_text()) if job["status"] == "done" and path.exists() else {}
+    metrics = read_json(path) if job["status"] == "done" and path.exists() else {}
     final = {name: value for name, value in metrics.items() if not name.endswith(AT_START_SUFFIX)}
     return {"job": int(folder.name), "metrics": final, **job}
 

@@ -6,6 +6,7 @@ the number of items or queries to make of a cell or builder.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
@@ -143,6 +144,8 @@ class BenchmarkConfig(Settings):
         return self.recipe or own
 
     def find_problems(self, group: str) -> Iterator[str]:
+        if not re.fullmatch(r"\w[\w.-]*", self.name, re.ASCII):
+            yield f"{group}name={self.name}: use letters, digits, '_', '-' and '.' only"
         simulator, recipe = f"{group}simulator={self.simulator}", self.item_recipe
         counterfactual = self.retrieval.counterfactual
         has_counterfactuals = counterfactual.train + counterfactual.test > 0

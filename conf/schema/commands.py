@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from conf.runs import TRAINER_FOLDERS, is_inside, runs_folder
 from conf.schema.benchmark import BenchmarkConfig
@@ -37,6 +38,21 @@ class CommandConfig(Settings):
     """Folder of the runs."""
     workers: int = setting(2, least=1)
     """Worker processes for simulation and rendering."""
+
+    def check(self, group: str = "") -> list[str]:
+        folders = {"store": self.store, "checkpoints": self.checkpoints}
+        empty = [f"{key}= is empty: name a folder" for key, folder in folders.items() if not folder]
+        return [*empty, *self.find_run_problems(), *super().check(group)]
+
+    def find_run_problems(self) -> list[str]:
+        """Return a message if `run` does not name a folder below that of the command's runs."""
+        if self.run is None:
+            return []
+        if self.run.startswith(f"{self.checkpoints.rstrip('/')}/"):
+            return [f"run={self.run} is a path: give the name only, run={Path(self.run).name}"]
+        if {"", ".", ".."} & {*self.run.split("/")}:
+            return [f"run={self.run}: give a name, such as run=first"]
+        return []
 
 
 @dataclass
@@ -267,7 +283,7 @@ class ExportModelCommand(CommandConfig):
     """Compare the outputs of the merged model with those of the trained model on held-out items of
     the run's benchmark. false skips the comparison and needs no benchmark."""
 
-    def find_problems(self, group: str) -> list[str]:
+    def find_run_problems(self) -> list[str]:
         for other in TRAINER_FOLDERS:
             if other != self.product and is_inside(self.run, runs_folder(self.checkpoints, other)):
                 return [f"run={self.run} trained a {other}: give product={other}"]

@@ -194,7 +194,7 @@ class ExportStudyCommand(CommandConfig):
     seed: int = setting(0, least=0)
     """Seed of the bootstrap over scenes."""
 
-    def find_problems(self, group: str) -> list[str]:
+    def find_run_problems(self) -> list[str]:
         return check_run(self.run, f"{self.checkpoints}/study")
 
 

@@ -48,7 +48,7 @@ class ArchitectureConfig(Settings):
 class LoraConfig(Settings):
     rank: int = setting(16, least=0)
     """Rank of the adapters; 0 adds no adapters and trains the whole model."""
-    alpha: int = 32
+    alpha: int = setting(32, least=1)
     """Numerator of the adapters' scale: their output is multiplied by alpha / rank."""
     dropout: float = setting(0.0, least=0, below=1)
     """Dropout probability of the adapters' inputs."""

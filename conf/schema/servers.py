@@ -180,7 +180,7 @@ class TeacherConfig(ServersConfig):
     """Sampling temperature of the server's responses."""
     top_p: float = setting(0.8, above=0, most=1)
     """Sample from the smallest set of most likely tokens whose total probability reaches this."""
-    top_k: int = 20
+    top_k: int = setting(20, least=-1)
     """Sample from this number of most likely tokens."""
     max_tokens: int = setting(640, least=1)
     """Maximum length of a response (tokens)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field, fields
+from math import isfinite
 from typing import Any, get_args, get_origin, get_type_hints
 from urllib.parse import urlsplit
 
@@ -83,6 +84,9 @@ def _check_value(
 ) -> list[str]:
     if options and value not in options:
         return [f"{key}={value}: the options are {', '.join(o or 'null' for o in options)}"]
+    numbers = value if isinstance(value, list) else [value]
+    if any(isinstance(number, float) and not isfinite(number) for number in numbers):
+        return [f"{key}={value}: give finite numbers"]
     if value is None or all(BOUNDS[name][0](value, bound) for name, bound in bounds.items()):
         return []
     wanted = " and ".join(BOUNDS[name][1].format(bound) for name, bound in bounds.items())

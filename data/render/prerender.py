@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from conf.files import write_bytes
+from conf.files import read_json, write_bytes
 from data.parallel import Workers
 from data.records import POOLS, original_scene_id, sample_prefix_frames
 from data.render.frame_cache import frames_path, load_frames, render_frames, save_frames
@@ -35,7 +35,7 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
     """
     options = {"frames": which, "frames_gb": limit_gb, "renderer": store.manifest["renderer"]}
     path = store.folder / FRAMES_FOLDER / FRAMES_RECORD
-    if path.exists() and options.items() <= json.loads(path.read_text()).items():
+    if path.exists() and options.items() <= read_json(path).items():
         return
     config = store.manifest["config"]
     jobs = {

@@ -185,7 +185,8 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
             continue
         if server.model not in models:
             raise UserError(
-                f"{url} does not serve server.model={server.model}; it serves {', '.join(models)}",
+                f"{url} does not serve server.model={server.model}: give one of the models that it "
+                f"serves ({', '.join(models) or 'none'})",
                 code="unknown-model",
             )
         served = models[server.model]
@@ -193,8 +194,8 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
         origins[url] = {"root": served.get("root"), "parent": parent}
     if not origins:
         raise UserError(
-            f"no server of server.url responds ({'; '.join(problems)}): start one, such as with "
-            "python -m teacher.serve frames=true, and run this again",
+            f"no server of server.url lists its models ({'; '.join(problems)}): check that the URL "
+            "ends with /v1, or start a server with python -m teacher.serve frames=true",
             code="no-server",
         )
     first, origin = next(iter(origins.items()))

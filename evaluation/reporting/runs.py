@@ -71,6 +71,8 @@ def gather_runs(
         UserError: No evaluation is among the runs, a pattern matches no finished run, or a run that
             a pattern names cannot be read.
     """
+    if saved.exists() and not saved.is_dir():
+        raise UserError(f"saved={saved} is no folder: give that of saved results", "missing-run")
     # The runs of a sweep are one folder deeper.
     depths = ("*/metrics.json", "*/*/metrics.json")
     files = [f for kind in KINDS for depth in depths for f in sorted(root.glob(f"{kind}/{depth}"))]

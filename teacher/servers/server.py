@@ -31,8 +31,19 @@ API_KEY_VARIABLE = "OPENAI_API_KEY"
 
 
 def get_api_key() -> str:
-    """Return the API key of the environment, or a placeholder: the openai client requires a key."""
-    return os.environ.get(API_KEY_VARIABLE) or "none"
+    """Return the API key of the environment, or a placeholder: the openai client requires a key.
+
+    Raises:
+        UserError: The key has characters that no HTTP header can have.
+    """
+    key = os.environ.get(API_KEY_VARIABLE, "").strip()
+    if not key.isascii() or not key.isprintable():
+        raise UserError(
+            f"the environment variable {API_KEY_VARIABLE} has characters that no API key has, such "
+            "as a line break: set it again",
+            code="invalid-api-key",
+        )
+    return key or "none"
 
 
 def authentication_error(url: str, error: openai.APIStatusError) -> UserError:

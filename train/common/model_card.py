@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
 import yaml
 from huggingface_hub import ModelCard, ModelCardData
 
+from conf.files import read_json
 from conf.multirun.table import AT_START_SUFFIX
 from conf.schema import ContrastiveCommand, SftCommand
 from models.fingerprints import is_hub_model
@@ -38,7 +38,7 @@ def build_model_card(
     preset, train = getattr(settings, product), settings.train
     narrated = student and train.regime != "answer_only"
     on_hub = is_hub_model(preset.model)
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = read_json(folder / "metrics.json")
     merged_library = "transformers" if student else "sentence-transformers"
     return ModelCard.from_template(
         ModelCardData(
@@ -57,7 +57,7 @@ def build_model_card(
         benchmark=settings.benchmark,
         seed=settings.seed,
         teacher=settings.teacher if narrated else None,
-        record=json.loads((folder / "run.json").read_text()),
+        record=read_json(folder / "run.json"),
         settings=yaml.safe_dump({product: asdict(preset), "train": asdict(train)}, sort_keys=False),
         items="items" if student else "queries",
         best_step=metrics.get(BEST_STEP),
