@@ -65,17 +65,22 @@ def rank() -> int:
 
     Rank 0 is the main rank, which prepares, logs and writes for all ranks.
     """
-    return int(os.environ["RANK"]) if "LOCAL_RANK" in os.environ else 0
+    return int(os.environ["RANK"]) if _has_launcher() else 0
 
 
 def world_size() -> int:
     """Return the number of ranks that a launcher started; 1 without a launcher."""
-    return int(os.environ["WORLD_SIZE"]) if "LOCAL_RANK" in os.environ else 1
+    return int(os.environ["WORLD_SIZE"]) if _has_launcher() else 1
 
 
 def local_world_size() -> int:
     """Return the number of ranks on this machine; 1 without a launcher."""
-    return int(os.environ.get("LOCAL_WORLD_SIZE", 1)) if "LOCAL_RANK" in os.environ else 1
+    return int(os.environ.get("LOCAL_WORLD_SIZE", 1)) if _has_launcher() else 1
+
+
+def _has_launcher() -> bool:
+    names = ("LOCAL_RANK", "RANK", "WORLD_SIZE")
+    return all(os.environ.get(name, "").isdecimal() for name in names)
 
 
 def run_name(run: str | None, overrides: Sequence[str]) -> str:

@@ -25,6 +25,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from benchmarks.arguments import positive_int
 from benchmarks.experiments.experiment import compose_benchmark, open_benchmark
 from conf.failures import report_failures
 from conf.schema import SftCommand, TeacherConfig
@@ -60,8 +61,8 @@ def main() -> None:
     parser.add_argument("student", type=Path, help="folder of a run of train.sft")
     parser.add_argument("--benchmark", default="tiny")
     parser.add_argument("--store", type=Path, default=Path("store"))
-    parser.add_argument("--items", type=int, default=300, help="number of test items")
-    parser.add_argument("--batch", type=int, default=32)
+    parser.add_argument("--items", type=positive_int, default=300, help="number of test items")
+    parser.add_argument("--batch", type=positive_int, default=32)
     args = parser.parse_args()
     trained = read_trained_settings(args.student, SftCommand, "student")
     check_base(args.student, trained.student)

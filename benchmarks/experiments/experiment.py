@@ -19,6 +19,7 @@ from typing import Any
 
 import pandas as pd
 
+from benchmarks.arguments import positive_int
 from conf.compose import compose
 from conf.files import write_bytes
 from conf.schema import BenchmarkConfig, SelectCommand
@@ -49,7 +50,7 @@ def create_parser(description: str, benchmark: str, record: Path) -> argparse.Ar
         "--checkpoints", type=Path, default=Path("checkpoints"), help="folder of runs"
     )
     parser.add_argument("--record", type=Path, default=record, help="file of recorded results")
-    parser.add_argument("--seeds", type=int, default=3, help="number of seeds per variant")
+    parser.add_argument("--seeds", type=positive_int, default=3, help="number of seeds per variant")
     parser.add_argument("--table", action="store_true", help="only print the recorded results")
     return parser
 

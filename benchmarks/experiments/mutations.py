@@ -26,6 +26,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from benchmarks.arguments import positive_int
 from conf.failures import report_failures
 from conf.schema import RelationBounds
 from data.records import COLORS, LETTERS
@@ -56,7 +57,7 @@ def main() -> None:
     parser.add_argument(
         "--predicates", choices=("paper", "relational"), default="paper", help="of the narrator"
     )
-    parser.add_argument("--limit", type=int, help="maximum number of rationales")
+    parser.add_argument("--limit", type=positive_int, help="maximum number of rationales")
     args = parser.parse_args()
     results: dict[str, list[bool]] = defaultdict(list)
     misses: dict[str, list[str]] = defaultdict(list)

@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.arguments import positive_int
 from benchmarks.experiments.experiment import open_benchmark, print_header, print_row
 from conf.failures import report_failures
 from conf.schema import RelationBounds
@@ -66,7 +67,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--benchmark", default="tiny")
     parser.add_argument("--store", type=Path, default=Path("store"))
-    parser.add_argument("--samples", type=int, default=3, help="samples of the errors per item")
+    parser.add_argument(
+        "--samples", type=positive_int, default=3, help="samples of the errors per item"
+    )
     args = parser.parse_args()
     cases = list(read_cases(open_benchmark(args.store, args.benchmark)))
     print(f"{len(cases)} test items, {args.samples} samples of the errors of each")

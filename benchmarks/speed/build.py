@@ -24,6 +24,7 @@ from unittest.mock import patch
 import pandas as pd
 import psutil
 
+from benchmarks.arguments import positive_int
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
@@ -104,9 +105,9 @@ def measure(scenes: int, folder: Path, workers: int) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("scenes", type=int, nargs="+")
+    parser.add_argument("scenes", type=positive_int, nargs="+")
     parser.add_argument("--folder", type=Path, default=Path("store/growth"))
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--workers", type=positive_int, default=2)
     options = parser.parse_args()
     logging.basicConfig(level=logging.WARNING)
     rows = [measure(scenes, options.folder, options.workers) for scenes in options.scenes]

@@ -31,8 +31,9 @@ from transformers import (
     TrainerCallback,
 )
 
+from benchmarks.arguments import positive_int
 from benchmarks.speed import hours
-from conf.errors import UserError
+from conf.errors import SettingsError, UserError
 from conf.runs import Run
 from conf.schema import TrainConfig
 from models.tiny_qwen3_vl import SPECIAL_TOKENS, build_processor
@@ -112,8 +113,10 @@ def add_arguments(parser: argparse.ArgumentParser, steps: int, variants: Sequenc
     parser.add_argument("preset", nargs="?", default="tiny", help="tiny or a released preset")
     parser.add_argument("--quantization", choices=["nf4", "none"], default="nf4")
     parser.add_argument("--precision", default="auto", help="bf16, fp32 or auto")
-    parser.add_argument("--steps", type=int, default=steps, help="steps to time, after the first")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument(
+        "--steps", type=positive_int, default=steps, help="steps to time, after the first"
+    )
+    parser.add_argument("--rounds", type=positive_int, default=3)
     parser.add_argument("--store", default="store", help="folder of the built benchmarks")
     parser.add_argument("--only", nargs="*", choices=list(variants), help="variants to measure")
 
@@ -145,6 +148,8 @@ def compare(
             found = measure(name)
         except torch.OutOfMemoryError:
             failures[name] = "out of memory"
+        except SettingsError:
+            raise
         except UserError as error:
             failures[name] = str(error)
         else:

@@ -32,6 +32,7 @@ from sentence_transformers.sentence_transformer.losses import (
 )
 from transformers import Trainer, set_seed
 
+from benchmarks.arguments import positive_int
 from benchmarks.speed import comparison
 from benchmarks.speed.comparison import OURS, SEED, Measurements, timing_arguments
 from conf.compose import compose
@@ -81,7 +82,9 @@ VARIANTS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--batch", type=int, nargs="+", default=[128], help="queries per step")
+    parser.add_argument(
+        "--batch", type=positive_int, nargs="+", default=[128], help="queries per step"
+    )
     parser.add_argument("--benchmark", default="small")
     comparison.add_arguments(parser, steps=3, variants=VARIANTS)
     args = parser.parse_args()

@@ -27,6 +27,7 @@ from unittest.mock import patch
 from torch import nn
 from transformers import set_seed
 
+from benchmarks.arguments import positive_int
 from benchmarks.speed import comparison
 from benchmarks.speed.comparison import SEED, Measurements
 from benchmarks.speed.sft import VARIANTS as SFT_VARIANTS
@@ -51,7 +52,9 @@ SFT, DISTILL, SAMPLING = "train.sft", "train.distill", "sampling"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--tokens", type=int, default=200, help="maximum length of a response")
+    parser.add_argument(
+        "--tokens", type=positive_int, default=200, help="maximum length of a response"
+    )
     comparison.add_arguments(parser, steps=3, variants=[SFT, DISTILL, SAMPLING])
     args = parser.parse_args()
     overrides = [*list_overrides(args), f"student.max_new_tokens={args.tokens}"]

@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.arguments import positive_int
 from conf.failures import report_failures
 from data.records import FRAMES as SCENE
 from evaluation.embedders.cache import EmbeddingCache
@@ -46,11 +47,11 @@ def main() -> None:
         ("large", 256, 1_000_000, measure_large),
     ):
         command = commands.add_parser(name)
-        command.add_argument("--queries", type=int, default=queries)
-        command.add_argument("--frames", type=int, default=frames)
+        command.add_argument("--queries", type=positive_int, default=queries)
+        command.add_argument("--frames", type=positive_int, default=frames)
         command.set_defaults(measure=measure)
         if measure is measure_ranks:
-            command.add_argument("--rounds", type=int, default=3)
+            command.add_argument("--rounds", type=positive_int, default=3)
         else:
             command.add_argument("--folder", help="where to write the cache files, by default /tmp")
     args = parser.parse_args()

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
+from benchmarks.arguments import positive_int
 from conf.compose import compose, list_presets
 from conf.failures import report_failures
 from conf.schema import BuildCommand, WorldConfig
@@ -80,8 +81,8 @@ def draw_sheet(path: Path, seed: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--scenes", type=positive_int, default=20)
+    parser.add_argument("--repeats", type=positive_int, default=3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--sheet", type=Path)
     args = parser.parse_args()

@@ -165,6 +165,13 @@ def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: 
         scene = reader.read_scene(path, source, split, **rate)
     except RecordError as error:
         outcome = {"problem": str(error)}
+    except PermissionError as error:
+        # It is no fault of the record, which must not be left out without notice.
+        raise UserError(
+            f"{error.filename or path} cannot be read (permission denied): let this user read the "
+            "release",
+            code="unreadable-file",
+        ) from error
     except (OSError, UnicodeDecodeError) as error:
         outcome = {"problem": f"{getattr(error, 'filename', None) or path}: {error}"}
     else:

@@ -72,6 +72,18 @@ def test_removed_key_names_its_replacement(monkeypatch):
         ("benchmark.height=129", "invalid-setting", "benchmark.height=129"),
         ("train.keep_checkpoints=0", "invalid-setting", "train.keep_checkpoints=0"),
         ("train.max_steps=0", "invalid-setting", "train.max_steps=0"),
+        ("train.lr=inf", "invalid-setting", "train.lr=inf"),
+        ("train.epochs=nan", "invalid-setting", "train.epochs=nan"),
+        ("benchmark.world.camera.position=[nan,0,2]", "invalid-setting", "camera.position"),
+        ("train.report_to=wandb", "invalid-setting", ("train.report_to=wandb", "[VALUE]")),
+        ("run=a=b", "invalid-setting", ("run=a=b", "quotes")),
+        ("checkpoints=", "invalid-setting", "checkpoints= is empty"),
+        ("run=", "invalid-setting", "run="),
+        ("run=../../elsewhere", "invalid-setting", "run=../../elsewhere"),
+        ("run=/elsewhere", "invalid-setting", "run=/elsewhere"),
+        ("run=checkpoints/sft/first", "invalid-setting", "run=first"),
+        ("benchmark.name=../elsewhere", "invalid-setting", "benchmark.name=../elsewhere"),
+        ("world.camera.fov=3", "unknown-key", "@package benchmark.world"),
     ],
 )
 def test_invalid_value_is_named(override, code, contains):

@@ -5,7 +5,7 @@ from itertools import permutations
 
 import pytest
 
-from conf.runs import Run, is_inside, open_run, run_name
+from conf.runs import Run, is_inside, open_run, rank, run_name, world_size
 from tests.user_errors import raises_user_error
 
 SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "workers": 2, "x": 1.0}
@@ -57,6 +57,23 @@ def test_other_settings_are_refused_with_both_values(tmp_path):
     (run.folder / "metrics.jsonl").touch()
     with raises_user_error("other-settings", contains="train.lr was 1.0 and is now 2.0"):
         open_run(run, SETTINGS | {"train": {"lr": 2.0}}, "train.sft")
+
+
+@pytest.mark.parametrize("name", ["run.json", "config.yaml"])
+def test_damaged_records_are_named(tmp_path, name):
+    run = Run("r", tmp_path / "r")
+    open_run(run, SETTINGS, "train.sft")
+    (run.folder / name).write_text("[")
+    with raises_user_error("damaged-file", contains=(name, f"delete {run.folder}")):
+        open_run(run, SETTINGS, "train.sft")
+
+
+def test_ranks_need_a_launcher(monkeypatch):
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    assert (rank(), world_size()) == (0, 1)
+    monkeypatch.setenv("RANK", "3")
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    assert (rank(), world_size()) == (3, 4)
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,14 @@ TWO_GPUS = {**os.environ, "CUDA_VISIBLE_DEVICES": "0,1"}
 
 
 @pytest.mark.parametrize(
+    ("override", "code"), [("run=a,b", "swept-run"), ("train.lr=range(1,1)", "no-jobs")]
+)
+def test_a_sweep_without_numbered_jobs_is_refused(override, code) -> None:
+    with raises_user_error(code):
+        Sweep("train.sft", SftCommand, [override])
+
+
+@pytest.mark.parametrize(
     ("command", "fixed", "metric"),
     [
         ("train.sft", ["+exp=cot"], "reasoning_generated_accuracy"),

@@ -12,6 +12,7 @@ import pytest
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import ensure_benchmark, ensure_items
 from data.parallel import Workers
+from data.releases.readers import READERS
 from data.render.frame_cache import FrameReader
 from data.world.scenes import read_release
 from tests.data.releases.clevrer_files import clevrer_annotation, write_clevrer_scene
@@ -87,6 +88,17 @@ def test_a_mended_record_is_read_by_the_next_build(movi, tmp_path) -> None:
     scenes, counts = read_release(config(release), tmp_path / "store", Workers(1), False)
     assert counts == {"bad records left out": 0}
     assert len(scenes["test"]) == 12
+
+
+def test_a_record_that_may_not_be_read_stops_the_build(movi, tmp_path, monkeypatch) -> None:
+    """Otherwise the benchmark would be smaller without notice."""
+
+    def refuse(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(READERS["movi_a"], "read_scene", refuse)
+    with raises_user_error("unreadable-file", contains="0000"):
+        read_release(config(movi), tmp_path / "store", Workers(1), False)
 
 
 def test_a_release_without_a_valid_record_names_their_number(movi, tmp_path) -> None:

@@ -230,7 +230,10 @@ def test_requests_carry_the_api_key(items, frames, start_server, tmp_path, monke
     ):
         with raises_user_error("invalid-api-key", contains=(server.url, "OPENAI_API_KEY")):
             request()
-    monkeypatch.setenv("OPENAI_API_KEY", "secret")
+    monkeypatch.setenv("OPENAI_API_KEY", "sec\rret")
+    with raises_user_error("invalid-api-key", contains="OPENAI_API_KEY"):
+        served_origin(config_of(server))
+    monkeypatch.setenv("OPENAI_API_KEY", "secret\n")
     assert served_origin(config_of(server))["root"] == "weights"
     answers = collect_responses(items, "record", responder(config_of(server), frames), log)
     assert [a.letter for a in answers] == ["C"] * 8
