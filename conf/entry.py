@@ -19,6 +19,7 @@ except ModuleNotFoundError as error:
     ) from None
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from conf.compose import allow_new_key, check_run_settings, config_name, register, validate_settings
@@ -93,7 +94,12 @@ def _start(name: str, schema: type, main: Main) -> None:
     task.__module__ = name
     # Without this variable Hydra catches exceptions and prints its own shortened traceback.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name(name))(task)()
+    start = hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name(name))
+    try:
+        start(task)()
+    except HydraException as error:
+        # The settings have been checked, so an option such as --config-dir is wrong.
+        raise SettingsError(str(error).strip().partition("\n")[0]) from error
 
 
 def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None:

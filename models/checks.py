@@ -76,6 +76,12 @@ def check_processor(
             "that belong to the weights",
             code="other-processor",
         )
+    if group == "student" and not processor.chat_template:
+        raise UserError(
+            f"student.model={model} has no chat template: restore chat_template.jinja, or give a "
+            "model that is trained to follow instructions",
+            code="no-chat-template",
+        )
 
 
 def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
+from safetensors.torch import load_file, save_file
 from transformers import (
     AutoProcessor,
     CLIPImageProcessor,
@@ -184,6 +185,26 @@ def test_a_processor_of_another_model_is_refused(
         loading.load_student(with_model(nf4_cfg, base), "fp32", list)
     with pytest.raises(UserError):
         embedder.load_retriever(retriever_over(base), "fp32", [], tmp_path)
+
+
+def test_a_base_without_a_chat_template_is_refused(nf4_cfg, saved_base, tmp_path) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(saved_base, base)
+    (base / "chat_template.jinja").unlink()
+    with raises_user_error("no-chat-template", contains="chat_template.jinja"):
+        loading.load_student(with_model(nf4_cfg, base), "fp32", list)
+
+
+def test_a_base_that_lacks_weights_is_refused(nf4_cfg, saved_base, tmp_path) -> None:
+    """transformers would give the missing weights random values."""
+    base = tmp_path / "base"
+    shutil.copytree(saved_base, base)
+    weights = load_file(base / "model.safetensors")
+    name = next(key for key in weights if "q_proj" in key)
+    kept = {key: value for key, value in weights.items() if key != name}
+    save_file(kept, base / "model.safetensors", {"format": "pt"})
+    with raises_user_error("missing-weights", contains=name.rpartition("layers")[2]):
+        loading.load_student(with_model(nf4_cfg, base), "fp32", list)
 
 
 def test_rationales_of_another_benchmark_are_refused(settings, micro_store, tmp_path) -> None:
