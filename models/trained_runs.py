@@ -125,8 +125,6 @@ def read_trained_settings(
                 code="unfinished-run",
             )
         settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), saved))
-        if problems := settings.check():
-            raise ValueError(problems[0])
     except (FileNotFoundError, NotADirectoryError) as error:
         if folder.name == product and settings_file(folder.parent).exists():
             advice = f"give the folder of its run, {key}={folder.parent}"
