@@ -37,7 +37,8 @@ TRAINING = (
     "train.hard_negatives", "train.precision", "train.evaluations", "train.generated_items",
     "train.best_metric", "train.report_to",
 )  # fmt: skip
-"""Such keys of the commands that train. Other commands have them too, but use few of them."""
+"""Further such keys, which are listed for the commands that train. Other commands use few of
+them."""
 
 
 def help_text(command: str, schema: type, overrides: list[str]) -> str:

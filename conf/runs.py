@@ -227,9 +227,9 @@ def changed_settings(folder: Path, settings: dict[str, Any]) -> list[str]:
     try:
         return compare_settings(OmegaConf.to_container(OmegaConf.load(path)), settings)
     except (YAMLError, ValueError) as error:
+        first = str(error).partition("\n")[0]
         raise UserError(
-            f"{path} is damaged ({str(error).partition(chr(10))[0]}): restore it, or delete "
-            f"{folder} and start again",
+            f"{path} is damaged ({first}): restore it, or delete {folder} and start again",
             code="damaged-file",
         ) from error
 

@@ -25,6 +25,8 @@ from data.records import (
 )
 from data.render.frame_cache import FrameReader
 from data.store import MANIFEST, Store, open_store
+from models.student.chat_requests import image_part
+from models.student.prompts import MODES, choose_instruction
 from teacher.journal import read_accepted
 
 Record = TypeVar("Record")
@@ -211,9 +213,6 @@ class Item(PrefixQuestion):
         Args:
             mode: `reasoning` asks for a rationale and the letter, `answer` for the letter alone.
         """
-        from models.student.chat_requests import image_part
-        from models.student.prompts import MODES, choose_instruction
-
         if mode not in MODES:
             raise UserError(f"mode={mode!r}: choose {' or '.join(MODES)}", code="unknown-option")
         parts: list[dict[str, Any]] = []

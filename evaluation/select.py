@@ -30,7 +30,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     if folder is not None:
         check_modes(folder, regime, modes)
     elif student.model is not None and not cfg.server.urls:
-        from models.loading import check_available
+        from models.checks import check_available
 
         check_available("student", student.model)
 

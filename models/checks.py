@@ -12,6 +12,7 @@ from safetensors import safe_open
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
+from models.fingerprints import find_commit
 
 if TYPE_CHECKING:
     from torch import nn
@@ -201,3 +202,29 @@ def check_widths(cfg: RetrieverConfig, entries: int) -> None:
             f"have {entries} entries: set retriever.widths=[{fitting}]",
             code="too-wide",
         )
+
+
+def check_available(group: str, model: str, key: str = "model") -> None:
+    """Raise UserError if a base is neither a local folder nor in the hub's cache and cannot be
+    downloaded. The message names the setting GROUP.KEY."""
+    try:
+        if not Path(model).is_dir():
+            find_commit(model)
+    except Exception as error:
+        # The hub's client raises the errors of whichever HTTP library is installed.
+        name = f"{group}.{key}"
+        if Path(model).is_absolute() or model.startswith("."):
+            message = f"{name}={model}: this folder does not exist"
+        else:
+            message = (
+                f"{name}={model} is neither a local folder nor in the hub's cache, and cannot be "
+                f"downloaded ({first_line(error)}). Give a local copy with {name}=FOLDER "
+                "(config.json, *.safetensors, tokenizer and processor files), or download it on a "
+                f"machine with network access: hf download {model}"
+            )
+        raise UserError(message, code="missing-model") from error
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of an error's message, or the name of its class."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)

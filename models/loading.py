@@ -30,12 +30,13 @@ from models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
     check_adapters,
+    check_available,
     check_complete,
     check_family,
     check_processor,
+    first_line,
 )
 from models.compat import keep_differentiable
-from models.fingerprints import find_commit
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
@@ -358,31 +359,10 @@ def explain_unloadable(group: str, model: str, key: str = "model") -> Iterator[N
     except LOAD_ERRORS as error:
         where = "that folder" if Path(model).is_dir() else "the hub or its cache"
         raise UserError(
-            f"{group}.{key}={model} cannot be loaded from {where}: {_first_line(error)}; "
+            f"{group}.{key}={model} cannot be loaded from {where}: {first_line(error)}; "
             "restore its files, or give another model",
             code="unloadable-model",
         ) from error
-
-
-def check_available(group: str, model: str, key: str = "model") -> None:
-    """Raise UserError if a base is neither a local folder nor in the hub's cache and cannot be
-    downloaded. The message names the setting GROUP.KEY."""
-    try:
-        if not Path(model).is_dir():
-            find_commit(model)
-    except Exception as error:
-        # The hub's client raises the errors of whichever HTTP library is installed.
-        name = f"{group}.{key}"
-        if Path(model).is_absolute() or model.startswith("."):
-            message = f"{name}={model}: this folder does not exist"
-        else:
-            message = (
-                f"{name}={model} is neither a local folder nor in the hub's cache, and cannot be "
-                f"downloaded ({_first_line(error)}). Give a local copy with {name}=FOLDER "
-                "(config.json, *.safetensors, tokenizer and processor files), or download it on a "
-                f"machine with network access: hf download {model}"
-            )
-        raise UserError(message, code="missing-model") from error
 
 
 @contextmanager
@@ -393,11 +373,7 @@ def explain_damage(folder: Path) -> Iterator[None]:
     except LOAD_ERRORS as error:
         exported = (folder / EXPORT).exists()
         raise UserError(
-            f"{folder} is damaged and cannot be read ({_first_line(error)}): "
+            f"{folder} is damaged and cannot be read ({first_line(error)}): "
             f"{'delete it and export' if exported else 'delete the run and train'} again",
             code="damaged-file",
         ) from error
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)

@@ -92,30 +92,13 @@ def read_trained_settings(
         UserError: `folder` is not the folder of a run or an export of this product, the run is not
             finished, or its settings are damaged.
     """
+    _check_run_folder(folder, product, key)
     config = settings_file(folder)
     try:
         saved = OmegaConf.load(config)
-        if (folder / product / EXPORT).exists():
-            raise UserError(
-                f"{key}={folder} contains an export: give {key}={folder / product}",
-                code="missing-run",
-            )
         if not OmegaConf.is_dict(saved) or product not in saved:
             raise UserError(
                 f"{key}={folder} is not a run that trained a {product}: give the folder of one",
-                code="missing-run",
-            )
-        if (folder / "config.json").exists() and not (folder / EXPORT).exists():
-            raise UserError(
-                f"{key}={folder} is a base, not a run: give {product}.model={folder}",
-                code="missing-run",
-            )
-        record = folder / "run.json"
-        command = read_json(record).get("command", "train.") if record.exists() else "train."
-        if not command.startswith("train."):
-            raise UserError(
-                f"{key}={folder} is a run of {command}: give the folder of a run that trained a "
-                f"{product}",
                 code="missing-run",
             )
         finished = (folder / "metrics.json").exists() and (folder / product).is_dir()
@@ -125,17 +108,6 @@ def read_trained_settings(
                 code="unfinished-run",
             )
         settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), saved))
-    except (FileNotFoundError, NotADirectoryError) as error:
-        if folder.name == product and settings_file(folder.parent).exists():
-            advice = f"give the folder of its run, {key}={folder.parent}"
-        elif (folder / "config.json").exists():
-            advice = f"this is a base, so give {product}.model={folder}"
-        else:
-            advice = f"give the folder of a run, such as checkpoints/{TRAINER_FOLDERS[product]}/RUN"
-        raise UserError(
-            f"{key}={folder} is not the run of a trained {product} ({config} is missing): {advice}",
-            code="missing-run",
-        ) from error
     except (YAMLError, OmegaConfBaseException, ValueError) as error:
         first = str(error).partition("\n")[0]
         raise UserError(
@@ -145,6 +117,31 @@ def read_trained_settings(
     setattr(settings, product, with_resolved_commit(folder, getattr(settings, product)))
     settings.train.precision = read_resolved(folder).get("precision", settings.train.precision)
     return settings
+
+
+def _check_run_folder(folder: Path, product: str, key: str) -> None:
+    """Raise UserError, and name the folder to give instead, if a folder is evidently not that of a
+    training run or of an export."""
+    if (folder / EXPORT).exists():
+        return
+    record = folder / "run.json"
+    command = read_json(record).get("command", "train.") if record.exists() else "train."
+    if (folder / product / EXPORT).exists():
+        problem = f"contains an export: give {key}={folder / product}"
+    elif folder.name == product and settings_file(folder.parent).exists():
+        problem = f"is the {product} of a run: give {key}={folder.parent}"
+    elif (folder / "config.json").exists():
+        problem = f"is a base: give {product}.model={folder}"
+    elif not command.startswith("train."):
+        problem = f"is a run of {command}: give the folder of a run that trained a {product}"
+    elif not settings_file(folder).exists():
+        problem = (
+            "is no run, because config.yaml is missing: give the folder of a run, such as "
+            f"checkpoints/{TRAINER_FOLDERS[product]}/RUN"
+        )
+    else:
+        return
+    raise UserError(f"{key}={folder} {problem}", code="missing-run")
 
 
 def resolve_model(

@@ -27,7 +27,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
 
     from data.build import ensure_benchmark
     from models import compat, distributed, loading
-    from models.checks import check_adapters
+    from models.checks import check_adapters, check_available
     from models.fast_layers import use_fast_layers
     from models.resolved_settings import data_digest, resolve_run
     from teacher.narrate import ensure_rationales
@@ -41,7 +41,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     # Check the batch and the base now, because building the benchmark may take long.
     distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)
     if cfg.student.model is not None:
-        loading.check_available("student", cfg.student.model)
+        check_available("student", cfg.student.model)
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.
     with distributed.main_first():
