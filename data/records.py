@@ -311,7 +311,7 @@ class Rationale(Record):
     measured (see `teacher.sufficiency`)."""
     undecided: bool = False
     """Whether there is a distractor of which all statements about the target's frame are true
-    (`teacher.deciding`)."""
+    (`teacher.statement_choice`)."""
 
     @classmethod
     def from_row(cls, row: dict[str, Any]) -> Self:

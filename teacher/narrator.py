@@ -10,8 +10,8 @@ from typing import Any
 
 from conf.schema.servers import NARRATOR_WORDS
 from data.records import SelectionItem
-from teacher.deciding import Decision, choose_statements
 from teacher.predicates.facts import Predicates, RelationalPredicates
+from teacher.statement_choice import Decision, choose_statements
 from teacher.writers.paper import Detail, Writer, join_sentences
 from teacher.writers.relational import RelationalWriter
 

@@ -14,11 +14,11 @@ from typing import Any
 
 from conf.schema import TeacherConfig
 from data.records import SelectionItem
-from teacher.cited import CONNECTIVES, list_facts
-from teacher.deciding import choose_statements
+from teacher.cited_rationales import CONNECTIVES, list_facts
 from teacher.predicates.facts import Predicates, Relation, RelationalPredicates
 from teacher.predicates.relations import find_topic
 from teacher.sections import SECTIONS
+from teacher.statement_choice import choose_statements
 
 SYSTEM = (files("teacher") / "templates" / "system_prompt.txt").read_text().rstrip()
 CITED = (files("teacher") / "templates" / "cited_prompt.txt").read_text().rstrip()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.cited import CitationError, cited_schema, compose_rationale, list_facts
+from teacher.cited_rationales import CitationError, cited_schema, compose_rationale, list_facts
 from teacher.prompts import build_messages
 from teacher.sections import GRAMMAR
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited

@@ -11,7 +11,7 @@ import pytest
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import ensure_benchmark
 from data.store import Store, open_store
-from data.tracks.selection import event, time, window
+from data.tracks.selection import event_items, time_items, window_items
 
 
 def micro_config(**changes: object) -> BenchmarkConfig:
@@ -23,9 +23,9 @@ def micro_config(**changes: object) -> BenchmarkConfig:
         "width": 192,
         "height": 128,
         "selection": SelectionConfig(
-            event=dict.fromkeys(event.CELLS, few),
-            time=dict.fromkeys(time.CELLS, few),
-            window=dict.fromkeys(window.CELLS, few),
+            event=dict.fromkeys(event_items.CELLS, few),
+            time=dict.fromkeys(time_items.CELLS, few),
+            window=dict.fromkeys(window_items.CELLS, few),
             matched=few,
         ),
         "retrieval": RetrievalTrackConfig(

@@ -43,11 +43,11 @@ from conf.failures import report_failures
 from conf.schema import RelationBounds
 from data.records import FAMILIES, LETTERS, SelectionItem
 from data.store import Store
-from teacher.deciding import choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation
 from teacher.predicates.relations import VALUES, normalize_relation
 from teacher.reading.claims import Claim
+from teacher.statement_choice import choose_statements
 from teacher.sufficiency import find_predicted, is_consistent, measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 

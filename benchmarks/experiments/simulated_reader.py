@@ -33,7 +33,6 @@ from conf.failures import report_failures
 from conf.schema import RelationBounds
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
-from teacher.deciding import UNKNOWN_PATH, Decision, choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation
 from teacher.predicates.places import region_at
@@ -43,6 +42,7 @@ from teacher.predicates.relations import (
     find_topic,
     normalize_relation,
 )
+from teacher.statement_choice import UNKNOWN_PATH, Decision, choose_statements
 
 ERRORS = ((0.0, 0.0), (0.02, 0.0), (0.02, 0.15), (0.02, 0.3), (0.03, 0.4))
 """Standard deviations of the seen places, and of the predicted ones as shares of the paths. Those

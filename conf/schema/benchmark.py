@@ -19,7 +19,8 @@ SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
 DISTRACTORS = ("paper", "balanced")
 RECIPES = ("dynapix", "movi_a", "physion")
 WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
-"""Window families of each group (see `data.tracks.selection.window`). B needs a later collision."""
+"""Window families of each group (see `data.tracks.selection.window_items`). B needs a later
+collision."""
 WINDOW_HORIZONS = (8, 16, 24)
 """Number of frames from the last frame of a window item's prefix to its target."""
 WINDOW_DIFFICULTIES = ("easy", "hard")

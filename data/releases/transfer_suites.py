@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data.records import Candidate, Scene, SelectionItem
-from data.tracks.selection import event, time
+from data.tracks.selection import event_items, time_items
 from data.tracks.selection.distractors import DistractorPicker, Family, Timing, scene_candidates
 from data.world.events import find_motion_onsets
 
@@ -40,7 +40,7 @@ class EventCell:
     kind: str
     span: int
     gap: int
-    question = event.QUESTION
+    question = event_items.QUESTION
 
     def timings(self, scene: Scene) -> list[Timing]:
         stops = [frame - self.gap for frame in sorted(set(EVENTS[self.kind](scene)))]
@@ -59,7 +59,7 @@ class TimeCell:
 
     @property
     def question(self) -> str:
-        return time.question(self.seconds)
+        return time_items.question(self.seconds)
 
     def timings(self, scene: Scene) -> list[Timing]:
         # As in the suite `dynapix`, the target is the first frame after the stated seconds; a scene

@@ -29,13 +29,17 @@ from data.store import PARTS, SCENES_FOLDER, load_scene, part_path, save_scene, 
 from data.tracks.controls import MATCHED_ANCHOR, fill_pairs
 from data.tracks.quota import CellInputs, fill_quota, named_rng, shuffle_candidates
 from data.tracks.retrieval import counterfactual, future
-from data.tracks.selection import event, time, window
+from data.tracks.selection import event_items, time_items, window_items
 from data.tracks.selection.balanced_subset import RESERVE, choose_items
 from data.tracks.selection.distractors import BUILDERS_VERSIONS, Family, Timing
 from data.tracks.shortcuts import item_scores, order_target_first
 from data.world.physics import generator_version
 
-DYNAPIX_FAMILIES = {"event": event.FAMILY, "time": time.FAMILY, "window": window.FAMILY}
+DYNAPIX_FAMILIES = {
+    "event": event_items.FAMILY,
+    "time": time_items.FAMILY,
+    "window": window_items.FAMILY,
+}
 OBSERVATIONS = ("event", "window")
 """Families whose number of observed frames is a setting."""
 COUNTERFACTUAL = "counterfactual"

@@ -15,7 +15,7 @@ import numpy as np
 
 from data.records import SELECTION_SECOND, Scene, SelectionItem, sample_prefix_frames
 from data.tracks.quota import CellInputs, fill_quota
-from data.tracks.selection import event, time
+from data.tracks.selection import event_items, time_items
 from data.tracks.selection.distractors import Family, Timing
 from data.world.events import collision_frames, collisions_in
 
@@ -36,14 +36,14 @@ def timings(subtype: str, scene: Scene) -> list[Timing]:
         for seconds in SECONDS
         if (stop := target - seconds * SELECTION_SECOND) >= SELECTION_SECOND - 1
         and not collisions_in(scene, stop + 1, target - 1)
-        and target <= scene.frames - 1 - event.TAIL
+        and target <= scene.frames - 1 - event_items.TAIL
     ]
 
 
 def fill_pairs(cell: CellInputs) -> tuple[list[SelectionItem], int]:
     """Make matched-anchor pairs up to the quota: a list with the items of each pair in sequence,
     and the number of targets that `fill_quota` dropped."""
-    items, dropped = fill_quota(MATCHED_ANCHOR, Family({}, timings, time.make_item), cell)
+    items, dropped = fill_quota(MATCHED_ANCHOR, Family({}, timings, time_items.make_item), cell)
     return [paired for item in items for paired in _pair(item)], dropped
 
 

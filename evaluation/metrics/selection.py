@@ -12,7 +12,7 @@ import numpy as np
 
 from data.records import LETTERS, SelectionItem
 from data.tracks.controls import MATCHED_ANCHOR
-from data.tracks.selection.time import CELLS
+from data.tracks.selection.time_items import CELLS
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
 from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.reasons import ReasonSummary

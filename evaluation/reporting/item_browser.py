@@ -24,7 +24,7 @@ from evaluation.metrics.results import SelectionResult
 from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting.measurements import Measurement, compare_models
 from evaluation.reporting.run_responses import ItemResponse, Responses
-from teacher.cited import list_facts
+from teacher.cited_rationales import list_facts
 from teacher.reading.claims import Claim
 from teacher.sections import SECTIONS
 

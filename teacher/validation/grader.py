@@ -9,14 +9,14 @@ from dataclasses import astuple, replace
 
 from conf.schema import RelationBounds, TeacherConfig
 from data.records import Rationale, SelectionItem
-from teacher.cited import CITED_VERSION
-from teacher.deciding import choose_statements
+from teacher.cited_rationales import CITED_VERSION
 from teacher.narrator import NARRATOR_VERSION
 from teacher.predicates.facts import RelationalPredicates
 from teacher.prompts import PROMPT_VERSION
 from teacher.reading.claims import VERDICTS
 from teacher.sections import GRAMMAR_VERSION
 from teacher.servers.responses import Response
+from teacher.statement_choice import choose_statements
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.validator import VALIDATOR_VERSION, Validation, validate_rationale
 from teacher.vocabulary import choose_vocabulary, name_vocabulary

@@ -9,7 +9,6 @@ from importlib.resources import files
 
 import yaml
 
-from teacher.deciding import Decision
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
@@ -25,6 +24,7 @@ from teacher.predicates.relations import (
     flip_relation,
     normalize_relation,
 )
+from teacher.statement_choice import Decision
 from teacher.writers.paper import Detail, Writer
 
 PHRASES = yaml.safe_load((files("teacher") / "templates" / "relations.yaml").read_text())
@@ -61,9 +61,10 @@ def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> Re
 class RelationalWriter(Writer):
     """Writes the sections of a rationale from relational predicates.
 
-    The prediction begins with the statements that decide the item (see `teacher.deciding`). The
-    candidate analysis describes each candidate by the topics of these statements only. The outcome
-    names the candidate that shows the object of the first statement closest to its place.
+    The prediction begins with the statements that decide the item (see
+    `teacher.statement_choice`). The candidate analysis describes each candidate by the topics of
+    these statements only. The outcome names the candidate that shows the object of the first
+    statement closest to its place.
     Other objects that are out of view at the cut are left out.
     """
 

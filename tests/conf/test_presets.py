@@ -13,7 +13,7 @@ from conf import schema
 from conf.compose import compose, config_name, list_presets
 from conf.errors import SettingsError
 from conf.help import COMMON, TRAINING, description
-from data.tracks.selection.window import CELLS
+from data.tracks.selection.window_items import CELLS
 
 CONF = Path(str(files("conf")))
 SCHEMAS = {

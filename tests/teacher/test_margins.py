@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from conf.schema import RelationBounds
-from teacher import deciding
-from teacher.deciding import choose_statements
+from teacher import statement_choice
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import REGIONS, Relation, RelationalPredicates
 from teacher.predicates.margins import measure_margin
@@ -22,6 +21,7 @@ from teacher.predicates.relations import (
     normalize_relation,
 )
 from teacher.prompts import format_facts
+from teacher.statement_choice import choose_statements
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 from tests.teacher.test_relations import A, B, C, places, random_places
@@ -134,7 +134,7 @@ def choose_with_margins(
     def measure_scaled(s: Relation, where: Places, bounds: RelationBounds) -> float:
         return measure_margin(s, where, bounds) * (factor if s == statement else others)
 
-    with patch.object(deciding, "measure_margin", measure_scaled):
+    with patch.object(statement_choice, "measure_margin", measure_scaled):
         return choose_statements(predicates).statements
 
 

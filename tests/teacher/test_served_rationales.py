@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.teacher.test_cited import cite_all
 
 from conf.schema import TeacherConfig
-from teacher.cited import compose_rationale, list_facts
+from teacher.cited_rationales import compose_rationale, list_facts
 from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
 from teacher.narrator import write_rationale
 from teacher.prompts import build_messages
 from teacher.vocabulary import choose_vocabulary, describe_item
 from tests.teacher.memory_store import make_store
-from tests.teacher.test_cited import cite_all
 from tests.teacher.tiny_qwen3 import save_tiny_qwen3, teach
 from tests.teacher.vllm_server import VllmServer
 

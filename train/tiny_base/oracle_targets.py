@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from data.records import COLORS, LETTERS, MATERIALS, SHAPES, Scene
-from teacher.deciding import measure_separation
 from teacher.predicates.facts import COMPASS
 from teacher.predicates.motion import motion_start
 from teacher.predicates.relations import EXTENTS
+from teacher.statement_choice import measure_separation
 
 WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
 """The words of a noun phrase, in their order."""

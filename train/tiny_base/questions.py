@@ -33,7 +33,6 @@ from conf.schema import RelationBounds
 from data.records import Candidate, Scene, SelectionItem
 from data.world.displacement import frame_displacements
 from models.student.prompts import build_response
-from teacher.deciding import Decision, choose_statements
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Relation, RelationalPredicates, View
@@ -44,6 +43,7 @@ from teacher.predicates.relations import (
     flip_relation,
     normalize_relation,
 )
+from teacher.statement_choice import Decision, choose_statements
 from teacher.writers.paper import Detail, join_sentences
 from teacher.writers.relational import RelationalWriter, leave_out_unseen
 

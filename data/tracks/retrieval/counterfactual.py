@@ -13,7 +13,7 @@ import numpy as np
 from data.records import COUNTERFACTUAL, FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.quota import CellInputs, named_rng
 from data.tracks.retrieval.queries import fill_query_quota
-from data.tracks.selection.time import spell_seconds
+from data.tracks.selection.time_items import spell_seconds
 from data.world.displacement import DIAGONAL, visible_positions
 
 LATEST_STOP = 2 * FPS

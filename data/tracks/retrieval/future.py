@@ -12,7 +12,7 @@ from functools import partial
 from data.records import FPS, FrameRef, RetrievalQuery, Scene
 from data.tracks.quota import CellInputs
 from data.tracks.retrieval.queries import fill_query_quota
-from data.tracks.selection.time import spell_seconds
+from data.tracks.selection.time_items import spell_seconds
 from data.world.events import collision_frames
 
 EVENTS_PER_SCENE = 3

@@ -14,7 +14,7 @@ from data.records import Collision, Landing, Scene, SceneObject, SelectionItem
 from data.releases.transfer_suites import TRANSFER_SUITES
 from data.releases.validation import RecordError
 from data.tracks.quota import CellInputs, fill_quota
-from data.tracks.selection import event, time
+from data.tracks.selection import event_items, time_items
 from data.world.events import find_motion_onsets
 
 MIN_DISPLACEMENT = 12.0
@@ -108,8 +108,8 @@ def test_items_have_their_suite_and_the_questions_of_dynapix(suite: str, items: 
     assert {i.suite for i in items} == {suite}
     (question,) = {i.question for i in items}
     (subtype,) = {i.subtype for i in items}
-    timed = {"in_1s": time.question(1), "in_2s": time.question(2)}
-    assert question == timed.get(subtype, event.QUESTION)
+    timed = {"in_1s": time_items.question(1), "in_2s": time_items.question(2)}
+    assert question == timed.get(subtype, event_items.QUESTION)
     assert max(Counter(i.answer for i in items).values()) == 6
 
 

@@ -14,7 +14,7 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from data.tracks.retrieval.counterfactual import removal_displacement
 from data.tracks.retrieval.database import UniqueFrames, counterfactual_database
-from data.tracks.selection import window
+from data.tracks.selection import window_items
 from data.tracks.selection.distractors import Timing, visible_objects
 from data.world.displacement import (
     cross_scene_displacement,
@@ -137,8 +137,8 @@ def test_candidates_of_window_families_b_and_c_differ_in_their_subjects(
     counts = Counter()
     for item in (i for i in items if i.window_family in ("B", "C")):
         scene = benchmark_store.scene(item.scene_id)
-        cell = window.CELLS[item.subtype]
-        subjects = window.subject_objects(cell, scene, timing(item))
+        cell = window_items.CELLS[item.subtype]
+        subjects = window_items.subject_objects(cell, scene, timing(item))
         visible = visible_objects(scene, timing(item))
         if item.window_family == "B":
             assert item.group in ("G2", "G4")

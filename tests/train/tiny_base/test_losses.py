@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import one_hot
 
 from data.records import LETTERS
-from teacher.deciding import measure_separation
+from teacher.statement_choice import measure_separation
 from train.tiny_base.heads import (
     SCALES,
     OracleHeads,

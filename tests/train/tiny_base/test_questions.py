@@ -14,10 +14,10 @@ from conf.schema import RelationBounds
 from data.records import LETTERS, SelectionItem
 from data.store import Store
 from models.student.collator import IGNORED, encode
-from teacher.deciding import choose_statements
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates, View
 from teacher.predicates.relations import normalize_relation
+from teacher.statement_choice import choose_statements
 from teacher.validation.claim_extraction import extract_claims
 from train.tiny_base.questions import (
     ASK,

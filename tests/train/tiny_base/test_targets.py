@@ -12,8 +12,8 @@ from transformers import AutoTokenizer
 
 from data.records import LETTERS, sample_prefix_frames
 from data.store import Store
-from teacher.deciding import UNSEEN_DISTANCE
 from teacher.predicates.motion import find_cut, motion_start
+from teacher.statement_choice import UNSEEN_DISTANCE
 from train.tiny_base.collator import object_token_ids, spatial_token_ids
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.located_mentions import described_state, measure_error

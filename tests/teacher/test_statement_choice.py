@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from conf.schema import RelationBounds, TeacherConfig
-from teacher.deciding import UNSEEN_DISTANCE, choose_statements, measure_separation
 from teacher.narrator import FULL, write_match_lines, write_rationale
 from teacher.predicates.facts import Relation
 from teacher.predicates.relations import (
@@ -20,6 +19,7 @@ from teacher.predicates.relations import (
     describe_distance,
     normalize_relation,
 )
+from teacher.statement_choice import UNSEEN_DISTANCE, choose_statements, measure_separation
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale

@@ -10,7 +10,13 @@ import pytest
 
 from conf.schema import RelationBounds, TeacherConfig
 from data.records import LETTERS
-from teacher.cited import PREFIXES, CitationError, cited_schema, compose_rationale, list_facts
+from teacher.cited_rationales import (
+    PREFIXES,
+    CitationError,
+    cited_schema,
+    compose_rationale,
+    list_facts,
+)
 from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
 from teacher.prompts import build_messages
