@@ -202,7 +202,9 @@ class ContrastiveTrainConfig(TrainConfig):
     """Number of queries per optimizer step, over all ranks. The negatives of a query are all
     targets and hard negatives of the batch, except the query's own target frame."""
     mini_batch: int = 8
-    """Number of queries or frames per forward pass; changes memory and speed, not the gradient."""
+    """Number of queries or frames per forward pass; changes memory and speed, not the gradient. If
+    it equals `batch`, a single process embeds a batch once instead of twice, and keeps the
+    activations of the whole batch."""
     hard_negatives: int = setting(1, least=0)
     """Number of hard negatives per query that are trained on, of those that the benchmark has."""
     scale: float = setting(50.0, above=0)
@@ -210,7 +212,8 @@ class ContrastiveTrainConfig(TrainConfig):
     retriever.late, are multiplied in the loss."""
     reuse_features: bool = False
     """Keep the frozen vision tower's features between the two forward passes of a step, which does
-    not change the gradient. With an 8B model, the features of a query take about 30 MB."""
+    not change the gradient. With an 8B model, the features of a query take about 30 MB. No effect
+    if a step has one forward pass."""
     width_weights: list[float] | None = None
     """Weight of the loss at each width of retriever.widths; null weights all widths equally."""
     validation_queries: int = setting(128, least=1)

@@ -27,7 +27,7 @@ class RetrieverInputs:
         cfg: The retriever's preset, with its instructions and the number of frames of a prefix.
         bf16: Whether the vision tower computes in bf16.
         reuse_features: Whether to compute the outputs of the frozen vision tower in the first pass
-            of a step only, and to keep them for the second pass.
+            of a step only, and to keep them for the second pass, if there is one.
     """
 
     def __init__(
@@ -52,13 +52,13 @@ class RetrieverInputs:
         return self._model.preprocess(inputs, prompt=instruction)
 
     def prepare(
-        self, items: Sequence[QueryOrFrame], inputs: dict[str, Any], first_pass: bool
+        self, items: Sequence[QueryOrFrame], inputs: dict[str, Any], is_first_of_two: bool
     ) -> dict[str, Any]:
-        """Move loaded inputs to the model's device. In a first pass with `reuse_features`, also
-        replace the pixels by the vision tower's outputs, and keep the result, which the next `load`
-        of the same items returns."""
+        """Move loaded inputs to the model's device. In the first of two passes with
+        `reuse_features`, also replace the pixels by the vision tower's outputs, and keep the
+        result, which the next `load` of the same items returns."""
         inputs = send_to_device(inputs, self._model.device, non_blocking=True)
-        if first_pass and self._reuse:
+        if is_first_of_two and self._reuse:
             inputs = self._encode_media(inputs)
             self._kept[tuple(items)] = send_to_device(inputs, "cpu")
         return inputs
