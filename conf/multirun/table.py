@@ -15,6 +15,10 @@ AT_START_SUFFIX = "_at_start"
 them out, because they have the same value in most jobs."""
 LOWER_IS_BETTER = r"loss|_error(/|$)|_rank$|set_aside|too_short|reject"
 """Pattern in the names of the metrics of which lower values are better."""
+MAIN_METRICS = (
+    "reasoning_generated_accuracy", "answer_generated_accuracy", "reward", "recall@10", "mrr",
+)  # fmt: skip
+"""Metrics that precede the others, which are in alphabetical order."""
 
 
 def read_jobs(folder: Path) -> list[dict[str, Any]]:
@@ -26,11 +30,12 @@ def read_jobs(folder: Path) -> list[dict[str, Any]]:
 
 def read_job(folder: Path) -> dict[str, Any]:
     """Return the record of an ended job: its number (`job`), `overrides`, `status` (done or failed)
-    and `metrics`, without those that are measured before training."""
+    and `metrics`, in the order of a table and without those that are measured before training."""
     job = read_json(folder / JOB_FILE)
     path = folder / "metrics.json"
     metrics = read_json(path) if job["status"] == "done" and path.exists() else {}
-    final = {name: value for name, value in metrics.items() if not name.endswith(AT_START_SUFFIX)}
+    names = sorted((n for n in metrics if not n.endswith(AT_START_SUFFIX)), key=metric_position)
+    final = {name: metrics[name] for name in names}
     return {"job": int(folder.name), "metrics": final, **job}
 
 
@@ -45,7 +50,7 @@ def write_sweep_table(folder: Path) -> str:
     import pandas as pd
 
     jobs = read_jobs(folder)
-    metrics = sorted({name for job in jobs for name in job["metrics"]})
+    metrics = sorted({name for job in jobs for name in job["metrics"]}, key=metric_position)
     settings = varying_overrides([job["overrides"] for job in jobs])
     rows = [
         {"job": job["job"]}
@@ -73,6 +78,12 @@ def varying_overrides(jobs: Sequence[Sequence[str]]) -> list[dict[str, str]]:
     keys = dict.fromkeys(key for job in by_key for key in job)
     differ = [key for key in keys if len({job.get(key) for job in by_key}) > 1]
     return [{key: job[key] for key in differ if key in job} for job in by_key]
+
+
+def metric_position(metric: str) -> tuple[int, str]:
+    """Return a sort key of the metrics of a table: the main metrics first."""
+    main = MAIN_METRICS.index(metric) if metric in MAIN_METRICS else len(MAIN_METRICS)
+    return main, metric
 
 
 def is_lower_better(metric: str) -> bool:

@@ -16,10 +16,11 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from conf.compose import compose
 from conf.errors import import_extra
+from conf.files import write_json
 from conf.gpus import visible_gpus
 from conf.multirun.search import STUDY_FILE, default_metric, distribution
 from conf.multirun.sweep import Sweep
-from conf.multirun.table import JOB_FILE, is_lower_better, read_jobs
+from conf.multirun.table import JOB_FILE, is_lower_better, read_job, read_jobs, write_sweep_table
 from conf.schema import ContrastiveCommand, SftCommand
 from conf.schema.training import REGIMES
 from tests.conf.toy_process import NO_GPU, run_toy, start_toy
@@ -279,6 +280,15 @@ def test_extra_that_is_not_installed_is_a_user_error(monkeypatch):
 def test_swept_override_becomes_a_distribution(override, expected):
     [parsed] = OverridesParser.create().parse_overrides([override])
     assert distribution(parsed) == expected
+
+
+def test_tables_begin_with_the_main_metrics(tmp_path):
+    metrics = {"answer_loss": 2.0, "reasoning_generated_accuracy": 0.5, "loss_at_start": 3.0}
+    write_json(tmp_path / "0/metrics.json", metrics)
+    write_json(tmp_path / "0/job.json", {"overrides": ["x=1"], "status": "done"})
+    assert list(read_job(tmp_path / "0")["metrics"]) == [*metrics][1::-1]
+    header = write_sweep_table(tmp_path).splitlines()[0]
+    assert header.split() == ["job", "reasoning_generated_accuracy", "answer_loss", "status"]
 
 
 def test_metric_determines_the_direction_of_a_search():
