@@ -39,7 +39,8 @@ class TrainConfig(Settings):
     speed."""
     evaluations: int = setting(10, least=1)
     """Number of evaluations, evenly spaced over the run and in addition to one before the first
-    step. Each evenly spaced evaluation saves a checkpoint."""
+    step. A run saves as many checkpoints, also evenly spaced, but at least two unless
+    `best_metric` is set."""
     keep_checkpoints: int = setting(2, least=1)
     """Number of checkpoints to keep, including the best one."""
     best_metric: str | None = None
@@ -58,6 +59,11 @@ class TrainConfig(Settings):
             yield (
                 f"{group}max_steps={self.max_steps} and {group}epochs={self.epochs}: give 1 or "
                 f"more steps, or {group}max_steps=-1 and {group}epochs above 0"
+            )
+        if self.best_metric is not None and self.evaluations == 1:
+            yield (
+                f"{group}best_metric={self.best_metric} with {group}evaluations=1: only the last "
+                f"checkpoint has an evaluation; set {group}evaluations to 2 or more"
             )
 
 
@@ -213,7 +219,7 @@ class ContrastiveTrainConfig(TrainConfig):
     reuse_features: bool = False
     """Keep the frozen vision tower's features between the two forward passes of a step, which does
     not change the gradient. With an 8B model, the features of a query take about 30 MB. No effect
-    if a step has one forward pass."""
+    if a batch is embedded once."""
     width_weights: list[float] | None = None
     """Weight of the loss at each width of retriever.widths; null weights all widths equally."""
     validation_queries: int = setting(128, least=1)

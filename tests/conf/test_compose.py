@@ -72,6 +72,7 @@ def test_removed_key_names_its_replacement(monkeypatch):
         ("benchmark.height=129", "invalid-setting", "benchmark.height=129"),
         ("train.keep_checkpoints=0", "invalid-setting", "train.keep_checkpoints=0"),
         ("train.max_steps=0", "invalid-setting", "train.max_steps=0"),
+        ("train.best_metric=eval_answer_loss", "invalid-setting", "train.evaluations=1"),
         ("train.lr=inf", "invalid-setting", "train.lr=inf"),
         ("train.epochs=nan", "invalid-setting", "train.epochs=nan"),
         ("benchmark.world.camera.position=[nan,0,2]", "invalid-setting", "camera.position"),

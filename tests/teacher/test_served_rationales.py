@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.teacher.test_cited import cite_all
 
 from conf.schema import TeacherConfig
 from teacher.cited_rationales import compose_rationale, list_facts
@@ -17,6 +16,7 @@ from teacher.narrator import write_rationale
 from teacher.prompts import build_messages
 from teacher.vocabulary import choose_vocabulary, describe_item
 from tests.teacher.memory_store import make_store
+from tests.teacher.test_cited_rationales import cite_all
 from tests.teacher.tiny_qwen3 import save_tiny_qwen3, teach
 from tests.teacher.vllm_server import VllmServer
 

@@ -17,6 +17,8 @@ PROJECT = "dynapix"
 """Name of the project in experiment trackers."""
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
 """The name in transformers of each value of train.schedule."""
+MIN_CHECKPOINTS = 2
+"""Minimum number of checkpoints of a run, so that a killed run loses at most half of it."""
 
 
 def common_arguments(
@@ -29,11 +31,19 @@ def common_arguments(
         checkpoint: The checkpoint that the run resumes from, or None.
     """
     if checkpoint is None:
+        # The best checkpoint must have an evaluation.
+        checkpoints = train.evaluations
+        if train.best_metric is None:
+            checkpoints = max(checkpoints, MIN_CHECKPOINTS)
         # The trainer reads a value below 1 as a share of all steps, but 1 as every step.
-        interval = min(1 / train.evaluations, 0.9999)
+        steps = {
+            "eval_steps": min(1 / train.evaluations, 0.9999),
+            "save_steps": min(1 / checkpoints, 0.9999),
+        }
     else:
-        # The number of steps that the trainer computed from the share when the run started.
-        interval = json.loads((checkpoint / STATE).read_text())["eval_steps"]
+        # The numbers of steps that the trainer computed from the shares when the run started.
+        state = json.loads((checkpoint / STATE).read_text())
+        steps = {name: state[name] for name in ("eval_steps", "save_steps")}
     return {
         "output_dir": str(run.folder),
         "seed": seed,
@@ -50,11 +60,10 @@ def common_arguments(
         "use_cpu": not torch.cuda.is_available(),
         **checkpointing_arguments(train.gradient_checkpointing),
         "eval_strategy": "steps",
-        "eval_steps": interval,
+        "save_strategy": "steps",
+        **steps,
         # A resumed run already has the initial evaluation in its metrics.jsonl.
         "eval_on_start": checkpoint is None,
-        "save_strategy": "steps",
-        "save_steps": interval,
         "save_total_limit": train.keep_checkpoints,
         "logging_steps": 1,
         "dataloader_num_workers": train.workers,

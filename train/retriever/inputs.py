@@ -19,7 +19,7 @@ FEATURES = "vision_features"
 
 
 class RetrieverInputs:
-    """Loads the inputs of one mini-batch at a time: memory does not depend on the batch size.
+    """Loads the inputs of one mini-batch at a time.
 
     Args:
         model: The retriever. Its backbone gets the hook `pass_features`.

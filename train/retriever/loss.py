@@ -5,7 +5,8 @@ pass, without gradients, computes embeddings, from which the loss and its gradie
 the embeddings are computed. The second pass propagates these gradients to the weights. Each pass
 loads the inputs of a mini-batch when it reaches it, so memory does not depend on the batch size.
 
-A batch that is one mini-batch is embedded once, which takes three quarters of the time.
+If all queries of a batch fit in one mini-batch, a single process embeds the batch only once, with
+gradients, and memory holds the activations of the whole batch.
 """
 
 from __future__ import annotations
@@ -47,8 +48,7 @@ class RankingLoss(nn.Module):
         widths: Embedding sizes. The loss at a width scores that many leading entries of a vector.
         weights: Weight of the loss at each width; None weights every width by 1.
         scale: Inverse temperature of the scores.
-        mini_batch: Queries or frames per mini-batch. The gradients do not depend on it. If it is
-            the size of a batch, memory holds the activations of the whole batch.
+        mini_batch: Queries or frames per mini-batch. The gradients do not depend on it.
         prefetch: Number of mini-batches that a thread loads in advance.
     """
 
@@ -84,12 +84,12 @@ class RankingLoss(nn.Module):
         """
         size = self._mini_batch
         parts = [c[start : start + size] for c in columns for start in range(0, len(c), size)]
-        # DDP allows only one forward pass before a backward pass.
+        # With DDP, several forward passes before a backward pass may mark a weight as ready twice.
         is_single_pass = len(parts) == len(columns) and world_size() == 1
         states, vectors, masks = [], [], []
         for part, inputs in self._load(parts, is_first_of_two=not is_single_pass):
             states.append(RandContext(*inputs.values()))
-            with torch.set_grad_enabled(is_single_pass):
+            with nullcontext() if is_single_pass else torch.no_grad():
                 embedded, mask = self._embed(part, inputs)
             check_finite(embedded, part)
             vectors.append(embedded)

@@ -105,6 +105,16 @@ def test_a_student_resumes_after_its_first_epoch(
 
 
 @pytest.mark.slow
+def test_a_run_with_one_evaluation_resumes_from_its_middle(sft_settings, tmp_path) -> None:
+    train_settings = replace(sft_settings.train, max_steps=4, evaluations=1)
+    settings = replace(sft_settings, train=train_settings)
+    whole, resumed = train_twice(sft.main, settings, tmp_path, step=2)
+    evaluated = [r["step"] for r in read_journal(whole) if "eval_answer_loss" in r]
+    assert evaluated == [0, 4]
+    check_same_weights(*(f / "student" / "adapter_model.safetensors" for f in (whole, resumed)))
+
+
+@pytest.mark.slow
 def test_micro_batches_change_neither_loss_nor_gradient(few_steps, tmp_path) -> None:
     """In the first step, with four samples of unequal length in one micro-batch or in four."""
     first = []

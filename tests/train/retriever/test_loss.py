@@ -75,7 +75,8 @@ def distinct(queries):
         documents = {f for q in kept for f in (q.target, *q.hard_negatives)}
         if query.target not in documents and not targets & {query.target, *query.hard_negatives}:
             kept.append(query)
-    assert len(kept) > 2
+    # More than the default mini-batch of `ranking_loss`.
+    assert 3 < len(kept) <= 12
     return kept
 
 
@@ -141,6 +142,29 @@ def test_gradients_equal_the_librarys(trained, distinct, frames, library, option
 @pytest.mark.parametrize("trained", ["adapters", "multi-vector adapters"], indirect=True)
 def test_reused_vision_features_change_no_gradient(trained, distinct, frames, library) -> None:
     assert_equal(own(trained, distinct, frames, reuse_features=True), library)
+
+
+@pytest.mark.parametrize("trained", ["adapters"], indirect=True)
+@pytest.mark.parametrize(("mini_batch", "passes"), [(3, 2), (12, 1)])
+def test_a_batch_within_one_mini_batch_is_embedded_once(
+    trained, distinct, frames, monkeypatch, mini_batch, passes
+) -> None:
+    model, cfg = copy.deepcopy(trained)
+    inputs = RetrieverInputs(model, frames, cfg, bf16=False, reuse_features=True)
+    loss, columns = (
+        ranking_loss(model, inputs, cfg, mini_batch=mini_batch),
+        batch_columns(distinct, NEGATIVES),
+    )
+    embed_part, embedded = loss._embed, []
+
+    def record(part, part_inputs):
+        embedded.extend(part)
+        return embed_part(part, part_inputs)
+
+    monkeypatch.setattr(loss, "_embed", record)
+    gradients(model, loss, columns)
+    assert len(embedded) == passes * sum(map(len, columns))
+    assert not inputs._kept
 
 
 @pytest.mark.parametrize("trained", ["whole", "multi-vector"], indirect=True)
