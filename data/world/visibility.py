@@ -10,7 +10,7 @@ import numpy as np
 from data.records import Scene, SceneObject
 from data.world.camera import Camera, pixel_rays
 from data.world.parts import Box
-from data.world.shapes import BOUNDING_RADIUS, intersect_object
+from data.world.shapes import BOUNDING_RADIUS, half_height, intersect_object, rotation_matrix
 
 MIN_VISIBLE = 0.05
 """Visible fraction up to which an object in view counts as hidden."""
@@ -54,26 +54,32 @@ def compute_visibility(
     half_side = np.where(in_front, 1.3 * camera.focal * radius / np.maximum(depth, 1e-3), 0.0)
     low, high = centre - half_side[..., None], centre + half_side[..., None]
     size = np.array([camera.width, camera.height])
-    inside = in_front & ((low >= 0) & (high <= size)).all(-1)
+    stride = max(1, round(STRIDE * camera.magnification))
+    inside = ((low >= 0) & (high <= size)).all(-1)
+    # A ray meets the sphere inscribed in the object: one passes by its centre within a stride.
+    inscribed = np.array([half_height(o.shape, s) for o, s in zip(objects, scales, strict=True)])
+    is_met = ((centre >= 0) & (centre < size)).all(-1)
+    is_met &= camera.focal * inscribed > 2 * stride * depth
+    # The image contains a part of the object, without which no fraction of it is visible.
+    certain = in_front & (inside | is_met)
     outside = ~in_front | ((high < 0) | (low > size)).any(-1)
     eye = np.asarray(camera.eye)
     hides = _may_hide(positions - eye, radius)
     hides &= ~outside[:, :, None] & ~outside[:, None, :]
-    behind_part = np.zeros_like(inside)
+    behind_part = np.zeros_like(certain)
     for box in parts:
         behind_part |= _box_may_hide(box, low, high, positions, radius, camera)
     behind = hides.any(-1) | behind_part
 
-    in_view = inside.copy()
-    fraction = inside.astype(np.float64)
+    in_view = certain.copy()
+    fraction = certain.astype(np.float64)
 
     def intersect(f: int, k: int, rays: np.ndarray) -> np.ndarray:
         shape, scale = objects[k].shape, scales[k]
         return intersect_object(shape, scale, positions[f, k], quaternions[f, k], eye, rays)
 
-    stride = max(1, round(STRIDE * camera.magnification))
-    # Rays are needed only for objects at the border of the image or behind something.
-    for f, i in np.argwhere(~outside & (~inside | behind)):
+    # Rays are needed only for objects behind something, and for those that may be out of view.
+    for f, i in np.argwhere(~outside & (~certain | behind)):
         window = _pixels_around(low[f, i], high[f, i], camera, stride)
         hidden_by = np.flatnonzero(hides[f, i])
         is_behind_part = False
@@ -81,11 +87,11 @@ def compute_visibility(
             part_distances = _part_distances(camera, parts)[window].reshape(-1)
             # Distances are depths, since rays advance by 1 along the optical axis.
             is_behind_part = part_distances.min() < depth[f, i] + radius[i]
-            if inside[f, i] and part_distances.max() < depth[f, i] - radius[i]:
+            if certain[f, i] and part_distances.max() < depth[f, i] - radius[i]:
                 # Parts hide the object completely.
                 fraction[f, i] = 0.0
                 continue
-            if inside[f, i] and not is_behind_part and not len(hidden_by):
+            if certain[f, i] and not is_behind_part and not len(hidden_by):
                 continue
         rays = pixel_rays(camera)[window].reshape(-1, 3)
         own = intersect(f, i, rays)
@@ -107,7 +113,9 @@ def compute_visibility(
 def _may_hide(centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Return whether object j may hide a part of object i, (F, N, N) by frame, i and j.
 
-    This requires that their bounding spheres overlap in the image and j is not entirely behind i.
+    This requires that their bounding spheres overlap in the image, and that they intersect or j is
+    in front of i. The radical plane of disjoint spheres separates them, and the camera is on the
+    side of the sphere of which its power is less. Every ray meets this sphere first.
 
     Args:
         centres: (F, N, 3) positions relative to the camera.
@@ -118,8 +126,11 @@ def _may_hide(centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
     cone = np.arcsin(np.minimum(radius / distance, 1))
     angle = np.arccos(np.clip(np.einsum("fic,fjc->fij", toward, toward), -1, 1))
     overlap = angle < cone[:, :, None] + cone[:, None, :]
-    behind = (distance - radius)[:, None, :] > (distance + radius)[:, :, None]
-    return overlap & ~behind & ~np.eye(len(radius), dtype=bool)
+    power = distance**2 - radius**2
+    in_front = power[:, None, :] < power[:, :, None]
+    apart = np.linalg.norm(centres[:, :, None] - centres[:, None, :], axis=-1)
+    intersect = apart < np.add.outer(radius, radius)
+    return overlap & (in_front | intersect) & ~np.eye(len(radius), dtype=bool)
 
 
 def _box_may_hide(
@@ -132,17 +143,20 @@ def _box_may_hide(
 ) -> np.ndarray:
     """Return whether a box may hide a part of each object, (F, N).
 
-    This requires that the box and the object overlap in the image, and that the object is not
-    entirely in front of the box.
+    This requires that the box and the object overlap in the image, and that no face of the box
+    separates the object from it, on the side of the camera.
 
     Args:
         low, high: (F, N, 2) corners of squares that contain the objects in the image.
     """
     pixels, _ = camera.project(box.corners)
     overlap = ((low <= pixels.max(axis=0)) & (high >= pixels.min(axis=0))).all(-1)
-    eye = np.asarray(camera.eye)
-    nearest = np.linalg.norm(np.subtract(box.position, eye)) - np.linalg.norm(box.half)
-    return overlap & (np.linalg.norm(positions - eye, axis=-1) + radius > nearest)
+    to_local = rotation_matrix(box.quaternion)
+    eye = np.subtract(camera.eye, box.position) @ to_local
+    side = np.where(eye > 0, 1, -1)
+    outside = side * ((positions - box.position) @ to_local) - box.half
+    faces_camera = side * eye > box.half
+    return overlap & ~((outside >= radius[:, None]) & faces_camera).any(-1)
 
 
 @lru_cache(maxsize=2)

@@ -11,7 +11,8 @@ import pytest
 from conf.schema import PartConfig, PhysicsConfig, WorldConfig
 from conf.schema.world import ByMaterial, CameraConfig, ObjectsConfig, StartConfig
 from data.records import Scene, SceneObject
-from data.world.parts import world_boxes
+from data.world import visibility
+from data.world.parts import Box, world_boxes
 from data.world.physics import Body, shared_simulator
 from data.world.sampling import record_scene, sample_scene, simulate_without
 from data.world.shapes import BOUNDING_RADIUS, CUBE_HALF, RADIUS, half_height, rotation_matrix
@@ -74,6 +75,33 @@ def random_parts(rng: np.random.Generator, seed: int) -> Iterator[tuple[str, Par
         height = 0.7 * np.sin(np.radians(tilt)).item()
         turn = rng.uniform(-180, 180)
         yield "ramp", PartConfig([-0.4, side, height], [1.4, 1.2, 0.1], turn=turn, tilt=tilt)
+
+
+def test_visibility_is_the_same_if_all_rays_are_cast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The conditions under which no rays are cast change nothing."""
+    worlds = [random_world(seed) for seed in range(12)]
+    samples = [sample_scene(world, 0, 0) for world in worlds]
+
+    def record() -> list[Scene]:
+        return [record_scene("", "train", *each) for each in zip(samples, worlds, strict=True)]
+
+    scenes = record()
+
+    def all_pairs(centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        return np.repeat(~np.eye(len(radius), dtype=bool)[None], len(centres), axis=0)
+
+    def all_objects(box: Box, low: np.ndarray, *rest: object) -> np.ndarray:
+        return np.ones(low.shape[:-1], dtype=bool)
+
+    monkeypatch.setattr(visibility, "_may_hide", all_pairs)
+    monkeypatch.setattr(visibility, "_box_may_hide", all_objects)
+    monkeypatch.setattr(visibility, "half_height", lambda shape, scale: 0.0)
+    hidden = 0
+    for scene, other in zip(scenes, record(), strict=True):
+        assert (scene.in_view == other.in_view).all()
+        assert (scene.visible_fraction == other.visible_fraction).all()
+        hidden += (scene.in_view & (scene.visible_fraction < 1)).sum()
+    assert hidden > 100
 
 
 def moments_of_inertia(shape: str, mass: float, scale: float) -> np.ndarray:
