@@ -6,6 +6,9 @@ generated_color/parse            share of the names whose colour is that of the 
                                  the name shares most words; likewise for material and shape
 generated_name_recall/parse      share of the objects named in the true answers to `parse` that the
                                  generated ones name too
+generated_moving/parse           share of the statements about an object's motion at the cut that
+                                 are right in whether it moves
+generated_heading/parse          share of the headings of moving objects at the cut that are right
 generated_region/predict         share of the claims about regions in answers to `predict` that the
                                  oracle supports, of those that it can decide; likewise for other
                                  kinds of claims
@@ -29,7 +32,9 @@ from data.records import LETTERS, SelectionItem
 from models.student.collator import Collator
 from models.student.generation import generate
 from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.facts import Predicates
 from teacher.predicates.relations import Places
+from teacher.reading.claims import CUT, Claim
 from teacher.validation.claim_extraction import extract_claims
 from train.tiny_base.data import ItemSampler
 from train.tiny_base.mentions import CLOSEST, NAME
@@ -40,6 +45,8 @@ SECTION_PREFIXES = {"parse": "", "predict": "", "describe": "Candidate analysis:
 """The kinds of questions whose answers are read, and what they lack to be read as sections of a
 rationale. Answers to `compare` state predictions that need not be true. `explain` repeats what the
 other kinds ask for; of its answers, only the outcome is read."""
+MOTIONS = ("speed", "still", "direction")
+"""Kinds of claims that say or imply whether an object moves."""
 BATCH = 32
 
 
@@ -108,6 +115,7 @@ def _read(
     claims = [c for c in extract_claims(text, predicates) if c.kind != "mention"]
     decided = [c for c in claims if c.verdict != "unknown"]
     read = [(claim.kind, claim.verdict == "supported") for claim in decided]
+    read += _read_motions(claims, predicates)
     objects = _scene_names(item, kind, sampler)
     for match in NAME.finditer(text):
         said = match.group().split()
@@ -115,6 +123,25 @@ def _read(
         closest = max(objects, key=lambda o: sum(a == b for a, b in zip(o, said, strict=True)))
         equal = [a == b for a, b in zip(closest, said, strict=True)]
         read += [*zip(WORDS, equal, strict=True), ("name_precision", all(equal))]
+    return read
+
+
+def _read_motions(claims: Sequence[Claim], predicates: Predicates) -> list[tuple[str, bool]]:
+    """Return what claims say of the motion of single objects at the cut, and whether it is right:
+    whether each object moves, and the heading of those that move."""
+    facts = {each.object: each for each in predicates.objects}
+    read = []
+    for claim in claims:
+        if claim.when != CUT or not claim.affirmed or claim.kind not in MOTIONS:
+            continue
+        own = facts.get(claim.subjects[0]) if len(claim.subjects) == 1 else None
+        if own is None or own.speed is None:
+            continue
+        moves = own.speed != "stationary"
+        is_said_still = claim.kind == "still" or claim.value == "stationary"
+        read.append(("moving", moves != is_said_still))
+        if claim.kind == "direction" and moves and own.heading is not None:
+            read.append(("heading", claim.value == own.heading))
     return read
 
 

@@ -51,6 +51,8 @@ def test_true_answers_are_right_in_every_respect(measure) -> None:
     assert {
         "generated_region/predict",
         "generated_color/parse",
+        "generated_moving/parse",
+        "generated_heading/parse",
         "generated_name_precision/describe",
         "generated_outcome/explain",
         "generated_choice/explain",
@@ -65,6 +67,17 @@ def test_false_words_are_noticed(measure) -> None:
     assert metal["generated_name_precision/parse"] < 0.8
     regions = measure(lambda text: text.replace("near the ", "not near the "))
     assert regions["generated_region/predict"] == 0
+
+
+def test_false_motions_are_noticed(measure) -> None:
+    moving = r"(is )?mov\w+ \w+ toward the \w+"
+    still = measure(lambda text: re.sub(moving, "is stationary", text))
+    assert still["generated_moving/parse"] < 0.6
+    assert "generated_heading/parse" not in still
+    opposite = {"north": "south", "south": "north", "east": "west", "west": "east"}
+    turned = measure(lambda text: re.sub("|".join(opposite), lambda m: opposite[m.group()], text))
+    assert turned["generated_heading/parse"] == 0
+    assert turned["generated_moving/parse"] == 1
 
 
 def test_objects_that_an_answer_lacks_are_noticed(measure) -> None:
