@@ -94,10 +94,19 @@ def compose(command: str, schema: type, overrides: list[str]) -> Any:
 
 def allow_new_key(override: str, schema: type) -> str:
     """Return an override with which Hydra accepts a new key of a dict of values, such as
-    `benchmark.selection.observation.window`: `++KEY=VALUE` instead of `KEY=VALUE`."""
-    key = override.partition("=")[0]
+    `benchmark.selection.observation.window`: `++KEY=VALUE` instead of `KEY=VALUE`.
+
+    Raises:
+        SettingsError: The override gives a dict no entries, which Hydra would ignore.
+    """
+    key, _, value = override.partition("=")
     for name in key.split("."):
         hint = get_type_hints(schema).get(name)
+        if get_origin(hint) is dict and key.endswith(name) and value.split() == ["{}"]:
+            raise SettingsError(
+                f"{override} changes nothing, because the entries of a preset stay: set each entry "
+                f"that should change, as in {key}.NAME=..."
+            )
         if get_origin(hint) is dict and not is_dataclass(get_args(hint)[1]):
             return f"++{override}"
         groups = [t for t in (hint, *get_args(hint)) if is_dataclass(t)]

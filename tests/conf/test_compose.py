@@ -63,6 +63,7 @@ def test_removed_key_names_its_replacement(monkeypatch):
         ("hydra/launcher=nope", "invalid-setting", ("hydra/launcher/nope", "process")),
         ("benchmark.selection.event.new.train=3", "unknown-key", "benchmark.selection.event.new"),
         ("+benchmark.selection.event={new: {trian: 3}}", "unknown-key", "event.new.trian"),
+        ("benchmark.selection.event={}", "invalid-setting", "event={} changes nothing"),
         ("student=null", "invalid-setting", "student=null"),
         ("+exp=null", "invalid-setting", "+exp=null"),
         ("student=3", "invalid-setting", "student=3: give"),
