@@ -21,6 +21,7 @@ from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.parallel import Workers
 from data.records import SPLITS
 from data.releases.transfer_suites import suite_name
+from data.render.blender import check_blender
 from data.render.prerender import FRAMES_RECORD, prerender_frames
 from data.store import (
     FRAMES_FOLDER,
@@ -61,6 +62,8 @@ Other settings may change, because the name of a file in `PARTS` is a hash of it
 
 @command("data.build", BuildCommand)
 def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
+    if cfg.frames != "none":
+        check_renderer(cfg.benchmark)
     workers = Workers(cfg.workers, cfg.parallel)
     store = ensure_items(cfg.benchmark, Path(cfg.store), workers, cfg.strict, cfg.verify)
     prerender_frames(store, cfg.frames, cfg.frames_gb, workers)
@@ -70,10 +73,19 @@ def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
 
 def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
     """Open a benchmark as `ensure_items` does, and render the frames that its records refer to."""
+    if not (root / cfg.store_name).exists():
+        check_renderer(cfg)
     store = ensure_items(cfg, root, Workers(workers))
     if not (store.folder / FRAMES_FOLDER / FRAMES_RECORD).exists():
         prerender_frames(store, "named", None, Workers(workers))
     return store
+
+
+def check_renderer(cfg: BenchmarkConfig) -> None:
+    """Raises UserError if Blender is to render the frames and is not installed. Without this check,
+    the error would come after the simulation of the scenes."""
+    if cfg.renderer == "blender":
+        check_blender()
 
 
 def ensure_items(

@@ -35,6 +35,21 @@ VERSION = f"blender-1, bpy {BPY}, {SAMPLES} samples"
 WORKER = Path(__file__).with_name("blender_worker.py")
 
 
+def check_blender() -> None:
+    """Raises UserError if the module `bpy` is missing or of another release."""
+    try:
+        installed = version("bpy")
+    except PackageNotFoundError:
+        installed = None
+    if installed != BPY:
+        raise UserError(
+            f"benchmark.renderer=blender needs Blender's module bpy {BPY} (installed: "
+            f"{installed}): install it with pip install -e '.[blender]', or use "
+            "benchmark.renderer=bullet",
+            code="missing-package",
+        )
+
+
 class BlenderRenderer:
     """Renders frames of any scene at one size, in one Blender process.
 
@@ -44,18 +59,8 @@ class BlenderRenderer:
     version = VERSION
 
     def __init__(self, width: int, height: int, world: WorldConfig) -> None:
-        """Start Blender. Raises UserError if the module `bpy` is missing or of another release."""
-        try:
-            installed = version("bpy")
-        except PackageNotFoundError:
-            installed = None
-        if installed != BPY:
-            raise UserError(
-                f"benchmark.renderer=blender needs Blender's module bpy {BPY} (installed: "
-                f"{installed}): install it with pip install -e '.[blender]', or use "
-                "benchmark.renderer=bullet",
-                code="missing-package",
-            )
+        """Start Blender. Raises UserError as `check_blender` does."""
+        check_blender()
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as the worker
         # Without -P, imports in the worker would find the modules of this folder first.
         self._worker = subprocess.Popen(

@@ -11,6 +11,9 @@ import psutil
 import pytest
 from PIL import Image
 
+from conf.compose import compose
+from conf.schema import BuildCommand
+from data.build import ensure_benchmark
 from data.records import Scene
 from data.render import blender, get_renderer
 from data.render.bullet import BulletRenderer
@@ -69,6 +72,14 @@ def test_blender_without_its_module_is_an_error(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(blender, "BPY", "0.0.0")
     with raises_user_error("missing-package", contains=("0.0.0", ".[blender]")):
         get_renderer({"renderer": "blender", "width": 48, "height": 32, "world": asdict(CLEVRER)})
+
+
+def test_blender_is_checked_before_a_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blender, "BPY", "0.0.0")
+    cfg = compose("data.build", BuildCommand, ["benchmark=small", "benchmark.renderer=blender"])
+    with raises_user_error("missing-package", contains="0.0.0"):
+        ensure_benchmark(cfg.benchmark, tmp_path, workers=1)
+    assert not any(tmp_path.iterdir())
 
 
 def test_crash_of_blender_names_the_frame(
