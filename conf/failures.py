@@ -94,7 +94,7 @@ def _output_is_closed() -> bool:
 
 def _exit_after_failed_write(path: str, reason: str) -> NoReturn:
     hint = "fix this and run the same command again to resume"
-    _exit(1, f"error: {path}: {reason}; {hint}  [write-failed]")
+    _exit(1, f"error: {path}: {reason}; {hint}  [file-error]")
 
 
 def _exit(status: int, message: str) -> NoReturn:

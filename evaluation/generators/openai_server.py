@@ -171,7 +171,8 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
         UserError: No server responds, one lacks the model or rejects the API key, or two serve
             different models under this name.
     """
-    problems, origins = [], {}
+    problems: dict[str, Exception] = {}
+    origins = {}
     for url in server.urls:
         try:
             with openai.OpenAI(
@@ -181,7 +182,7 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
         except openai.AuthenticationError as error:
             raise authentication_error(url, error) from error
         except (openai.OpenAIError, *MALFORMED_REPLY_ERRORS) as error:
-            problems.append(f"{url}: {error.__cause__ or error}")
+            problems[url] = error
             continue
         if server.model not in models:
             raise UserError(
@@ -193,9 +194,10 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
         parent = models.get(served.get("parent"), {}).get("root")
         origins[url] = {"root": served.get("root"), "parent": parent}
     if not origins:
+        errors = [f"{url}: {_describe(error)}" for url, error in problems.items()]
+        advice = " or ".join(dict.fromkeys(map(_advise, problems.values())))
         raise UserError(
-            f"no server of server.url lists its models ({'; '.join(problems)}): check that the URL "
-            "ends with /v1, or start a server with python -m teacher.serve frames=true",
+            f"no server of server.url lists its models ({'; '.join(errors)}): {advice}",
             code="no-server",
         )
     first, origin = next(iter(origins.items()))
@@ -206,3 +208,19 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
             code="different-models",
         )
     return origin
+
+
+def _describe(error: Exception) -> str:
+    """Return the error with which a server did not list its models, in one line."""
+    if isinstance(error, MALFORMED_REPLY_ERRORS):
+        return "the reply is no list of models"
+    return str(error.__cause__ or error).partition("\n")[0]
+
+
+def _advise(error: Exception) -> str:
+    """Return what to do about this error."""
+    if isinstance(error, openai.APIConnectionError):
+        return "start a server with python -m teacher.serve frames=true, or correct the address"
+    if isinstance(error, (openai.InternalServerError, openai.RateLimitError)):
+        return "run the same command again when the server accepts requests"
+    return "check that the URL is that of an OpenAI-compatible server and ends with /v1"

@@ -12,7 +12,7 @@ from conf.failures import report_failures
 from tests.children import run_child
 from tests.conf.toy_process import run_toy
 
-RESUME = "fix this and run the same command again to resume  [write-failed]\n"
+RESUME = "fix this and run the same command again to resume  [file-error]\n"
 
 
 def test_run_writes_its_record_and_can_be_repeated(folder):

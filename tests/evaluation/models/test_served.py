@@ -7,6 +7,8 @@ import io
 import json
 from dataclasses import replace
 from functools import partial
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -203,8 +205,36 @@ def test_a_server_reports_the_origin_of_its_models(start_server) -> None:
     with raises_user_error("unknown-model", contains=("server.model=other", "served, adapter")):
         served_origin(replace(config_of(server), model="other"))
     server.stop()
-    with raises_user_error("no-server", contains="http://127"):
+    with raises_user_error("no-server", contains=("http://127", "teacher.serve")):
         served_origin(config_of(server))
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "advice"),
+    [
+        (200, "<html>\nWelcome</html>", "no list of models): check that the URL"),
+        (404, "{}", "ends with /v1"),
+        (429, "{}", "run the same command again"),
+        (503, "{}", "run the same command again"),
+    ],
+)
+def test_what_to_do_about_a_server_depends_on_its_error(status, body, advice) -> None:
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body.encode())
+
+        def log_message(self, *args: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        cfg = ServerConfig(url=[f"http://127.0.0.1:{server.server_port}/v1"], model="any")
+        with raises_user_error("no-server", contains=advice):
+            served_origin(cfg)
+        server.shutdown()
 
 
 def test_a_revision_identifies_weights_that_a_server_does_not_describe(

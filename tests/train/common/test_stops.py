@@ -151,4 +151,4 @@ def test_weights_that_cannot_be_written_end_the_command(tmp_path, capsys, save):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert ended.value.code == 1
-    assert "[write-failed]" in capsys.readouterr().err
+    assert "[file-error]" in capsys.readouterr().err
