@@ -50,6 +50,7 @@ REMOVED_KEYS: dict[str, str] = {
     "cards": "use gpus instead",
     "train.keep": "use train.keep_checkpoints instead",
     "train.packing": "leave it out: samples of similar length are padded together",
+    "train.false_words": "leave it out: students are trained on true texts",
     "train.best": "use train.best_metric instead",
     "teacher.patience": "use teacher.unreachable_timeout instead",
     "server.patience": "use server.unreachable_timeout instead",

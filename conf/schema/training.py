@@ -100,10 +100,6 @@ class SftTrainConfig(StudentTrainConfig):
     facts: bool = False
     """Show the facts of an item as text instead of its frames. Such a model can be the teacher of
     train.distill; it cannot be evaluated."""
-    false_words: float = setting(0.0, least=0, below=1)
-    """Share of the words for places and relations in predictions and candidate analyses that are
-    replaced by false ones, others in each epoch. The student reads them, but is not trained to
-    write them, so that it learns to go on after a mistake. Validation is on true texts."""
     reuse_features: bool = False
     """Cache the frozen vision tower's features of each frame in up to half of the free memory. With
     an 8B model, the features of a frame take about 3 MB."""
@@ -113,12 +109,6 @@ class SftTrainConfig(StudentTrainConfig):
         if self.facts and self.regime == "answer_only":
             yield (
                 f"{group}facts=true with {group}regime=answer_only: facts need a regime with "
-                f"rationales, such as {group}regime=cot"
-            )
-        if self.false_words and self.regime == "answer_only":
-            yield (
-                f"{group}false_words={self.false_words} with {group}regime=answer_only: only "
-                f"rationales have such words; set {group}false_words=0, or choose a regime with "
                 f"rationales, such as {group}regime=cot"
             )
 

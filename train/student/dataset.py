@@ -24,24 +24,8 @@ from models.student.prompts import (
 from teacher.candidate_letters import relabel_text, reorder_candidates
 from teacher.narrator import write_facts, write_match_lines
 from teacher.vocabulary import choose_vocabulary, describe_item
-from train.common.false_words import falsify_words
 from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
-
-
-@dataclass(frozen=True)
-class Variation:
-    """How samples differ between epochs.
-
-    Attributes:
-        permute_candidates: Whether the order of the candidates differs.
-        false_words: Share of the words for places and relations that are replaced (see
-            `train.common.false_words`).
-    """
-
-    seed: int
-    permute_candidates: bool
-    false_words: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,11 +61,15 @@ class SupervisedItem:
         return " ".join(filter(None, parts))
 
     def lazy_sample(
-        self, frames: FrameReader, frame_count: int, variation: Variation | None = None
+        self, frames: FrameReader, frame_count: int, order_seed: int | None = None
     ) -> LazySample:
-        """Return a sample that shows `frame_count` frames of the prefix, the same in every epoch
-        unless `variation` is given."""
-        render = partial(self._render_in_epoch, frames, frame_count, variation)
+        """Return a sample that shows `frame_count` frames of the prefix.
+
+        Args:
+            order_seed: Seed with which the candidates are permuted in every epoch; None leaves
+                their order.
+        """
+        render = partial(self._render_in_epoch, frames, frame_count, order_seed)
         pairs = -(-frame_count // 2)
         picture_count = 0 if self.facts else pairs + len(LETTERS)
         return LazySample(self.text, picture_count, render, self.item.family)
@@ -94,15 +82,10 @@ class SupervisedItem:
         )
 
     def _render_in_epoch(
-        self, frames: FrameReader, frame_count: int, variation: Variation | None, epoch: int
+        self, frames: FrameReader, frame_count: int, order_seed: int | None, epoch: int
     ) -> Sample:
-        if variation is None:
-            return self.render(frames, frame_count)
-        seed = variation.seed
-        item = self.permuted(seed, epoch) if variation.permute_candidates else self
-        rng = seeded_rng("false words", seed, epoch, self.item.item_id)
-        text, spans = falsify_words(item.response, variation.false_words, rng)
-        return replace(item.render(frames, frame_count), response=text, false_spans=spans)
+        item = self if order_seed is None else self.permuted(order_seed, epoch)
+        return item.render(frames, frame_count)
 
     def permuted(self, seed: int, epoch: int) -> SupervisedItem:
         """Return a copy with permuted candidates, and with their new letters in its texts."""
@@ -182,16 +165,16 @@ def load_datasets(
     by_item = {r.item_id: r for r in rationales}
 
     def samples_of(
-        items: list[SelectionItem], variation: Variation | None = None
+        items: list[SelectionItem], order_seed: int | None = None
     ) -> dict[str, list[LazySample]]:
         by_mode = supervised_items(store, items, by_item, train.regime, cfg.teacher, train.facts)
         return {
-            mode: [s.lazy_sample(frames, frame_count, variation) for s in supervised]
+            mode: [s.lazy_sample(frames, frame_count, order_seed) for s in supervised]
             for mode, supervised in by_mode.items()
         }
 
-    variation = Variation(cfg.seed, train.permute_candidates, train.false_words)
-    training, validation = samples_of(training_items, variation), samples_of(validation_items)
+    order_seed = cfg.seed if train.permute_candidates else None
+    training, validation = samples_of(training_items, order_seed), samples_of(validation_items)
     samples = [sample for part in training.values() for sample in part]
     # With facts, items without rationale are left out.
     source = "teacher.narrate" if train.facts else "data.build"

@@ -11,10 +11,10 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from teacher.candidate_letters import reorder_candidates
 from teacher.predicates.extraction import extract_predicates
-from train.common.false_words import falsify_words
 from train.common.held_out import check_not_empty, held_out_scenes
 from train.student.dataset import prompt_corpus, uses_only
 from train.student.lazy_samples import seeded_rng
+from train.tiny_base.false_words import falsify_words
 from train.tiny_base.questions import KINDS, QUESTIONS, Question, make_question
 from train.tiny_base.samples import OracleSample, make_sample
 

@@ -6,8 +6,8 @@ generated_color/parse            share of the names whose colour is that of the 
                                  the name shares most words; likewise for material and shape
 generated_name_recall/parse      share of the objects named in the true answers to `parse` that the
                                  generated ones name too
-generated_moving/parse           share of the statements about an object's motion at the cut that
-                                 are right in whether it moves
+generated_moving/parse           share of the statements about an object's speed at the cut that are
+                                 right in whether it moves
 generated_heading/parse          share of the headings of moving objects at the cut that are right
 generated_region/predict         share of the claims about regions in answers to `predict` that the
                                  oracle supports, of those that it can decide; likewise for other
@@ -45,8 +45,6 @@ SECTION_PREFIXES = {"parse": "", "predict": "", "describe": "Candidate analysis:
 """The kinds of questions whose answers are read, and what they lack to be read as sections of a
 rationale. Answers to `compare` state predictions that need not be true. `explain` repeats what the
 other kinds ask for; of its answers, only the outcome is read."""
-MOTIONS = ("speed", "still", "direction")
-"""Kinds of claims that say or imply whether an object moves."""
 BATCH = 32
 
 
@@ -132,14 +130,15 @@ def _read_motions(claims: Sequence[Claim], predicates: Predicates) -> list[tuple
     facts = {each.object: each for each in predicates.objects}
     read = []
     for claim in claims:
-        if claim.when != CUT or not claim.affirmed or claim.kind not in MOTIONS:
+        if claim.when != CUT or not claim.affirmed:
             continue
         own = facts.get(claim.subjects[0]) if len(claim.subjects) == 1 else None
         if own is None or own.speed is None:
             continue
         moves = own.speed != "stationary"
-        is_said_still = claim.kind == "still" or claim.value == "stationary"
-        read.append(("moving", moves != is_said_still))
+        if claim.kind in ("speed", "still"):
+            is_said_still = claim.kind == "still" or claim.value == "stationary"
+            read.append(("moving", moves != is_said_still))
         if claim.kind == "direction" and moves and own.heading is not None:
             read.append(("heading", claim.value == own.heading))
     return read

@@ -18,7 +18,7 @@ from teacher.predicates.extraction import extract_predicates
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from train.student.dataset import SupervisedItem, Variation, supervised_items, tokenizer_corpus
+from train.student.dataset import SupervisedItem, supervised_items, tokenizer_corpus
 from train.student.lazy_samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
@@ -101,9 +101,9 @@ def test_an_order_depends_on_seed_epoch_and_item(micro_store, frames, student_cf
     assert first != orders(supervised[0], seed=1)
     assert first != second
     for permute in (True, False):
-        variation = Variation(0, permute)
+        seed = 0 if permute else None
         dataset = StudentDataset(
-            [s.lazy_sample(frames, student_cfg.frames, variation) for s in supervised]
+            [s.lazy_sample(frames, student_cfg.frames, seed) for s in supervised]
         )
         dataset.set_epoch(1)
         for k, s in enumerate(supervised):

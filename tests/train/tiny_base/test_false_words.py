@@ -10,7 +10,7 @@ from conf.schema import RelationBounds
 from teacher.narrator import write_rationale
 from teacher.validation.claim_extraction import extract_claims
 from tests.teacher.test_predicates import random_cases
-from train.common.false_words import ALTERNATIVES, FALSIFIED_SECTIONS, WORD, falsify_words
+from train.tiny_base.false_words import ALTERNATIVES, FALSIFIED_SECTIONS, WORD, falsify_words
 
 
 def test_words_are_replaced_by_others_of_their_kind() -> None:
