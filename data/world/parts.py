@@ -34,8 +34,9 @@ class Box:
 
     def intersect(self, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """Return each ray's parameter at its first intersection with the box; inf for none."""
-        half, position = np.array(self.half), np.array(self.position)
-        return intersect_box(half, position, self.quaternion, eye, rays)
+        to_local = rotation_matrix(self.quaternion)
+        origin = (eye - np.array(self.position)) @ to_local
+        return intersect_box(np.array(self.half), origin, rays @ to_local)
 
 
 def world_boxes(world: WorldConfig) -> tuple[Box, ...]:

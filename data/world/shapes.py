@@ -15,15 +15,16 @@ BOUNDING_RADIUS = {"sphere": RADIUS, "cylinder": RADIUS * 2**0.5, "cube": CUBE_H
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the (3, 3) rotation matrix of a unit quaternion in x y z w order."""
-    x, y, z, w = quaternion
-    return np.array(
+    """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4) in x y z w order."""
+    x, y, z, w = np.moveaxis(np.asarray(quaternion), -1, 0)
+    matrix = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+    return np.moveaxis(matrix, (0, 1), (-2, -1))
 
 
 def half_height(shape: str, scale: float) -> float:
@@ -32,74 +33,58 @@ def half_height(shape: str, scale: float) -> float:
 
 
 def intersect_object(
-    shape: str,
-    scale: float,
-    position: np.ndarray,
-    quaternion: np.ndarray,
-    eye: np.ndarray,
-    rays: np.ndarray,
+    shape: str, scale: float | np.ndarray, origin: np.ndarray, direction: np.ndarray
 ) -> np.ndarray:
-    """Return each ray's parameter at its first intersection with an object, (P,); inf for none."""
+    """Return each ray's parameter at its first intersection with an object, (P,); inf for none.
+
+    Args:
+        scale: Size of the object, or (P,) that of the object of each ray.
+        origin: (3,) origin of all rays, or (P, 3) origins, in the object's own coordinates.
+        direction: (P, 3) directions, likewise.
+    """
     if shape == "cube":
-        return intersect_box(np.full(3, CUBE_HALF * scale), position, quaternion, eye, rays)
-    radius = RADIUS * scale
-    origin, direction = _to_local(position, quaternion, eye, rays)
+        return intersect_box(CUBE_HALF * np.asarray(scale)[..., None], origin, direction)
+    radius = RADIUS * np.asarray(scale)
     with np.errstate(divide="ignore", invalid="ignore"):
         if shape == "sphere":
             return _solve_quadric(origin, direction, 3, radius)
         side = _solve_quadric(origin, direction, 2, radius)
-        on_side = np.abs(origin[2] + side * direction[:, 2]) <= radius
+        on_side = np.abs(origin[..., 2] + side * direction[..., 2]) <= radius
         side = np.where(on_side, side, np.inf)
-        cap = _slab(origin[2:], direction[:, 2:], radius)[0][:, 0]
-        across = origin[:2] + cap[:, None] * direction[:, :2]
-        on_cap = _squares(across) <= radius**2
+        cap = _slab(origin[..., 2], direction[..., 2], radius)[0]
+        across = origin[..., :2] + cap[:, None] * direction[..., :2]
+        on_cap = _dot(across, across) <= radius**2
         return np.minimum(side, np.where(on_cap & (cap > 0), cap, np.inf))
 
 
-def intersect_box(
-    half: np.ndarray,
-    position: np.ndarray,
-    quaternion: np.ndarray,
-    eye: np.ndarray,
-    rays: np.ndarray,
-) -> np.ndarray:
+def intersect_box(half: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return each ray's parameter at its first intersection with a box, (P,); inf for none.
 
     Args:
-        half: (3,) halves of the edges.
-        eye: (3,) origin of all rays, or (P, 3) origins.
+        half: Halves of the edges, (3,), or (P, 1) for the cube of each ray.
+        origin, direction: As for `intersect_object`.
     """
-    origin, direction = _to_local(position, quaternion, eye, rays)
     with np.errstate(divide="ignore", invalid="ignore"):
         low, high = _slab(origin, direction, half)
         low, high = reduce(np.maximum, low.T), reduce(np.minimum, high.T)
         return np.where((low <= high) & (low > 0), low, np.inf)
 
 
-def _to_local(
-    position: np.ndarray, quaternion: np.ndarray, eye: np.ndarray, rays: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return origins and directions of rays in a body's own coordinates."""
-    to_local = rotation_matrix(quaternion)
-    return (eye - position) @ to_local, rays @ to_local
-
-
 def _solve_quadric(
-    origin: np.ndarray, direction: np.ndarray, axes: int, radius: float
+    origin: np.ndarray, direction: np.ndarray, axes: int, radius: np.ndarray
 ) -> np.ndarray:
     """Return the first intersection with a sphere (3 axes) or an infinite z cylinder (2 axes)."""
-    o, d = origin[:axes], direction[:, :axes]
-    a = _squares(d)
-    b = d @ o
-    c = o @ o - radius**2
+    o, d = origin[..., :axes], direction[..., :axes]
+    a, b = _dot(d, d), _dot(d, o)
+    c = _dot(o, o) - radius**2
     discriminant = b * b - a * c
     t = (-b - np.sqrt(np.maximum(discriminant, 0))) / a
     return np.where((discriminant > 0) & (t > 0), t, np.inf)
 
 
-def _squares(vectors: np.ndarray) -> np.ndarray:
-    """Return squared lengths (P,), summed by column because numpy is slow along a short axis."""
-    return reduce(np.add, (vectors**2).T)
+def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return dot products (...), summed by column because numpy is slow along a short axis."""
+    return reduce(np.add, np.moveaxis(one * other, -1, 0))
 
 
 def _slab(

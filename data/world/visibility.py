@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
+from itertools import product
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from data.world.shapes import BOUNDING_RADIUS, half_height, intersect_object, ro
 
 MIN_VISIBLE = 0.05
 """Visible fraction up to which an object in view counts as hidden."""
+CORNERS = np.array([*product((-1.0, 1.0), repeat=3)])
+"""Corners (8, 3) of a cube with edges of length 2."""
 STRIDE = 2 / 105
 """Step between the rays that measure visibility, as a fraction of the length in px of a simulator
 unit in the middle of the image. In the world of CLEVRER, it is 2 px: one ray for every 2 x 2 pixels
@@ -49,65 +52,93 @@ def compute_visibility(
     scales = scales or [1.0] * len(objects)
     centre, depth = camera.project(positions)
     radius = np.array([BOUNDING_RADIUS[o.shape] * s for o, s in zip(objects, scales, strict=True)])
-    in_front = depth > radius + 0.05
-    # A square that contains the object in the image; 1.3 because off-axis spheres look larger.
-    half_side = np.where(in_front, 1.3 * camera.focal * radius / np.maximum(depth, 1e-3), 0.0)
-    low, high = centre - half_side[..., None], centre + half_side[..., None]
+    inner = np.array([half_height(o.shape, s) for o, s in zip(objects, scales, strict=True)])
+    low, high = _image_bounds(objects, positions, quaternions, scales, camera)
     size = np.array([camera.width, camera.height])
     stride = max(1, round(STRIDE * camera.magnification))
+
+    in_front = depth > radius + 0.05
+    outside = ~in_front | ((high < 0) | (low > size)).any(-1)
     inside = ((low >= 0) & (high <= size)).all(-1)
     # A ray meets the sphere inscribed in the object: one passes by its centre within a stride.
-    inscribed = np.array([half_height(o.shape, s) for o, s in zip(objects, scales, strict=True)])
     is_met = ((centre >= 0) & (centre < size)).all(-1)
-    is_met &= camera.focal * inscribed > 2 * stride * depth
-    # The image contains a part of the object, without which no fraction of it is visible.
-    certain = in_front & (inside | is_met)
-    outside = ~in_front | ((high < 0) | (low > size)).any(-1)
+    is_met &= camera.focal * inner > 2 * stride * depth
+    in_view = in_front & (inside | is_met)
+
     eye = np.asarray(camera.eye)
     hides = _may_hide(positions - eye, radius)
+    hides &= ((low[:, :, None] < high[:, None]) & (high[:, :, None] > low[:, None])).all(-1)
     hides &= ~outside[:, :, None] & ~outside[:, None, :]
-    behind_part = np.zeros_like(certain)
+    behind = hides.any(-1)
     for box in parts:
-        behind_part |= _box_may_hide(box, low, high, positions, radius, camera)
-    behind = hides.any(-1) | behind_part
-
-    in_view = certain.copy()
-    fraction = certain.astype(np.float64)
-
-    def intersect(f: int, k: int, rays: np.ndarray) -> np.ndarray:
-        shape, scale = objects[k].shape, scales[k]
-        return intersect_object(shape, scale, positions[f, k], quaternions[f, k], eye, rays)
+        behind |= _box_may_hide(box, low, high, positions, radius, camera)
 
     # Rays are needed only for objects behind something, and for those that may be out of view.
-    for f, i in np.argwhere(~outside & (~certain | behind)):
-        window = _pixels_around(low[f, i], high[f, i], camera, stride)
-        hidden_by = np.flatnonzero(hides[f, i])
-        is_behind_part = False
-        if behind_part[f, i]:
-            part_distances = _part_distances(camera, parts)[window].reshape(-1)
-            # Distances are depths, since rays advance by 1 along the optical axis.
-            is_behind_part = part_distances.min() < depth[f, i] + radius[i]
-            if certain[f, i] and part_distances.max() < depth[f, i] - radius[i]:
-                # Parts hide the object completely.
-                fraction[f, i] = 0.0
-                continue
-            if certain[f, i] and not is_behind_part and not len(hidden_by):
-                continue
-        rays = pixel_rays(camera)[window].reshape(-1, 3)
-        own = intersect(f, i, rays)
-        covered = np.isfinite(own)
-        in_view[f, i] = covered.any()
-        if not covered.any():
-            fraction[f, i] = 0.0
-            continue
-        rays, own = rays[covered], own[covered]
-        visible = np.ones(len(own), dtype=bool)
-        for j in hidden_by:
-            visible &= ~(intersect(f, j, rays) < own)
-        if is_behind_part:
-            visible &= ~(part_distances[covered] < own)
-        fraction[f, i] = visible.sum() / len(own)
+    pairs = [*map(tuple, np.argwhere(~outside & (behind | ~in_view)).tolist())]
+    # The grid of rays begins at the corner of a square around the bounding sphere.
+    half_side = 1.3 * camera.focal * radius / np.maximum(depth, 1e-3)
+    begin = np.maximum((centre - half_side[..., None]).astype(int), 0)
+    windows = [_grid_window(low[pair], high[pair], begin[pair], stride, camera) for pair in pairs]
+    rays = [pixel_rays(camera)[window].reshape(-1, 3) for window in windows]
+
+    intersect = partial(_intersect_objects, objects, np.array(scales), positions - eye, quaternions)
+    # Distances are depths, since rays advance by 1 along the optical axis.
+    distances = intersect(pairs, rays)
+    covered = [np.isfinite(each) for each in distances]
+    own = [each[covers] for each, covers in zip(distances, covered, strict=True)]
+    to_part = _part_distances(camera, parts)
+    visible = [
+        to_part[window].reshape(-1)[covers] >= each
+        for window, covers, each in zip(windows, covered, own, strict=True)
+    ]
+    hiders = [(k, f, j) for k, (f, i) in enumerate(pairs) for j in np.flatnonzero(hides[f, i])]
+    others = intersect([(f, j) for _, f, j in hiders], [rays[k][covered[k]] for k, _, _ in hiders])
+    for (k, _, _), each in zip(hiders, others, strict=True):
+        visible[k] &= each >= own[k]
+
+    fraction = in_view.astype(np.float64)
+    for (f, i), seen in zip(pairs, visible, strict=True):
+        in_view[f, i] = len(seen) > 0
+        fraction[f, i] = seen.mean() if len(seen) else 0.0
     return in_view, fraction
+
+
+def _intersect_objects(
+    objects: Sequence[SceneObject],
+    scales: np.ndarray,
+    centres: np.ndarray,
+    quaternions: np.ndarray,
+    pairs: Sequence[tuple[int, int]],
+    rays: Sequence[np.ndarray],
+) -> list[np.ndarray]:
+    """Return the distances (P,) at which rays (P, 3) of the camera first meet an object; inf for
+    those that do not.
+
+    All rays towards objects of a shape are intersected at once: most sets of rays are so small that
+    Python would take longer than numpy.
+
+    Args:
+        centres: (F, N, 3) positions of the objects relative to the camera.
+        pairs: The frame and the object of each set of rays.
+    """
+    distances = [np.empty(0)] * len(pairs)
+    for shape in sorted({each.shape for each in objects}):
+        chosen = [k for k, (_, each) in enumerate(pairs) if objects[each].shape == shape]
+        if not chosen:
+            continue
+        frames, each = np.array([pairs[k] for k in chosen]).T
+        counts = [len(rays[k]) for k in chosen]
+        to_local = rotation_matrix(quaternions[frames, each])
+        origins = -np.einsum("ka,kab->kb", centres[frames, each], to_local)
+        first = intersect_object(
+            shape,
+            np.repeat(scales[each], counts),
+            np.repeat(origins, counts, axis=0),
+            np.concatenate([rays[k] @ turn for k, turn in zip(chosen, to_local, strict=True)]),
+        )
+        for k, part in zip(chosen, np.split(first, np.cumsum(counts)[:-1]), strict=True):
+            distances[k] = part
+    return distances
 
 
 def _may_hide(centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -165,15 +196,56 @@ def _part_distances(camera: Camera, parts: tuple[Box, ...]) -> np.ndarray:
     for none."""
     rays = pixel_rays(camera)
     eye, flat = np.asarray(camera.eye), rays.reshape(-1, 3)
-    first = [box.intersect(eye, flat) for box in parts]
+    first = [np.full(len(flat), np.inf), *(box.intersect(eye, flat) for box in parts)]
     return np.min(first, axis=0).reshape(rays.shape[:2])
 
 
-def _pixels_around(
-    low: np.ndarray, high: np.ndarray, camera: Camera, stride: int
+def _image_bounds(
+    objects: Sequence[SceneObject],
+    positions: np.ndarray,
+    quaternions: np.ndarray,
+    scales: Sequence[float],
+    camera: Camera,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners (F, N, 2), lowest and highest, of rectangles that contain the objects in
+    the image. They are valid for objects that are in front of the camera as a whole."""
+    low, high = np.empty((2, *positions.shape[:2], 2))
+    for k, (each, scale) in enumerate(zip(objects, scales, strict=True)):
+        half = half_height(each.shape, scale)
+        if each.shape == "sphere":
+            bounds = _sphere_bounds(positions[:, k], half, camera)
+        else:
+            # A cylinder is as wide as it is high: a cube contains it.
+            corners = half * CORNERS @ np.swapaxes(rotation_matrix(quaternions[:, k]), -1, -2)
+            pixels, _ = camera.project(positions[:, k, None] + corners)
+            bounds = pixels.min(axis=-2), pixels.max(axis=-2)
+        low[:, k], high[:, k] = bounds
+    return low, high
+
+
+def _sphere_bounds(
+    centres: np.ndarray, radius: float, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rectangles of `_image_bounds` for a sphere with centres (F, 3)."""
+    local = (centres - np.asarray(camera.eye)) @ camera.axes.T
+    across, depth = local[:, :2], local[:, 2:]
+    # Planes through the camera touch the sphere at these angles to the optical axis.
+    angle = np.arctan2(across, depth)
+    spread = np.arcsin(np.minimum(radius / np.hypot(across, depth), 1))
+    middle = np.array([camera.width / 2, camera.height / 2])
+    return (
+        middle + camera.focal * np.tan(angle - spread),
+        middle + camera.focal * np.tan(angle + spread),
+    )
+
+
+def _grid_window(
+    low: np.ndarray, high: np.ndarray, begin: np.ndarray, stride: int, camera: Camera
 ) -> tuple[slice, slice]:
-    """Return every `stride`-th row and column of a square, as far as it is in the image."""
-    left, top = (max(int(bound), 0) for bound in low)
-    right, bottom = int(high[0]) + 1, int(high[1]) + 1
-    rows = slice(top, min(bottom, camera.height), stride)
-    return rows, slice(left, min(right, camera.width), stride)
+    """Return the rows and columns of a grid of pixels that begins at `begin`, as far as they are in
+    a rectangle and in the image."""
+    # The centre of pixel k is at k + 0.5.
+    first = begin + np.maximum(np.ceil((low - 0.5 - begin) / stride), 0).astype(int) * stride
+    last = np.minimum(np.floor(high - 0.5).astype(int) + 1, [camera.width, camera.height])
+    (left, top), (right, bottom) = first.tolist(), last.tolist()
+    return slice(top, bottom, stride), slice(left, right, stride)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -12,7 +12,7 @@ from conf.schema import PartConfig, PhysicsConfig, WorldConfig
 from conf.schema.world import ByMaterial, CameraConfig, ObjectsConfig, StartConfig
 from data.records import Scene, SceneObject
 from data.world import visibility
-from data.world.parts import Box, world_boxes
+from data.world.parts import world_boxes
 from data.world.physics import Body, shared_simulator
 from data.world.sampling import record_scene, sample_scene, simulate_without
 from data.world.shapes import BOUNDING_RADIUS, CUBE_HALF, RADIUS, half_height, rotation_matrix
@@ -78,24 +78,25 @@ def random_parts(rng: np.random.Generator, seed: int) -> Iterator[tuple[str, Par
 
 
 def test_visibility_is_the_same_if_all_rays_are_cast(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The conditions under which no rays are cast change nothing."""
+    """Rays that are left out meet nothing, and objects for which no rays are cast are visible."""
     worlds = [random_world(seed) for seed in range(12)]
     samples = [sample_scene(world, 0, 0) for world in worlds]
 
     def record() -> list[Scene]:
         return [record_scene("", "train", *each) for each in zip(samples, worlds, strict=True)]
 
-    scenes = record()
-
     def all_pairs(centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
         return np.repeat(~np.eye(len(radius), dtype=bool)[None], len(centres), axis=0)
 
-    def all_objects(box: Box, low: np.ndarray, *rest: object) -> np.ndarray:
-        return np.ones(low.shape[:-1], dtype=bool)
+    def whole_image(
+        objects: Sequence[SceneObject], positions: np.ndarray, *rest: object
+    ) -> tuple[np.ndarray, np.ndarray]:
+        low = np.full((*positions.shape[:2], 2), -1.0)
+        return low, low + 1000
 
+    scenes = record()
     monkeypatch.setattr(visibility, "_may_hide", all_pairs)
-    monkeypatch.setattr(visibility, "_box_may_hide", all_objects)
-    monkeypatch.setattr(visibility, "half_height", lambda shape, scale: 0.0)
+    monkeypatch.setattr(visibility, "_image_bounds", whole_image)
     hidden = 0
     for scene, other in zip(scenes, record(), strict=True):
         assert (scene.in_view == other.in_view).all()
