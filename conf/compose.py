@@ -50,7 +50,7 @@ REMOVED_KEYS: dict[str, str] = {
     "cards": "use gpus instead",
     "train.keep": "use train.keep_checkpoints instead",
     "train.packing": "leave it out: samples of similar length are padded together",
-    "train.false_words": "leave it out: students are trained on true texts",
+    "train.false_words": "leave it out: it did not raise the accuracy",
     "train.best": "use train.best_metric instead",
     "teacher.patience": "use teacher.unreachable_timeout instead",
     "server.patience": "use server.unreachable_timeout instead",
@@ -86,6 +86,11 @@ def config_name(command: str) -> str:
 
 def compose(command: str, schema: type, overrides: list[str]) -> Any:
     """Compose the settings of one run as an instance of `schema`. Raises SettingsError."""
+    if empty := [o for o in overrides if re.fullmatch(r"[^=]+=\s*{\s*}", o)]:
+        raise SettingsError(
+            f"{empty[0]} changes nothing, because the entries of the preset stay: set each entry "
+            "that should change, as in KEY.NAME=VALUE"
+        )
     with open_hydra(command, schema):
         cfg = compose_config(command, [allow_new_key(o, schema) for o in overrides])
         with open_dict(cfg):
@@ -96,18 +101,10 @@ def compose(command: str, schema: type, overrides: list[str]) -> Any:
 def allow_new_key(override: str, schema: type) -> str:
     """Return an override with which Hydra accepts a new key of a dict of values, such as
     `benchmark.selection.observation.window`: `++KEY=VALUE` instead of `KEY=VALUE`.
-
-    Raises:
-        SettingsError: The override gives a dict no entries, which Hydra would ignore.
     """
-    key, _, value = override.partition("=")
+    key = override.partition("=")[0]
     for name in key.split("."):
         hint = get_type_hints(schema).get(name)
-        if get_origin(hint) is dict and key.endswith(name) and value.split() == ["{}"]:
-            raise SettingsError(
-                f"{override} changes nothing, because the entries of a preset stay: set each entry "
-                f"that should change, as in {key}.NAME=..."
-            )
         if get_origin(hint) is dict and not is_dataclass(get_args(hint)[1]):
             return f"++{override}"
         groups = [t for t in (hint, *get_args(hint)) if is_dataclass(t)]

@@ -28,16 +28,16 @@ FAILED_WRITE = r"PytorchStreamWriter|unexpected pos|\(os error (27|28|122)\)"
 message gives no cause."""
 FULL_DISK_BYTES = 1 << 20
 """Free space below which a disk counts as full."""
-WRITE_ERRORS = {
+FILE_ERRORS = {
     "ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM", "ENOTDIR", "EISDIR", "EEXIST",
     "ENAMETOOLONG",
 }  # fmt: skip
-"""Names in `errno` of the errors of writing that the user can correct."""
+"""Names in `errno` of the errors of reading and writing that the user can correct."""
 
 
 @contextmanager
 def report_failures(folder: str = ".") -> Iterator[None]:
-    """Exit with a message after a UserError, an interruption, a failed write or an import of a
+    """Exit with a message after a UserError, an interruption, an error of a file or an import of a
     package that is not installed. Exit without one if nobody reads the output any more, as after
     `| head`.
 
@@ -69,17 +69,17 @@ def report_failures(folder: str = ".") -> Iterator[None]:
             raise
         _end_process(128 + signal.SIGPIPE)
     except OSError as error:
-        if errno.errorcode.get(error.errno) not in WRITE_ERRORS:
+        if errno.errorcode.get(error.errno) not in FILE_ERRORS:
             raise
-        _exit_after_failed_write(str(error.filename or folder), str(error.strerror))
+        _exit_after_file_error(str(error.filename or folder), str(error.strerror))
     except Exception as error:
         if world_size() > 1 and re.search(PEER_ENDED, str(error)):
             _end_process(1)
         if os.path.exists(folder) and shutil.disk_usage(folder).free < FULL_DISK_BYTES:
-            _exit_after_failed_write(folder, os.strerror(errno.ENOSPC))
+            _exit_after_file_error(folder, os.strerror(errno.ENOSPC))
         if not re.search(FAILED_WRITE, str(error)):
             raise
-        _exit_after_failed_write(folder, f"a file was not written ({error})")
+        _exit_after_file_error(folder, f"a file was not written ({error})")
 
 
 def _output_is_closed() -> bool:
@@ -92,7 +92,7 @@ def _output_is_closed() -> bool:
     return is_closed
 
 
-def _exit_after_failed_write(path: str, reason: str) -> NoReturn:
+def _exit_after_file_error(path: str, reason: str) -> NoReturn:
     hint = "fix this and run the same command again to resume"
     _exit(1, f"error: {path}: {reason}; {hint}  [file-error]")
 

@@ -63,7 +63,7 @@ Other settings may change, because the name of a file in `PARTS` is a hash of it
 @command("data.build", BuildCommand)
 def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
     if cfg.frames != "none":
-        check_renderer(cfg.benchmark)
+        check_renderer(cfg.benchmark, Path(cfg.store))
     workers = Workers(cfg.workers, cfg.parallel)
     store = ensure_items(cfg.benchmark, Path(cfg.store), workers, cfg.strict, cfg.verify)
     prerender_frames(store, cfg.frames, cfg.frames_gb, workers)
@@ -73,18 +73,18 @@ def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
 
 def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
     """Open a benchmark as `ensure_items` does, and render the frames that its records refer to."""
-    if not (root / cfg.store_name).exists():
-        check_renderer(cfg)
+    check_renderer(cfg, root)
     store = ensure_items(cfg, root, Workers(workers))
     if not (store.folder / FRAMES_FOLDER / FRAMES_RECORD).exists():
         prerender_frames(store, "named", None, Workers(workers))
     return store
 
 
-def check_renderer(cfg: BenchmarkConfig) -> None:
-    """Raises UserError if Blender is to render the frames and is not installed. Without this check,
-    the error would come after the simulation of the scenes."""
-    if cfg.renderer == "blender":
+def check_renderer(cfg: BenchmarkConfig, root: Path) -> None:
+    """Raises UserError if a benchmark that is not built yet needs Blender, as `check_blender` does.
+    Without this check, the error would come after the simulation of the scenes."""
+    is_rendered = cfg.simulator == "bullet" and cfg.renderer == "blender"
+    if is_rendered and not (root / cfg.store_name).exists():
         check_blender()
 
 

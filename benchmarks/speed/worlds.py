@@ -2,10 +2,10 @@
 
     python -m benchmarks.speed.worlds --repeats 3 --sheet docs/worlds.webp
 
-Each repeat simulates the same numbers of scenes in every world and renders frames of them, in turn,
-in one process. The table has the medians of the CPU time: scenes per second, frames per second, and
-their ratios to the world `clevrer` of the same repeat. `--sheet` also draws the first scene of each
-world, at six moments.
+Each repeat simulates the same number of scenes in every world and renders frames of some, in one
+process, one scene of each world after the other. The table has the medians of the CPU time: scenes
+per second, frames per second, and their ratios to the world `clevrer` of the same repeat. `--sheet`
+also draws the first scene of each world, at six moments.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ SIZE = 240, 160
 """Width and height of the rendered frames, px."""
 MOMENTS = 6
 """Frames of a scene on the sheet."""
-RENDERED = 25
-"""Frames of a scene that are rendered for the measurement."""
+RENDERED, RENDERED_SCENES = 25, 8
+"""Frames of a scene that are rendered for the measurement, and the number of such scenes."""
 WORLDS = list_presets("data.build", BuildCommand)["world"]
 
 
@@ -42,24 +42,34 @@ def preset_world(name: str) -> WorldConfig:
     return compose("data.build", BuildCommand, overrides).benchmark.world
 
 
-def simulate(world: WorldConfig, scenes: int, seed: int) -> tuple[list[Scene], float]:
-    """Simulate scenes, and return them with the CPU seconds per scene."""
-    start = time.process_time()
-    simulated = [
-        record_scene(f"{world.name}-{k}", "train", sample_scene(world, seed, k), world)
-        for k in range(scenes)
-    ]
-    return simulated, (time.process_time() - start) / scenes
+def simulate(world: WorldConfig, seed: int, index: int) -> Scene:
+    """Simulate a scene of a world."""
+    name = f"{world.name}-{seed}-{index}"
+    return record_scene(name, "train", sample_scene(world, seed, index), world)
 
 
-def render(world: WorldConfig, scenes: list[Scene]) -> float:
-    """Render frames of scenes, and return the CPU seconds per frame."""
-    renderer = BulletRenderer(*SIZE, world)
-    start = time.process_time()
-    for scene in scenes:
-        for frame in moments(scene, RENDERED):
-            renderer.render(scene, frame)
-    return (time.process_time() - start) / (len(scenes) * RENDERED)
+def measure(scene_count: int, seed: int) -> dict[str, np.ndarray]:
+    """Simulate scenes and render frames of some, of all worlds in turn, so that changes of the
+    machine's speed concern all worlds alike.
+
+    Returns:
+        For each world, the CPU seconds per scene and per frame.
+    """
+    worlds = {name: preset_world(name) for name in WORLDS}
+    renderers = {name: BulletRenderer(*SIZE, world) for name, world in worlds.items()}
+    seconds = {name: np.zeros(2) for name in worlds}
+    for index in range(scene_count):
+        for name, world in worlds.items():
+            start = time.process_time()
+            scene = simulate(world, seed, index)
+            seconds[name][0] += (time.process_time() - start) / scene_count
+            if index < RENDERED_SCENES:
+                start = time.process_time()
+                for frame in moments(scene, RENDERED):
+                    renderers[name].render(scene, frame)
+                frames = RENDERED * min(scene_count, RENDERED_SCENES)
+                seconds[name][1] += (time.process_time() - start) / frames
+    return seconds
 
 
 def moments(scene: Scene, count: int) -> list[int]:
@@ -72,7 +82,7 @@ def draw_sheet(path: Path, seed: int) -> None:
     rows = []
     for name in WORLDS:
         world = preset_world(name)
-        (scene,), _ = simulate(world, 1, seed)
+        scene = simulate(world, seed, 0)
         renderer = BulletRenderer(*SIZE, world)
         images = [renderer.render(scene, frame) for frame in moments(scene, MOMENTS)]
         rows.append(np.concatenate([np.asarray(image) for image in images], axis=1))
@@ -90,11 +100,7 @@ def main() -> None:
         draw_sheet(args.sheet, args.seed)
     measured = defaultdict(list)
     for repeat in range(args.repeats):
-        seconds = {}
-        for name in WORLDS:
-            world = preset_world(name)
-            scenes, per_scene = simulate(world, args.scenes, args.seed + repeat)
-            seconds[name] = np.array([per_scene, render(world, scenes[:4])])
+        seconds = measure(args.scenes, args.seed + repeat)
         for name, pair in seconds.items():
             measured[name].append([*1 / pair, *seconds["clevrer"] / pair])
     columns = ["scenes/s", "frames/s", "scenes, ratio", "frames, ratio"]

@@ -73,7 +73,7 @@ class Camera:
         return np.stack([x, y, np.ones_like(x)], axis=-1) @ self.axes
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=16)
 def pixel_rays(camera: Camera) -> np.ndarray:
     """Return world directions (H, W, 3), not normalised, through the centres of all pixels."""
     return camera.rays(*np.meshgrid(np.arange(camera.width), np.arange(camera.height)))

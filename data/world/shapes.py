@@ -38,7 +38,7 @@ def intersect_object(
     """Return each ray's parameter at its first intersection with an object, (P,); inf for none.
 
     Args:
-        scale: Size of the object, or (P,) that of the object of each ray.
+        scale: Size of the object, or (P,) sizes, one for each ray.
         origin: (3,) origin of all rays, or (P, 3) origins, in the object's own coordinates.
         direction: (P, 3) directions, likewise.
     """
@@ -61,7 +61,7 @@ def intersect_box(half: np.ndarray, origin: np.ndarray, direction: np.ndarray) -
     """Return each ray's parameter at its first intersection with a box, (P,); inf for none.
 
     Args:
-        half: Halves of the edges, (3,), or (P, 1) for the cube of each ray.
+        half: (3,) halves of the edges; for cubes also (1,), or (P, 1) with one cube for each ray.
         origin, direction: As for `intersect_object`.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -73,7 +73,8 @@ def intersect_box(half: np.ndarray, origin: np.ndarray, direction: np.ndarray) -
 def _solve_quadric(
     origin: np.ndarray, direction: np.ndarray, axes: int, radius: np.ndarray
 ) -> np.ndarray:
-    """Return the first intersection with a sphere (3 axes) or an infinite z cylinder (2 axes)."""
+    """Return the first intersection with a sphere (3 axes) or an infinite z cylinder (2 axes) of
+    one radius, or of (P,) radii."""
     o, d = origin[..., :axes], direction[..., :axes]
     a, b = _dot(d, d), _dot(d, o)
     c = _dot(o, o) - radius**2

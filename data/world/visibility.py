@@ -60,7 +60,9 @@ def compute_visibility(
     in_front = depth > radius + 0.05
     outside = ~in_front | ((high < 0) | (low > size)).any(-1)
     inside = ((low >= 0) & (high <= size)).all(-1)
-    # A ray meets the sphere inscribed in the object: one passes by its centre within a stride.
+    # In each axis, a ray passes within a stride of a centre that is in the image. It meets the
+    # sphere inscribed in the object if the radius in the image is above sqrt(2) strides. A factor
+    # of 2 leaves a margin.
     is_met = ((centre >= 0) & (centre < size)).all(-1)
     is_met &= camera.focal * inner > 2 * stride * depth
     in_view = in_front & (inside | is_met)
@@ -69,16 +71,16 @@ def compute_visibility(
     hides = _may_hide(positions - eye, radius)
     hides &= ((low[:, :, None] < high[:, None]) & (high[:, :, None] > low[:, None])).all(-1)
     hides &= ~outside[:, :, None] & ~outside[:, None, :]
-    behind = hides.any(-1)
+    may_be_hidden = hides.any(-1)
     for box in parts:
-        behind |= _box_may_hide(box, low, high, positions, radius, camera)
+        may_be_hidden |= _box_may_hide(box, low, high, positions, radius, camera)
 
-    # Rays are needed only for objects behind something, and for those that may be out of view.
-    pairs = [*map(tuple, np.argwhere(~outside & (behind | ~in_view)).tolist())]
-    # The grid of rays begins at the corner of a square around the bounding sphere.
+    # Rays are needed only for objects that others may hide, and for those that may be out of view.
+    pairs = [*map(tuple, np.argwhere(~outside & (may_be_hidden | ~in_view)).tolist())]
+    # The grid of an object's rays has a point at the corner of a square around the object.
     half_side = 1.3 * camera.focal * radius / np.maximum(depth, 1e-3)
-    begin = np.maximum((centre - half_side[..., None]).astype(int), 0)
-    windows = [_grid_window(low[pair], high[pair], begin[pair], stride, camera) for pair in pairs]
+    point = np.maximum((centre - half_side[..., None]).astype(int), 0)
+    windows = [_grid_window(low[pair], high[pair], point[pair], stride, camera) for pair in pairs]
     rays = [pixel_rays(camera)[window].reshape(-1, 3) for window in windows]
 
     intersect = partial(_intersect_objects, objects, np.array(scales), positions - eye, quaternions)
@@ -123,21 +125,22 @@ def _intersect_objects(
     """
     distances = [np.empty(0)] * len(pairs)
     for shape in sorted({each.shape for each in objects}):
-        chosen = [k for k, (_, each) in enumerate(pairs) if objects[each].shape == shape]
+        chosen = [k for k, (_, index) in enumerate(pairs) if objects[index].shape == shape]
         if not chosen:
             continue
-        frames, each = np.array([pairs[k] for k in chosen]).T
+        frames, indices = np.array([pairs[k] for k in chosen]).T
         counts = [len(rays[k]) for k in chosen]
-        to_local = rotation_matrix(quaternions[frames, each])
-        origins = -np.einsum("ka,kab->kb", centres[frames, each], to_local)
+        to_local = rotation_matrix(quaternions[frames, indices])
+        origins = -np.einsum("ka,kab->kb", centres[frames, indices], to_local)
+        directions = [rays[k] @ matrix for k, matrix in zip(chosen, to_local, strict=True)]
         first = intersect_object(
             shape,
-            np.repeat(scales[each], counts),
+            np.repeat(scales[indices], counts),
             np.repeat(origins, counts, axis=0),
-            np.concatenate([rays[k] @ turn for k, turn in zip(chosen, to_local, strict=True)]),
+            np.concatenate(directions),
         )
-        for k, part in zip(chosen, np.split(first, np.cumsum(counts)[:-1]), strict=True):
-            distances[k] = part
+        for k, own in zip(chosen, np.split(first, np.cumsum(counts)[:-1]), strict=True):
+            distances[k] = own
     return distances
 
 
@@ -145,8 +148,10 @@ def _may_hide(centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Return whether object j may hide a part of object i, (F, N, N) by frame, i and j.
 
     This requires that their bounding spheres overlap in the image, and that they intersect or j is
-    in front of i. The radical plane of disjoint spheres separates them, and the camera is on the
-    side of the sphere of which its power is less. Every ray meets this sphere first.
+    in front of i. The power of a point is its squared distance from a sphere's centre minus the
+    squared radius. The points with equal powers form a plane, which separates two disjoint spheres.
+    The camera is on the side of the sphere with the lower power, so every ray meets this sphere
+    first.
 
     Args:
         centres: (F, N, 3) positions relative to the camera.
@@ -174,11 +179,12 @@ def _box_may_hide(
 ) -> np.ndarray:
     """Return whether a box may hide a part of each object, (F, N).
 
-    This requires that the box and the object overlap in the image, and that no face of the box
-    separates the object from it, on the side of the camera.
+    This requires that the box and the object overlap in the image. It also requires that no face of
+    the box has both the camera and the whole object in front of it: otherwise a ray would meet the
+    object before the box.
 
     Args:
-        low, high: (F, N, 2) corners of squares that contain the objects in the image.
+        low, high: (F, N, 2) corners of rectangles that contain the objects in the image.
     """
     pixels, _ = camera.project(box.corners)
     overlap = ((low <= pixels.max(axis=0)) & (high >= pixels.min(axis=0))).all(-1)
@@ -190,7 +196,7 @@ def _box_may_hide(
     return overlap & ~((outside >= radius[:, None]) & faces_camera).any(-1)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=16)
 def _part_distances(camera: Camera, parts: tuple[Box, ...]) -> np.ndarray:
     """Return the parameter of each pixel's ray at its first intersection with a part (H, W); inf
     for none."""
@@ -208,14 +214,14 @@ def _image_bounds(
     camera: Camera,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners (F, N, 2), lowest and highest, of rectangles that contain the objects in
-    the image. They are valid for objects that are in front of the camera as a whole."""
+    the image. They are valid for objects whose bounding spheres are in front of the camera."""
     low, high = np.empty((2, *positions.shape[:2], 2))
     for k, (each, scale) in enumerate(zip(objects, scales, strict=True)):
         half = half_height(each.shape, scale)
         if each.shape == "sphere":
             bounds = _sphere_bounds(positions[:, k], half, camera)
         else:
-            # A cylinder is as wide as it is high: a cube contains it.
+            # A cylinder is as wide as it is high, so that a cube contains it.
             corners = half * CORNERS @ np.swapaxes(rotation_matrix(quaternions[:, k]), -1, -2)
             pixels, _ = camera.project(positions[:, k, None] + corners)
             bounds = pixels.min(axis=-2), pixels.max(axis=-2)
@@ -240,12 +246,13 @@ def _sphere_bounds(
 
 
 def _grid_window(
-    low: np.ndarray, high: np.ndarray, begin: np.ndarray, stride: int, camera: Camera
+    low: np.ndarray, high: np.ndarray, point: np.ndarray, stride: int, camera: Camera
 ) -> tuple[slice, slice]:
-    """Return the rows and columns of a grid of pixels that begins at `begin`, as far as they are in
-    a rectangle and in the image."""
+    """Return the rows and columns of a grid of pixels, of which `point` is one, as far as they are
+    in a rectangle and in the image."""
     # The centre of pixel k is at k + 0.5.
-    first = begin + np.maximum(np.ceil((low - 0.5 - begin) / stride), 0).astype(int) * stride
+    least = np.maximum(np.ceil(low - 0.5), 0).astype(int)
+    first = least + (point - least) % stride
     last = np.minimum(np.floor(high - 0.5).astype(int) + 1, [camera.width, camera.height])
     (left, top), (right, bottom) = first.tolist(), last.tolist()
     return slice(top, bottom, stride), slice(left, right, stride)

@@ -24,6 +24,7 @@ from models.trained_runs import product_folder, run_title
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import TRUNCATED, Response
 from teacher.servers.server import (
+    API_KEY_VARIABLE,
     MALFORMED_REPLY_ERRORS,
     Messages,
     RequestFields,
@@ -194,12 +195,11 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
         parent = models.get(served.get("parent"), {}).get("root")
         origins[url] = {"root": served.get("root"), "parent": parent}
     if not origins:
-        errors = [f"{url}: {_describe(error)}" for url, error in problems.items()]
-        advice = " or ".join(dict.fromkeys(map(_advise, problems.values())))
-        raise UserError(
-            f"no server of server.url lists its models ({'; '.join(errors)}): {advice}",
-            code="no-server",
-        )
+        lines = [
+            f"{url} does not list its models ({_describe(error)}): {_advise(error)}"
+            for url, error in problems.items()
+        ]
+        raise UserError("\n".join(lines), code="no-server")
     first, origin = next(iter(origins.items()))
     if others := [url for url, other in origins.items() if other != origin]:
         raise UserError(
@@ -211,16 +211,19 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
 
 
 def _describe(error: Exception) -> str:
-    """Return the error with which a server did not list its models, in one line."""
+    """Describe in one line why a server did not list its models."""
     if isinstance(error, MALFORMED_REPLY_ERRORS):
-        return "the reply is no list of models"
+        return f"the reply is not a list of models, {type(error).__name__}"
     return str(error.__cause__ or error).partition("\n")[0]
 
 
 def _advise(error: Exception) -> str:
-    """Return what to do about this error."""
-    if isinstance(error, openai.APIConnectionError):
-        return "start a server with python -m teacher.serve frames=true, or correct the address"
-    if isinstance(error, (openai.InternalServerError, openai.RateLimitError)):
-        return "run the same command again when the server accepts requests"
-    return "check that the URL is that of an OpenAI-compatible server and ends with /v1"
+    """Return advice for a user whose server gave an error."""
+    match error:
+        case openai.APITimeoutError() | openai.InternalServerError() | openai.RateLimitError():
+            return "run the same command again when the server accepts requests"
+        case openai.APIConnectionError():
+            return "start a server with python -m teacher.serve frames=true, or correct server.url"
+        case openai.PermissionDeniedError():
+            return f"check the API key in the environment variable {API_KEY_VARIABLE}"
+    return "check that server.url is that of an OpenAI-compatible server and ends with /v1"

@@ -1,8 +1,8 @@
-"""Replace words for places and relations in training rationales by false ones.
+"""Replace words for places and relations in the answers that train the tiny base by false ones.
 
 A model makes mistakes in the predictions and descriptions that it writes. If it was trained only on
 true texts, it relies on these mistakes when it chooses a candidate. Here, some words are replaced,
-and the loss ignores them: the model learns to continue correctly after a mistake, but not to write
+and the loss ignores them: the base learns to continue correctly after a mistake, but not to write
 one.
 """
 

@@ -6,9 +6,10 @@ generated_color/parse            share of the names whose colour is that of the 
                                  the name shares most words; likewise for material and shape
 generated_name_recall/parse      share of the objects named in the true answers to `parse` that the
                                  generated ones name too
-generated_moving/parse           share of the statements about an object's speed at the cut that are
-                                 right in whether it moves
-generated_heading/parse          share of the headings of moving objects at the cut that are right
+generated_moving/parse           share of the statements about an object's speed at the cut that say
+                                 rightly whether the object moves
+generated_heading/parse          share of the headings stated of moving objects at the cut that are
+                                 right
 generated_region/predict         share of the claims about regions in answers to `predict` that the
                                  oracle supports, of those that it can decide; likewise for other
                                  kinds of claims
@@ -126,11 +127,11 @@ def _read(
 
 def _read_motions(claims: Sequence[Claim], predicates: Predicates) -> list[tuple[str, bool]]:
     """Return what claims say of the motion of single objects at the cut, and whether it is right:
-    whether each object moves, and the heading of those that move."""
+    whether each object moves, and the heading of those that move. Names are unique in a scene."""
     facts = {each.object: each for each in predicates.objects}
     read = []
     for claim in claims:
-        if claim.when != CUT or not claim.affirmed:
+        if claim.when != CUT or claim.candidate is not None or not claim.affirmed:
             continue
         own = facts.get(claim.subjects[0]) if len(claim.subjects) == 1 else None
         if own is None or own.speed is None:

@@ -212,7 +212,8 @@ def test_a_server_reports_the_origin_of_its_models(start_server) -> None:
 @pytest.mark.parametrize(
     ("status", "body", "advice"),
     [
-        (200, "<html>\nWelcome</html>", "no list of models): check that the URL"),
+        (200, "<html>\nWelcome</html>", ("not a list of models", "ends with /v1")),
+        (403, "{}", "OPENAI_API_KEY"),
         (404, "{}", "ends with /v1"),
         (429, "{}", "run the same command again"),
         (503, "{}", "run the same command again"),
