@@ -21,6 +21,7 @@ from hydra import initialize_config_module
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -86,22 +87,31 @@ def config_name(command: str) -> str:
 
 def compose(command: str, schema: type, overrides: list[str]) -> Any:
     """Compose the settings of one run as an instance of `schema`. Raises SettingsError."""
-    if empty := [o for o in overrides if re.fullmatch(r"[^=]+=\s*{\s*}", o)]:
-        raise SettingsError(
-            f"{empty[0]} changes nothing, because the entries of the preset stay: set each entry "
-            "that should change, as in KEY.NAME=VALUE"
-        )
     with open_hydra(command, schema):
+        refuse_empty_dicts(overrides)
         cfg = compose_config(command, [allow_new_key(o, schema) for o in overrides])
         with open_dict(cfg):
             del cfg["hydra"]
         return validate_settings(cfg, schema)
 
 
+def refuse_empty_dicts(overrides: list[str]) -> None:
+    """Raises SettingsError if an override contains `{}`, which Hydra merges without any effect."""
+
+    def has_empty(value: Any) -> bool:
+        return isinstance(value, dict) and (not value or any(map(has_empty, value.values())))
+
+    for override in OverridesParser.create().parse_overrides(overrides):
+        if has_empty(override.value()):
+            raise SettingsError(
+                f"{override.input_line}: an empty dict changes nothing, because the entries of the "
+                "preset stay: set each entry that should change, as in KEY.NAME=VALUE"
+            )
+
+
 def allow_new_key(override: str, schema: type) -> str:
     """Return an override with which Hydra accepts a new key of a dict of values, such as
-    `benchmark.selection.observation.window`: `++KEY=VALUE` instead of `KEY=VALUE`.
-    """
+    `benchmark.selection.observation.window`: `++KEY=VALUE` instead of `KEY=VALUE`."""
     key = override.partition("=")[0]
     for name in key.split("."):
         hint = get_type_hints(schema).get(name)
