@@ -30,8 +30,8 @@ def main(cfg: TinyBaseCommand, run: Run) -> dict[str, float]:
     from models.distributed import end_ranks, main_first, split_batch
     from models.precision import resolve_precision
     from train.common.held_out import shuffled
-    from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
     from train.tiny_base.generated_answers import measure_generated_answers
+    from train.tiny_base.samples import ItemSampler, split_items, tokenizer_corpus
     from train.tiny_base.training import STAGES, build_trainer
 
     for stage in STAGES:

@@ -37,10 +37,10 @@ from teacher.predicates.facts import Predicates
 from teacher.predicates.relations import Places
 from teacher.reading.claims import CUT, Claim
 from teacher.validation.claim_extraction import extract_claims
-from train.tiny_base.data import ItemSampler
 from train.tiny_base.mentions import CLOSEST, NAME
 from train.tiny_base.oracle_targets import WORDS
 from train.tiny_base.questions import Question
+from train.tiny_base.samples import ItemSampler
 
 SECTION_PREFIXES = {"parse": "", "predict": "", "describe": "Candidate analysis: "}
 """The kinds of questions whose answers are read, and what they lack to be read as sections of a

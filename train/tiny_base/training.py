@@ -40,12 +40,12 @@ from train.common.curves import plot_curves
 from train.common.journal import CURVES, JOURNAL, read_journal
 from train.common.muon import Muon
 from train.tiny_base.collator import OracleCollator, letter_token_ids
-from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import OracleHeads
 from train.tiny_base.oracle_targets import SPATIAL_WORDS, WORDS, OracleTargets
 from train.tiny_base.pointing import pointing_losses
 from train.tiny_base.probe import Probe
 from train.tiny_base.questions import KINDS
+from train.tiny_base.samples import ItemSampler
 from train.tiny_base.trace import (
     MIDDLE,
     NAMING,

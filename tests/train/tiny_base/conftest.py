@@ -11,10 +11,9 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from teacher.predicates.motion import find_cut
 from train.tiny_base.collator import OracleCollator, letter_token_ids
-from train.tiny_base.data import ItemSampler
 from train.tiny_base.heads import OracleHeads
 from train.tiny_base.oracle_targets import PICTURES
-from train.tiny_base.samples import OracleSample
+from train.tiny_base.samples import ItemSampler, OracleSample
 from train.tiny_base.trace import CHOOSING
 from train.tiny_base.training import first_token_ids
 

@@ -10,7 +10,7 @@ from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.responses import GeneratedText
 from train.tiny_base import generated_answers
-from train.tiny_base.data import ItemSampler, split_items
+from train.tiny_base.samples import ItemSampler, split_items
 
 pytestmark = pytest.mark.slow
 

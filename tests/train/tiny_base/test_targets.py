@@ -15,7 +15,6 @@ from data.store import Store
 from teacher.predicates.motion import find_cut, motion_start
 from teacher.statement_choice import UNSEEN_DISTANCE
 from train.tiny_base.collator import object_token_ids, spatial_token_ids
-from train.tiny_base.data import ItemSampler
 from train.tiny_base.located_mentions import described_state, measure_error
 from train.tiny_base.mentions import TokenizedText
 from train.tiny_base.oracle_targets import (
@@ -35,7 +34,7 @@ from train.tiny_base.oracle_targets import (
 )
 from train.tiny_base.pointing import locate_objects
 from train.tiny_base.questions import KINDS
-from train.tiny_base.samples import shown_objects
+from train.tiny_base.samples import ItemSampler, shown_objects
 
 GRID = 3
 """Visual tokens along the side of an image of 96 px."""

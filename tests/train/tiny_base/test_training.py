@@ -22,7 +22,7 @@ from tests.tiny_models import SMALL
 from tests.user_errors import raises_user_error
 from train.base import main
 from train.common.held_out import held_out_scenes
-from train.tiny_base.data import ItemSampler, split_items, tokenizer_corpus
+from train.tiny_base.samples import ItemSampler, split_items, tokenizer_corpus
 from train.tiny_base.training import (
     CHECKPOINT,
     TinyBaseTrainer,
