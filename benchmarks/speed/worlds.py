@@ -58,18 +58,18 @@ def measure(scene_count: int, seed: int) -> dict[str, np.ndarray]:
     worlds = {name: preset_world(name) for name in WORLDS}
     renderers = {name: BulletRenderer(*SIZE, world) for name, world in worlds.items()}
     seconds = {name: np.zeros(2) for name in worlds}
+    counts = scene_count, RENDERED * min(scene_count, RENDERED_SCENES)
     for index in range(scene_count):
         for name, world in worlds.items():
             start = time.process_time()
             scene = simulate(world, seed, index)
-            seconds[name][0] += (time.process_time() - start) / scene_count
+            seconds[name][0] += time.process_time() - start
             if index < RENDERED_SCENES:
                 start = time.process_time()
                 for frame in moments(scene, RENDERED):
                     renderers[name].render(scene, frame)
-                frames = RENDERED * min(scene_count, RENDERED_SCENES)
-                seconds[name][1] += (time.process_time() - start) / frames
-    return seconds
+                seconds[name][1] += time.process_time() - start
+    return {name: spent / counts for name, spent in seconds.items()}
 
 
 def moments(scene: Scene, count: int) -> list[int]:

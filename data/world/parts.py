@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data.world.shapes import intersect_box, rotation_matrix
+from data.world.shapes import CORNERS, intersect_box, rotation_matrix
 
 if TYPE_CHECKING:
     from conf.schema import PartConfig, WorldConfig
@@ -29,8 +28,7 @@ class Box:
     @property
     def corners(self) -> np.ndarray:
         """(8, 3) corners in world coordinates."""
-        signs = np.array(list(product((-1, 1), repeat=3)))
-        return np.array(self.position) + (signs * self.half) @ rotation_matrix(self.quaternion).T
+        return np.array(self.position) + (CORNERS * self.half) @ rotation_matrix(self.quaternion).T
 
     def intersect(self, eye: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """Return each ray's parameter at its first intersection with the box; inf for none."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import reduce
+from itertools import product
 
 import numpy as np
 
@@ -12,6 +13,8 @@ CUBE_HALF = 0.18
 """Half of a cube's edge, simulator units."""
 BOUNDING_RADIUS = {"sphere": RADIUS, "cylinder": RADIUS * 2**0.5, "cube": CUBE_HALF * 3**0.5}
 """Radius of each shape's bounding sphere, simulator units."""
+CORNERS = np.array([*product((-1, 1), repeat=3)])
+"""Corners (8, 3) of a cube with edges of length 2."""
 
 
 def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:

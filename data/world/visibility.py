@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
-from itertools import product
 
 import numpy as np
 
 from data.records import Scene, SceneObject
 from data.world.camera import Camera, pixel_rays
 from data.world.parts import Box
-from data.world.shapes import BOUNDING_RADIUS, half_height, intersect_object, rotation_matrix
+from data.world.shapes import (
+    BOUNDING_RADIUS,
+    CORNERS,
+    CUBE_HALF,
+    half_height,
+    intersect_object,
+    rotation_matrix,
+)
 
 MIN_VISIBLE = 0.05
 """Visible fraction up to which an object in view counts as hidden."""
-CORNERS = np.array([*product((-1.0, 1.0), repeat=3)])
-"""Corners (8, 3) of a cube with edges of length 2."""
 STRIDE = 2 / 105
 """Step between the rays that measure visibility, as a fraction of the length in px of a simulator
 unit in the middle of the image. In the world of CLEVRER, it is 2 px: one ray for every 2 x 2 pixels
@@ -217,14 +221,13 @@ def _image_bounds(
     the image. They are valid for objects whose bounding spheres are in front of the camera."""
     low, high = np.empty((2, *positions.shape[:2], 2))
     for k, (each, scale) in enumerate(zip(objects, scales, strict=True)):
-        half = half_height(each.shape, scale)
-        if each.shape == "sphere":
-            bounds = _sphere_bounds(positions[:, k], half, camera)
-        else:
-            # A cylinder is as wide as it is high, so that a cube contains it.
-            corners = half * CORNERS @ np.swapaxes(rotation_matrix(quaternions[:, k]), -1, -2)
-            pixels, _ = camera.project(positions[:, k, None] + corners)
+        if each.shape == "cube":
+            turned = CORNERS @ np.swapaxes(rotation_matrix(quaternions[:, k]), -1, -2)
+            pixels, _ = camera.project(positions[:, k, None] + CUBE_HALF * scale * turned)
             bounds = pixels.min(axis=-2), pixels.max(axis=-2)
+        else:
+            radius = BOUNDING_RADIUS[each.shape] * scale
+            bounds = _sphere_bounds(positions[:, k], radius, camera)
         low[:, k], high[:, k] = bounds
     return low, high
 
