@@ -35,7 +35,10 @@ RESULT_NEUTRAL_KEYS = {
 """Keys that do not change the result of a run. Their values may differ when a run is resumed, and
 they are not part of the run's name."""
 
-BOOKKEEPING_FILES = {"config.yaml", "run.json", "run.log", "output.log", "job.json"}
+LOCK = ".lock"
+"""Name of the file that is locked while a process uses a folder."""
+
+BOOKKEEPING_FILES = {"config.yaml", "run.json", "run.log", "output.log", "job.json", LOCK}
 """Files that may exist in a run's folder before the command writes its first result."""
 
 TRAINER_FOLDERS = {"student": "sft", "retriever": "contrastive"}
@@ -182,24 +185,42 @@ def other_settings_error(subject: str, changes: Sequence[str]) -> SettingsError:
 
 @contextmanager
 def lock_folder(folder: Path, busy: str) -> Iterator[None]:
-    """Hold an exclusive lock on a folder during the block.
+    """Hold an exclusive lock on a folder during the block; the lock is the file `.lock` in it.
 
     Raises:
         UserError: Another process holds the lock; `busy` is the message.
     """
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UserError(busy, code="in-use") from error
+    with lock_file(folder / LOCK, busy):
         yield
-    finally:
-        os.close(handle)
+
+
+@contextmanager
+def lock_file(path: Path, busy: str, wait: bool = False) -> Iterator[None]:
+    """Hold an exclusive lock on a file during the block; create it if it is missing.
+
+    The file is opened for writing, because NFS locks no other files exclusively.
+
+    Args:
+        wait: Log `busy` and wait while another process holds the lock.
+
+    Raises:
+        UserError: Another process holds the lock, and `wait` is not set; `busy` is the message.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a") as file:
+        if wait:
+            wait_for_lock(file.fileno(), busy)
+        else:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise UserError(busy, code="in-use") from error
+        yield
 
 
 def wait_for_lock(handle: int, busy: str) -> None:
-    """Take an exclusive lock on an open file or folder, and wait while another process holds it.
+    """Take an exclusive lock on a file that is open for writing, and wait while another process
+    holds it.
 
     Args:
         handle: File descriptor; closing it releases the lock.

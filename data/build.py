@@ -2,62 +2,58 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
-import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
 from conf.files import read_json, write_bytes
-from conf.runs import compare_settings, flatten, wait_for_lock
+from conf.runs import compare_settings, flatten, lock_file
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
+from data.checks.counts import count_records, summarize_store
+from data.frames.prerender import FRAMES_RECORD, prerender_frames
+from data.items.cells import (
+    family_quotas,
+    list_subtypes,
+    load_cached,
+    make_items_and_queries,
+)
+from data.items.database import make_databases
+from data.items.queries import BUILDERS
+from data.items.recipes import OBSERVATIONS
+from data.oracle.displacement import visible_positions
 from data.parallel import Workers
-from data.records import SPLITS
-from data.releases.transfer_suites import suite_name
+from data.records import COUNTERFACTUAL, SPLITS, Scene, SelectionItem
 from data.render.blender import check_blender
-from data.render.prerender import FRAMES_RECORD, prerender_frames
+from data.sources.scenes import keep_test_scenes, make_scenes
 from data.store import (
     FRAMES_FOLDER,
     MANIFEST,
     PARTS,
     PLAN,
     SCENES_FOLDER,
+    TABLES,
     Store,
-    built_files,
-    component_versions,
     hash_files,
-    load_scene,
     open_store,
     save_rows,
-    scene_path,
     with_checksum,
 )
-from data.tracks.build_items import (
-    OBSERVATIONS,
-    family_quotas,
-    item_families,
-    make_items_and_queries,
-    remove_unused_futures,
-)
-from data.tracks.retrieval import future
-from data.tracks.retrieval.database import make_databases
-from data.tracks.shortfalls import count_records, summarize_store
-from data.world.displacement import visible_positions
-from data.world.physics import generator_version
-from data.world.scenes import make_scenes
+from data.versions import component_versions
 
 log = logging.getLogger(__name__)
 
 SCENE_SETTINGS = ("simulator", "world", "seed", "test_share", "fps")
-"""Settings that determine the scenes. A killed build resumes only with the same values of these.
-Other settings may change, because the name of a file in `PARTS` is a hash of its job's inputs."""
+"""Settings that determine the content of the scenes. A killed build resumes only with the same
+values of these. Other settings may change: they determine which scenes there are, and the name of a
+file in `PARTS` is a hash of its job's inputs."""
 
 
 @command("data.build", BuildCommand)
@@ -66,7 +62,8 @@ def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
         check_renderer(cfg.benchmark, Path(cfg.store))
     workers = Workers(cfg.workers, cfg.parallel)
     store = ensure_items(cfg.benchmark, Path(cfg.store), workers, cfg.strict, cfg.verify)
-    prerender_frames(store, cfg.frames, cfg.frames_gb, workers)
+    if cfg.frames != "none":
+        prerender_frames(store, cfg.frames, cfg.frames_gb, workers)
     log.info(summarize_store(store))
     return {name: float(count) for name, count in store.manifest["counts"].items()}
 
@@ -124,49 +121,76 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
     with lock_partial_build(cfg, folder) as partial:
         if partial is None:
             return
-        scene_ids, invalid = make_scenes(cfg, partial, workers, strict)
+        scene_ids, left_out = make_scenes(cfg, partial, workers, strict)
+        scene_ids = keep_test_scenes(cfg, scene_ids)
         items, queries, dropped = make_items_and_queries(cfg, partial, scene_ids, workers)
-        if cfg.distractors == "balanced":
-            remove_unused_futures(partial, items)
-        scene_of = lru_cache(maxsize=None)(lambda name: load_scene(scene_path(partial, name)))
-        queries, databases, left_out = make_databases(cfg, queries, scene_ids, scene_of)
-        if not items and not queries:
-            names = [name for ids in scene_ids.values() for name in ids]
-            is_simulated = cfg.simulator == "bullet"
-            if is_simulated and not any(visible_positions(scene_of(n))[1].any() for n in names):
-                raise UserError(
-                    f"no scene of the benchmark {cfg.name} shows an object: move "
-                    "benchmark.world.camera, or benchmark.world.parts, which may hide the objects",
-                    code="impossible-world",
-                )
-            reasons = "".join(f" ({count} {what})" for what, count in invalid.items() if count)
-            raise UserError(
-                f"benchmark {cfg.name} would contain no item and no query{reasons}: raise "
-                "benchmark.scenes or the quotas, or lower benchmark.selection.min_displacement="
-                f"{cfg.selection.min_displacement}",
-                code="empty-benchmark",
-            )
         save_rows([i.to_row() for i in items], partial / "selection.parquet")
+        scene_of = functools.partial(load_cached, partial)
+        queries, databases, unused = make_databases(cfg, queries, scene_ids, scene_of)
+        if not items and not queries:
+            raise empty_benchmark(cfg, scene_ids, scene_of, left_out)
         save_rows([q.to_row() for q in queries], partial / "retrieval.parquet")
         rows = [{**vars(f), "database": name} for name in databases for f in databases[name]]
         save_rows(rows, partial / "database.parquet")
         counts, shortfalls = count_records(cfg, scene_ids, items, queries, databases)
+        scenes = list_used_scenes(partial, scene_ids, items)
+        used = {f"{SCENES_FOLDER}/{name}.npz" for name in scenes}
         manifest = {
             "name": cfg.store_name,
-            "suite": suite_name(cfg),
+            "suite": cfg.suite,
             "seed": cfg.seed,
             **component_versions(asdict(cfg)),
             "config": asdict(cfg),
             "world_changes": world_changes(cfg.world),
-            "counts": counts | invalid | dropped | left_out,
+            "counts": counts | left_out | dropped | unused,
             "shortfalls": shortfalls,
             "scenes": scene_ids,
-            "files": hash_files(partial, built_files(partial)),
+            "files": hash_files(partial, sorted([*TABLES, *used])),
         }
         write_bytes(partial / MANIFEST, json.dumps(with_checksum(manifest), indent=1).encode())
+        # The results of the jobs go first: a build that is killed from here on makes them again,
+        # together with the alternative futures to which they refer.
+        shutil.rmtree(partial / PARTS, ignore_errors=True)
+        for path in (partial / SCENES_FOLDER).glob("*.npz"):
+            if path.relative_to(partial).as_posix() not in used:
+                path.unlink()
         partial.rename(folder)
-        shutil.rmtree(folder / PARTS)
         (folder / PLAN).unlink()
+
+
+def list_used_scenes(
+    folder: Path, scene_ids: Mapping[str, Sequence[str]], items: Sequence[SelectionItem]
+) -> set[str]:
+    """Return the ids of the scenes of a benchmark, of their counterfactuals, and of the alternative
+    futures that items refer to. A killed build with other settings may have left further ones."""
+    used = {name for names in scene_ids.values() for name in names}
+    every = {path.stem for path in (folder / SCENES_FOLDER).glob("*.npz")}
+    used |= {name for name in every if name.partition(COUNTERFACTUAL)[0] in used}
+    return used | {candidate.scene_id for item in items for candidate in item.candidates}
+
+
+def empty_benchmark(
+    cfg: BenchmarkConfig,
+    scene_ids: Mapping[str, Sequence[str]],
+    scene_of: Callable[[str], Scene],
+    left_out: Mapping[str, int],
+) -> UserError:
+    """Return an error that says why a benchmark would contain no item and no query."""
+    names = [name for ids in scene_ids.values() for name in ids]
+    is_simulated = cfg.simulator == "bullet"
+    if is_simulated and not any(visible_positions(scene_of(n))[1].any() for n in names):
+        return UserError(
+            f"no scene of the benchmark {cfg.name} shows an object: move benchmark.world.camera, "
+            "or benchmark.world.parts, which may hide the objects",
+            code="impossible-world",
+        )
+    reasons = "".join(f" ({count} {what})" for what, count in left_out.items() if count)
+    return UserError(
+        f"benchmark {cfg.name} would contain no item and no query{reasons}: raise "
+        "benchmark.scenes or the quotas, or lower benchmark.selection.min_displacement="
+        f"{cfg.selection.min_displacement}",
+        code="empty-benchmark",
+    )
 
 
 def world_changes(world: WorldConfig) -> dict[str, Any]:
@@ -182,8 +206,8 @@ def world_changes(world: WorldConfig) -> dict[str, Any]:
 
 def check_quota_names(cfg: BenchmarkConfig) -> None:
     """Raises SettingsError if a quota is set for an unknown family, subtype or builder."""
-    known = {f"selection.{name}": list(f.cells) for name, f in item_families(cfg).items()}
-    known["retrieval.builders"] = [str(b) for b in future.BUILDERS]
+    known = {f"selection.{name}": [*names] for name, names in list_subtypes(cfg).items()}
+    known["retrieval.builders"] = [str(b) for b in BUILDERS]
     quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
     from conf.compose import nearest_key
 
@@ -199,7 +223,7 @@ def check_quota_names(cfg: BenchmarkConfig) -> None:
         options = known.get(key, [])
         if named and not options:
             problems.append(
-                f"benchmark.{key}: suite {suite_name(cfg)} lacks this family; remove its quotas"
+                f"benchmark.{key}: suite {cfg.suite} lacks this family; remove its quotas"
             )
         problems += [
             f"benchmark.{key}.{name}: unknown name; did you mean "
@@ -223,21 +247,20 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
         UserError: the partial build has other settings.
     """
     partial = folder.with_name(f".{folder.name}.partial")
-    partial.mkdir(parents=True, exist_ok=True)
     plan = {
-        "generator": generator_version(cfg.world.physics.rolling_friction),
+        "generator": component_versions(asdict(cfg))["generator"],
         "benchmark": {key: asdict(cfg)[key] for key in SCENE_SETTINGS},
         "counterfactual scenes": {
             split: getattr(cfg.retrieval.counterfactual, split) > 0 for split in SPLITS
         },
     }
-    handle = os.open(partial, os.O_RDONLY)
-    try:
-        wait_for_lock(handle, f"{folder} is being built by another process")
+    busy = f"{folder} is being built by another process"
+    with lock_file(partial.with_suffix(".lock"), busy, wait=True):
         if folder.exists():
             shutil.rmtree(partial, ignore_errors=True)
             yield None
             return
+        partial.mkdir(exist_ok=True)
         if (partial / PLAN).exists() and any((partial / SCENES_FOLDER).glob("*.npz")):
             # Simulating scenes can take hours, so a changed setting must not discard them silently.
             check_same_settings(read_json(partial / PLAN), plan, partial)
@@ -245,8 +268,6 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
             leftover.unlink()
         write_bytes(partial / PLAN, json.dumps(plan).encode())
         yield partial
-    finally:
-        os.close(handle)
 
 
 def check_same_settings(old: dict[str, Any], new: dict[str, Any], folder: Path) -> None:

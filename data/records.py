@@ -34,6 +34,8 @@ COLORS = ("gray", "red", "blue", "green", "brown", "cyan", "purple", "yellow")
 POOLS = ("future", "counterfactual")
 SPLITS = ("train", "test")
 FAMILIES = ("event", "time", "window")
+MATCHED_ANCHOR = "matched_anchor"
+"""Name of the suite of the matched-anchor items."""
 COUNTERFACTUAL, ALTERNATIVE = "-without-", "-alt-"
 """What follows the id of a scene in the ids of its counterfactuals and alternative futures."""
 
@@ -59,12 +61,14 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class Collision:
-    """The first contact of two objects."""
+    """A contact of two objects, from the first touch until they separate."""
 
     frame: int
-    """The first frame at or after the contact."""
+    """The first frame at or after the first touch; 0 if the objects touch from the start."""
     objects: tuple[int, int]
-    """Indices of the two objects."""
+    """Indices of the two objects, the lower one first."""
+    end: int
+    """The last frame in which the objects touch."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,8 @@ class Scene:
             hide it; in MoVi-A and Physion, whether a part of the object is visible.
         visible_fraction: (F, N) visible pixels divided by the pixels that the object would cover
             alone, 0 if it would cover none; NaN where a simulator's record lacks it.
-        collisions: first contacts in order of frame.
+        collisions: every contact of every pair, in order of frame (`data.oracle.contacts` has what
+            follows from them, such as the next collision); empty in alternative futures.
         image_size: (width, height) of the image plane that `image_positions` refers to.
         fps: frames per second.
         landings: landings in order of frame, for simulators that record contacts with the ground.
@@ -260,8 +265,8 @@ class RetrievalQuery(Record):
     target: FrameRef
     hard_negatives: tuple[FrameRef, ...] = ()
     removed_object: str | None = None
-    standard: bool = False
-    """Whether the query belongs to the standard test, on which retrievers are evaluated."""
+    asked_object: str | None = None
+    """The object whose place a counterfactual query asks for."""
 
     @classmethod
     def from_row(cls, row: dict[str, Any]) -> Self:

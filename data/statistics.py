@@ -17,8 +17,8 @@ log = logging.getLogger(__name__)
 @command("data.statistics", StatisticsCommand)
 def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_items
+    from data.checks.statistics import compute_statistics, format_statistics
     from data.parallel import Workers
-    from data.publish.statistics import compute_statistics, format_statistics
 
     # Small images are rendered for the shortcuts; the frames of the benchmark are not needed.
     store = ensure_items(cfg.benchmark, Path(cfg.store), Workers(cfg.workers))

@@ -25,7 +25,7 @@ import contextlib
 import hashlib
 import io
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -45,9 +45,7 @@ from data.records import (
     SceneObject,
     SelectionItem,
 )
-from data.render import RENDERERS
-from data.tracks.selection.distractors import BUILDERS_VERSIONS
-from data.world.physics import generator_version
+from data.versions import component_versions
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -61,19 +59,10 @@ PLAN = "plan.json"
 PARTS = "parts"
 """Folder of the results of a build's jobs; absent from a complete store."""
 SCENES_FOLDER, FRAMES_FOLDER = "scenes", "frames"
+TABLES = ("selection.parquet", "retrieval.parquet", "database.parquet")
 DATABASES = ("test", "future", "counterfactual")
 """Names of the databases of frames: of the standard test, of the future-state queries and of the
 counterfactual queries. Every frame of `test` is also in `future`."""
-
-
-def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
-    """Return the versions of the code that determines scenes, pixels, items and queries."""
-    is_rendered, renderer = config["simulator"] == "bullet", RENDERERS[config["renderer"]]
-    return {
-        "generator": generator_version(config["world"]["physics"]["rolling_friction"]),
-        "renderer": renderer.version if is_rendered else f"{config['simulator']}'s own frames",
-        "builders": BUILDERS_VERSIONS[config["distractors"]],
-    }
 
 
 def scene_path(folder: Path, scene_id: str) -> Path:
@@ -106,7 +95,7 @@ def load_scene(path: Path) -> Scene:
     """Read a scene's oracle."""
     with np.load(path) as file:
         header = json.loads(str(file["header"]))
-        collisions = ((c["frame"], tuple(c["objects"])) for c in header["collisions"])
+        collisions = ((c["frame"], tuple(c["objects"]), c["end"]) for c in header["collisions"])
         header |= {
             "objects": tuple(SceneObject(**o) for o in header["objects"]),
             "collisions": tuple(Collision(*c) for c in collisions),
@@ -148,12 +137,6 @@ def hash_files(folder: Path, names: Iterable[str]) -> dict[str, str]:
     with ThreadPoolExecutor(4) as pool:
         hashes = pool.map(lambda name: hash_file(folder / name), names)
         return dict(zip(names, hashes, strict=True))
-
-
-def built_files(folder: Path) -> list[str]:
-    """Relative paths of every scene and every table of a store, in order."""
-    paths = [*(folder / SCENES_FOLDER).glob("*.npz"), *folder.glob("*.parquet")]
-    return sorted(p.relative_to(folder).as_posix() for p in paths)
 
 
 def with_checksum(manifest: dict[str, Any]) -> dict[str, Any]:
@@ -208,8 +191,9 @@ class Store:
         return [RetrievalQuery.from_row(r) for r in kept]
 
     def standard_test(self) -> list[RetrievalQuery]:
-        """Return the queries of the standard test; their targets are in the database `test`."""
-        return [q for q in self.retrieval("test") if q.standard]
+        """Return the queries of the standard test: the future-state queries of the test split,
+        whose targets are in the database `test`."""
+        return self.retrieval("test")
 
     def database(self, name: str = "test") -> list[FrameRef]:
         """Return the frames of one of `DATABASES`."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from conf.errors import UserError
 from conf.schema.benchmark import store_name
+from data.frames.frame_cache import FrameReader
 from data.records import (
     FAMILIES,
     LETTERS,
@@ -23,7 +24,6 @@ from data.records import (
     SelectionItem,
     sample_prefix_frames,
 )
-from data.render.frame_cache import FrameReader
 from data.store import MANIFEST, Store, open_store
 from models.student.chat_requests import image_part
 from models.student.prompts import MODES, choose_instruction

@@ -38,7 +38,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.render.frame_cache import FrameReader
+    from data.frames.frame_cache import FrameReader
     from evaluation.generators import response_log
     from evaluation.generators.generator import item_sample, open_generator, response_settings
     from evaluation.metrics.reasons import measure_reasons
@@ -100,7 +100,7 @@ def select_items(
     Raises:
         UserError: The benchmark has no such items.
     """
-    from data.tracks.controls import MATCHED_ANCHOR
+    from data.records import MATCHED_ANCHOR
 
     items = store.selection("test", suite)
     if not items:
@@ -121,8 +121,9 @@ def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> lis
     """
     import numpy as np
 
-    from data.tracks.controls import MATCHED_ANCHOR, pair_items
-    from data.tracks.quota import interleave
+    from data.items.controls import pair_items
+    from data.records import MATCHED_ANCHOR
+    from data.seeded_order import interleave
 
     if limit is None:
         return items

@@ -32,7 +32,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.render.frame_cache import FrameReader
+    from data.frames.frame_cache import FrameReader
     from evaluation.embedders.embedder import open_embedders
     from evaluation.generators.generator import open_generator
     from evaluation.metrics import results

@@ -10,8 +10,8 @@ import pytest
 
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from data.build import ensure_benchmark
+from data.items.recipes import CELLS
 from data.store import Store, open_store
-from data.tracks.selection import event_items, time_items, window_items
 
 
 def micro_config(**changes: object) -> BenchmarkConfig:
@@ -23,16 +23,12 @@ def micro_config(**changes: object) -> BenchmarkConfig:
         "width": 192,
         "height": 128,
         "selection": SelectionConfig(
-            event=dict.fromkeys(event_items.CELLS, few),
-            time=dict.fromkeys(time_items.CELLS, few),
-            window=dict.fromkeys(window_items.CELLS, few),
-            matched=few,
+            **{family: dict.fromkeys(cells, few) for family, cells in CELLS.items()}, matched=few
         ),
         "retrieval": RetrievalTrackConfig(
             builders={str(k): Quota(train=4, test=2) for k in range(1, 7)},
             counterfactual=Quota(train=4, test=2),
             hard_negatives=2,
-            standard=12,
             database=60,
             source=160,
             counterfactual_source=60,

@@ -47,6 +47,28 @@ def test_packages_import_only_from_those_before_them(package: str) -> None:
             assert roots <= allowed, f"{path.relative_to(ROOT)} imports {roots - allowed}"
 
 
+ROOMS = (
+    "records", "seeded_order", "versions", "store", "parallel", "sim", "oracle", "render",
+    "sources", "frames", "items", "checks", "publish", "build", "export gallery statistics",
+)  # fmt: skip
+"""The modules and folders of `data/` in the order of the data flow, like `PACKAGES`. The commands
+at the end import nothing from each other."""
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "data").rglob("*.py")), ids=str)
+def test_rooms_of_data_import_only_from_those_before_them(path: Path) -> None:
+    place = {name: k for k, names in enumerate(ROOMS) for name in names.split()}
+    own = path.relative_to(ROOT / "data").parts[0].removesuffix(".py")
+    if own == "__init__":
+        return
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "data":
+            below = node.module.split(".")[1:]
+            names = below[:1] or [alias.name for alias in node.names]
+            for name in names:
+                assert name == own or place[name] < place[own], f"{path} imports data.{name}"
+
+
 def test_no_folder_is_crowded() -> None:
     counts = Counter(path.parent for path in MODULES)
     crowded = {str(f.relative_to(ROOT)): n for f, n in counts.items() if n > LARGEST_FOLDER}

@@ -21,8 +21,8 @@ from conf.schema import (
     StudentConfig,
     TeacherConfig,
 )
+from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
-from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.tiny_qwen3_vl import build_model, build_processor
 from train.student import dataset

@@ -25,7 +25,7 @@ def main(cfg: TinyBaseCommand, run: Run) -> dict[str, float]:
     from transformers import set_seed
 
     from data.build import ensure_benchmark
-    from data.render.frame_cache import FrameReader
+    from data.frames.frame_cache import FrameReader
     from models import compat, loading
     from models.distributed import end_ranks, main_first, split_batch
     from models.precision import resolve_precision

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 from conf.entry import Run, command
 from conf.errors import UserError
 from conf.files import read_json, write_json
-from conf.runs import lock_folder, resolve_run_name, runs_folder
+from conf.runs import lock_file, resolve_run_name, runs_folder
 from conf.schema import ContrastiveCommand, ExportModelCommand, SftCommand
 
 if TYPE_CHECKING:
@@ -165,8 +165,8 @@ def renamed_when_complete(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder, and rename it to `folder` at the end of the block. It is deleted
     after an exception, and emptied first if a killed export left files in it."""
     partial = folder.with_name(f".{folder.name}.partial")
-    partial.mkdir(exist_ok=True)
-    with lock_folder(partial, f"{folder} is being written by another process"):
+    with lock_file(partial.with_suffix(".lock"), f"{folder} is being written by another process"):
+        partial.mkdir(exist_ok=True)
         for leftover in partial.iterdir():
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         try:

@@ -29,9 +29,9 @@ from benchmarks.arguments import positive_int
 from benchmarks.experiments.experiment import compose_benchmark, open_benchmark
 from conf.failures import report_failures
 from conf.schema import SftCommand, TeacherConfig
+from data.frames.frame_cache import FrameReader
 from data.parallel import batched
 from data.records import FAMILIES, SelectionItem
-from data.render.frame_cache import FrameReader
 from data.store import Store
 from evaluation.select import limit_items
 from models import loading

@@ -58,7 +58,7 @@ from conf.failures import report_failures
 from conf.schema import DistillCommand, ReinforceCommand, SftCommand
 from data.records import FAMILIES
 from data.store import Store
-from data.tracks.selection.distractors import BUILDERS_VERSIONS
+from data.versions import BUILDERS
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
 from teacher.numbers.detection import find_numbers
@@ -109,7 +109,7 @@ def main() -> None:
 
 def settings_keys(benchmark: str) -> dict[str, str]:
     """Return the key of each variant's settings: those of all trainings that it needs."""
-    versions = {"builders": BUILDERS_VERSIONS, "narrator": NARRATOR_VERSION, "words": VERSIONS}
+    versions = {"builders": BUILDERS, "narrator": NARRATOR_VERSION, "words": VERSIONS}
     keys = {
         name: training_key("train.sft", SftCommand, [*sft, f"benchmark={benchmark}"], versions)
         for name, sft in SFT.items()

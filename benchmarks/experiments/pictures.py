@@ -20,8 +20,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.experiments.experiment import open_benchmark, read_item_responses
 from conf.failures import report_failures
+from data.frames.frame_cache import FrameReader
 from data.records import LETTERS, SelectionItem, sample_prefix_frames
-from data.render.frame_cache import FrameReader
 from data.store import Store
 
 INK, PAPER, GREEN, RED, GRAY = "#222222", "#ffffff", "#1a7f37", "#cf222e", "#8c959f"

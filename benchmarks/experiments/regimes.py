@@ -40,10 +40,9 @@ from benchmarks.experiments.records import (
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import SftCommand
-from data.records import FAMILIES
+from data.records import FAMILIES, MATCHED_ANCHOR
 from data.store import Store
-from data.tracks.controls import MATCHED_ANCHOR
-from data.tracks.selection.distractors import BUILDERS_VERSIONS
+from data.versions import BUILDERS
 from evaluation.metrics.baselines import baseline_results
 from models.fingerprints import weights_digest
 from teacher.narrator import NARRATOR_VERSION
@@ -120,7 +119,7 @@ def main() -> None:
     overrides = [f"student={args.student}", f"benchmark={args.benchmark}", *SHARED]
     base = weights_digest(compose("train.sft", SftCommand, overrides).student.model)
     # Results of other settings, other items or other rationales are not reused.
-    versions = {"builders": BUILDERS_VERSIONS, "narrator": NARRATOR_VERSION, "words": VERSIONS}
+    versions = {"builders": BUILDERS, "narrator": NARRATOR_VERSION, "words": VERSIONS}
     settings = {
         name: training_key("train.sft", SftCommand, [*(v.training or ()), *overrides], versions)
         for name, v in VARIANTS.items()

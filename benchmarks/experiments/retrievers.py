@@ -30,7 +30,7 @@ from benchmarks.experiments.experiment import (
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import ContrastiveCommand
-from data.tracks.selection.distractors import BUILDERS_VERSIONS
+from data.versions import BUILDERS
 from evaluation.metrics.results import RetrievalResult, from_json
 from models.fingerprints import weights_digest
 
@@ -54,7 +54,7 @@ def main() -> None:
     benchmark = f"benchmark={args.benchmark}"
     base = compose("train.contrastive", ContrastiveCommand, [benchmark]).retriever.model
     # Results of other settings, another base or other items are not reused.
-    versions = {"builders": BUILDERS_VERSIONS}
+    versions = {"builders": BUILDERS}
     settings = {
         name: training_key("train.contrastive", ContrastiveCommand, [*variant, benchmark], versions)
         for name, variant in VARIANTS.items()

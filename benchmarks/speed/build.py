@@ -29,10 +29,10 @@ from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import BenchmarkConfig, BuildCommand, Quota
 from data import build
+from data.checks.counts import summarize_store
+from data.items.cells import family_quotas
 from data.parallel import Workers
 from data.store import open_store
-from data.tracks.build_items import family_quotas
-from data.tracks.shortfalls import summarize_store
 
 PAPER_SCENES = 10_000
 STAGES = ("make_scenes", "make_items_and_queries", "make_databases")

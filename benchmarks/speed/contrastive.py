@@ -40,8 +40,8 @@ from conf.failures import report_failures
 from conf.runs import Run
 from conf.schema import ContrastiveCommand
 from data.build import ensure_benchmark
+from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
-from data.render.frame_cache import FrameReader
 from models import compat
 from models.fast_layers import use_fast_layers
 from models.precision import resolve_precision

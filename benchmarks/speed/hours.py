@@ -26,7 +26,7 @@ from conf.compose import compose
 from conf.errors import UserError
 from conf.failures import report_failures
 from conf.schema import ContrastiveCommand, SftCommand
-from data.tracks.build_items import family_quotas
+from data.items.cells import family_quotas
 
 RATES = Path(__file__).with_name("rates.jsonl")
 REGIMES = ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout")

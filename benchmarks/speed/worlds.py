@@ -25,7 +25,8 @@ from conf.failures import report_failures
 from conf.schema import BuildCommand, WorldConfig
 from data.records import Scene
 from data.render.bullet import BulletRenderer
-from data.world.sampling import record_scene, sample_scene
+from data.sim.sampling import sample_scene
+from data.sources.scenes import record_scene
 
 SIZE = 240, 160
 """Width and height of the rendered frames, px."""

@@ -19,11 +19,18 @@ SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
 DISTRACTORS = ("paper", "balanced")
 RECIPES = ("dynapix", "movi_a", "physion")
 WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
-"""Window families of each group (see `data.tracks.selection.window_items`). B needs a later
+"""Window families of each group (see `data.items.recipes`). B needs a later
 collision."""
 WINDOW_HORIZONS = (8, 16, 24)
 """Number of frames from the last frame of a window item's prefix to its target."""
 WINDOW_DIFFICULTIES = ("easy", "hard")
+STANDIN = "standin_"
+"""Start of the names of the suites whose scenes are simulated instead of read from a release."""
+QUERIES_PER_SCENE = {"4": 1, "5": 1, "6": 1}
+"""Maximum number of queries of a builder about a scene (paper, retrieval construction); 3 for the
+other builders."""
+MODEL_SIZE = 336
+"""Side (px) of the square image in which displacements are measured: the models' input size."""
 SCENE_FRAMES, SCENE_FPS = 128, 25
 """Frames and frame rate of the scenes to which the recipe dynapix applies."""
 
@@ -72,14 +79,12 @@ class RetrievalTrackConfig(Settings):
     """Quotas and databases of the retrieval track, which has the builders 1 to 6."""
 
     builders: dict[str, Quota] = field(default_factory=dict)
-    """Quota of each builder."""
+    """Quota of each builder. The test queries of all builders are the standard test."""
     counterfactual: Quota = field(default_factory=Quota)
     """Quota of counterfactual queries: a scene is simulated again without one of its objects."""
     hard_negatives: int = setting(3, least=1)
     """Hard negatives per query: frames of the target's scene at other moments and, for a
     counterfactual query, the factual scene's frame at the target's moment."""
-    standard: int = setting(2_002, least=0)
-    """Number of queries in the standard test, which samples them evenly from the builders."""
     database: int = setting(10_000, least=0)
     """Number of frames in the database of the standard test, including every target."""
     source: int = setting(30_000, least=0)
@@ -121,6 +126,9 @@ class BenchmarkConfig(Settings):
     """Number of scenes to simulate, or maximum number of scenes to read from a release."""
     test_share: float = setting(0.2, above=0, most=1)
     """Share of the scenes in the test split."""
+    test_scenes: int | None = setting(None, least=1)
+    """Number of scenes of the test split that the test items, the test queries and the frames of
+    their database come from; the other test scenes are used by nothing. null takes all."""
     renderer: str = setting("bullet", RENDERERS)
     """bullet renders on the CPU of any machine; blender renders scenes that look like CLEVRER's and
     needs the extra `blender`."""
@@ -143,6 +151,14 @@ class BenchmarkConfig(Settings):
         """The recipe of the items, `recipe` or the simulator's own."""
         own = self.simulator if self.simulator in RECIPES else "dynapix"
         return self.recipe or own
+
+    @property
+    def suite(self) -> str:
+        """Name of the set of items: `dynapix`, a transfer suite, or a stand-in for one, whose
+        scenes are simulated."""
+        recipe = self.item_recipe
+        is_standin = recipe != "dynapix" and self.simulator != recipe
+        return f"{STANDIN}{recipe}" if is_standin else recipe
 
     def find_problems(self, group: str) -> Iterator[str]:
         if not re.fullmatch(r"\w[\w.-]*", self.name, re.ASCII):
@@ -192,11 +208,39 @@ class BenchmarkConfig(Settings):
                 f"{group}renderer=blender: Blender has no {look} of world={self.world.name}; set "
                 f"{group}renderer=bullet"
             )
+        pixel = MODEL_SIZE / min(self.width, self.height)
+        if self.selection.min_displacement < pixel:
+            yield (
+                f"{group}selection.min_displacement={self.selection.min_displacement} must be at "
+                f"least {pixel:.2f}, a pixel of a frame of {self.width} x {self.height} px: "
+                "otherwise candidates could be the same image"
+            )
+        yield from self._find_unmet_quotas(group)
         if self.width < 48 or self.width * 2 != self.height * 3:
             yield (
                 f"{group}width={self.width} and {group}height={self.height}: the aspect ratio "
                 "must be 3:2 and the size at least 48 x 32 px, such as 480 x 320"
             )
+
+    def _find_unmet_quotas(self, group: str) -> Iterator[str]:
+        """Describe each test quota that `test_scenes` scenes cannot meet."""
+        if self.test_scenes is None:
+            return
+        track, builders = self.selection, self.retrieval.builders
+        quotas = {
+            f"selection.{family}.{cell}": (quota.test, 1)
+            for family in ("event", "time", "window")
+            for cell, quota in getattr(track, family).items()
+        }
+        quotas["selection.matched"] = (track.matched.test, 1)
+        for name, quota in builders.items():
+            quotas[f"retrieval.builders.{name}"] = (quota.test, QUERIES_PER_SCENE.get(name, 3))
+        for name, (quota, most) in quotas.items():
+            if quota > most * self.test_scenes:
+                yield (
+                    f"{group}test_scenes={self.test_scenes} cannot carry {group}{name}.test="
+                    f"{quota}: a scene gives at most {most}; raise the former or lower the latter"
+                )
 
 
 def _unusual_look(world: WorldConfig) -> str | None:

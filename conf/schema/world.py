@@ -25,7 +25,7 @@ RADIUS = 0.2
 """Radius of spheres and cylinders, and half the height of cylinders, of scale 1, simulator units.
 In the world of CLEVRER, all objects have scale 1."""
 SLIDE_FRAMES = 33
-"""Minimum number of frames of scenes in which objects slide; see `data.world.sliding`."""
+"""Minimum number of frames of scenes in which objects slide; see `data.sim.starts`."""
 MAX_ROW = 6
 """Maximum number of objects in a scene that starts with a row of objects."""
 

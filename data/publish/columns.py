@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
+from data.frames.frame_cache import FrameReader
 from data.records import FrameRef, RetrievalQuery, SelectionItem, sample_prefix_frames
-from data.render.frame_cache import FrameReader
 from data.store import Store
 
 if TYPE_CHECKING:

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 from PIL import Image
 
+from data.frames.frame_cache import FrameReader
+from data.oracle.displacement import cross_scene_displacement
+from data.oracle.interventions import removal_displacements
 from data.records import (
     LETTERS,
     FrameRef,
@@ -16,10 +19,7 @@ from data.records import (
     original_scene_id,
     sample_prefix_frames,
 )
-from data.render.frame_cache import FrameReader
 from data.store import Store
-from data.tracks.retrieval.counterfactual import removal_displacement
-from data.world.displacement import cross_scene_displacement
 
 INK, GREEN = "#222222", "#1a7f37"
 CELL_WIDTH, CAPTION_HEIGHT, HEADING_HEIGHT = 2.3, 0.5, 0.6
@@ -132,7 +132,7 @@ class SheetRows:
             scene = self._store.scene(query.scene_id)
             counterfactual = self._store.scene(query.target.scene_id)
             removed = [o.noun_phrase for o in scene.objects].index(query.removed_object)
-            shift = removal_displacement(scene, counterfactual, removed)[query.target.frame]
+            shift = removal_displacements(scene, counterfactual, removed)[query.target.frame].max()
             caption = f"other objects differ by {shift:.0f} px"
             cells.insert(0, self._caption_frame(negatives.pop(0), "factual", caption))
         for frame in negatives:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+from data.items.controls import pair_items
 from data.publish.contact_sheets import SheetRows, draw_sheet
-from data.records import SPLITS
+from data.records import MATCHED_ANCHOR, SPLITS
+from data.seeded_order import named_rng
 from data.store import Store
-from data.tracks.controls import MATCHED_ANCHOR, pair_items
-from data.tracks.quota import named_rng
 
 
 @dataclass(frozen=True)

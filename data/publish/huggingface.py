@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.files import write_bytes
-from conf.runs import lock_folder
+from conf.runs import lock_file
 from data.publish.columns import (
     DESCRIPTIONS,
     ExportedRecord,
@@ -33,9 +33,9 @@ from data.publish.columns import (
     dataset_features,
     list_columns,
 )
-from data.records import POOLS, SPLITS, RetrievalQuery, SelectionItem
-from data.store import DATABASES, Store, component_versions, hash_file
-from data.tracks.controls import MATCHED_ANCHOR
+from data.records import MATCHED_ANCHOR, POOLS, SPLITS, RetrievalQuery, SelectionItem
+from data.store import DATABASES, Store, hash_file
+from data.versions import component_versions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -74,9 +74,9 @@ def ensure_export(store: Store, folder: Path, images: bool) -> list[Shard]:
         log.info("%s already holds this export", folder)
         return _read_record(folder)["shards"]
     partial = folder.with_name(f".{folder.name}.partial")
-    partial.mkdir(parents=True, exist_ok=True)
     busy = f"another process is writing {folder}: run this command again when it has finished"
-    with lock_folder(partial, busy):
+    with lock_file(partial.with_suffix(".lock"), busy):
+        partial.mkdir(exist_ok=True)
         if not plan.items() <= _read_record(partial).items():
             for path in partial.iterdir():
                 shutil.rmtree(path) if path.is_dir() else path.unlink()

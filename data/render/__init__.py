@@ -1,9 +1,8 @@
 """The two renderers of scenes, `bullet` and `blender`, which have the same interface.
 
 `bullet` runs on every machine, and `blender` renders images in the style of CLEVRER's videos. The
-renderer is a setting of a benchmark, because the two give different pixels. A renderer's `version`
-changes whenever the same oracle gives different pixels. `render(scene, frame)` returns an RGB
-image.
+renderer is a setting of a benchmark, because the two give different pixels. `render(scene, frame)`
+returns an RGB image.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ from PIL import Image
 from conf.errors import UserError
 from data.records import Scene
 from data.render.appearance import RGB
-from data.world.camera import Camera
-from data.world.shapes import CUBE_HALF, RADIUS
+from data.sim.camera import Camera
+from data.sim.shapes import CUBE_HALF, RADIUS
 
 if TYPE_CHECKING:
     from conf.schema import WorldConfig
@@ -30,7 +30,6 @@ BPY = "4.2.23"
 """Release of Blender's Python module; other releases give other pixels."""
 SAMPLES = 32
 """Maximum number of light paths per pixel; a denoiser removes the remaining noise."""
-VERSION = f"blender-1, bpy {BPY}, {SAMPLES} samples"
 
 WORKER = Path(__file__).with_name("blender_worker.py")
 
@@ -55,8 +54,6 @@ class BlenderRenderer:
 
     Only the camera of the world is used. `blender_worker.py` defines the lamps and the ground.
     """
-
-    version = VERSION
 
     def __init__(self, width: int, height: int, world: WorldConfig) -> None:
         """Start Blender. Raises UserError as `check_blender` does."""

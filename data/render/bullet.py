@@ -19,14 +19,12 @@ from PIL import Image
 from data.records import MATERIALS, Scene, SceneObject
 from data.render.appearance import RGB, Mesh, box_mesh, mesh, texture
 from data.render.floor import Floor
-from data.world.camera import Camera
-from data.world.parts import Box, world_boxes
-from data.world.physics import start_bullet
+from data.sim.camera import Camera
+from data.sim.parts import Box, world_boxes
+from data.sim.physics import start_bullet
 
 if TYPE_CHECKING:
     from conf.schema import WorldConfig
-
-VERSION = "bullet-1"
 
 OVERSAMPLING = 2
 NEAR, FAR = 0.1, 50.0
@@ -46,8 +44,6 @@ class Layer(NamedTuple):
 
 class BulletRenderer:
     """Renders frames of any scene at one size, in this process, without a window."""
-
-    version = VERSION
 
     def __init__(self, width: int, height: int, world: WorldConfig) -> None:
         self._world = world

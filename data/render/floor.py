@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data.world.camera import Camera
-from data.world.parts import world_boxes
-from data.world.shapes import RADIUS
+from data.sim.camera import Camera
+from data.sim.parts import world_boxes
+from data.sim.shapes import RADIUS
 
 if TYPE_CHECKING:
     from conf.schema import WorldConfig

@@ -17,8 +17,8 @@ from transformers import AutoConfig, AutoModel, AutoProcessor, PreTrainedModel
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
+from data.frames.frame_cache import FrameReader
 from data.records import FrameRef, sample_prefix_frames
-from data.render.frame_cache import FrameReader
 from evaluation.embedders.embedder import Query
 from models.loading import DTYPES, explain_unloadable
 

@@ -19,8 +19,8 @@ from conf.runs import Run
 from conf.schema import ContrastiveCommand, EmbedderConfig, RetrieverConfig
 from conf.schema.evaluation import EmbeddingCommand
 from data.build import ensure_benchmark
+from data.frames.frame_cache import FrameReader
 from data.records import FrameRef, RetrievalQuery, SelectionItem
-from data.render.frame_cache import FrameReader
 from data.store import Store
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.metrics.results import UNTRAINED

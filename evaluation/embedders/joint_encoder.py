@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from conf.schema import RetrieverConfig
+from data.frames.frame_cache import FrameReader
 from data.parallel import batched
 from data.records import FrameRef
-from data.render.frame_cache import FrameReader
 from evaluation.embedders.cache import pad_rows
 from evaluation.embedders.embedder import Encoder, Query
 from models.compat import keep_freed_memory

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageCommand
+from data.frames.frame_cache import FrameReader
 from data.records import SelectionItem
-from data.render.frame_cache import FrameReader
 from evaluation.generators.response_log import RECORD_MODES, SampleOf, SaveResponses, Subject
 from evaluation.generators.response_schema import build_record_schema, write_record_instruction
 from models.precision import resolve_precision

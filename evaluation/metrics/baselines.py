@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from data.checks.baselines import score_baselines
 from data.records import SelectionItem
 from data.store import Store
-from data.tracks.baselines import score_baselines
 from evaluation.metrics.results import BASELINE, SelectionResult
 from evaluation.metrics.selection import Choices, build_selection_report
 

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data.records import LETTERS, SelectionItem
-from data.tracks.controls import MATCHED_ANCHOR
-from data.tracks.selection.time_items import CELLS
+from data.items.recipes import TIME_CELLS
+from data.records import LETTERS, MATCHED_ANCHOR, SelectionItem
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
 from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.reasons import ReasonSummary
@@ -130,7 +129,7 @@ def _selection_result(
 def horizon_of(item: SelectionItem) -> str | None:
     """Return the horizon in seconds (time family) or in frames (window family), else None."""
     if item.family == "time":
-        return f"{CELLS[item.subtype]} s"
+        return f"{TIME_CELLS[item.subtype]} s"
     return f"{item.horizon} frames" if item.family == "window" else None
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from conf.errors import UserError
+from data.items.controls import pair_items
 from data.records import FAMILIES, SelectionItem
-from data.tracks.controls import pair_items
 from evaluation.metrics.intervals import SceneBootstrap
 
 MAX_NAMED_ITEMS = 3

@@ -13,11 +13,18 @@ import numpy as np
 from tqdm import tqdm
 
 from conf.errors import UserError
-from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_prefix_frames
-from data.render.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader
+from data.oracle.contacts import collisions_in
+from data.records import (
+    FAMILIES,
+    LETTERS,
+    MATCHED_ANCHOR,
+    FrameRef,
+    SelectionItem,
+    sample_prefix_frames,
+)
+from data.seeded_order import interleave
 from data.store import Store, open_store
-from data.tracks.controls import MATCHED_ANCHOR
-from data.tracks.quota import interleave
 from evaluation.metrics.baselines import baseline_results
 from evaluation.metrics.reasons import item_predicates, read_reasons
 from evaluation.metrics.results import SelectionResult
@@ -176,10 +183,9 @@ def describe_truth(item: SelectionItem, store: Store) -> list[str]:
         f"{item.target_frame - item.prefix_stop} frames after the prefix. Between any two "
         f"candidates, an object is displaced by {item.min_displacement:.0f} px or more."
     ]
-    for collision in scene.collisions:
-        if item.prefix_stop < collision.frame <= item.target_frame:
-            first, second = (scene.objects[k].noun_phrase for k in collision.objects)
-            sentences.append(f"The {first} and the {second} collide at frame {collision.frame}.")
+    for collision in collisions_in(scene, item.prefix_stop + 1, item.target_frame):
+        first, second = (scene.objects[k].noun_phrase for k in collision.objects)
+        sentences.append(f"The {first} and the {second} collide at frame {collision.frame}.")
     return sentences
 
 

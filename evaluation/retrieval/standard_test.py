@@ -17,9 +17,9 @@ import numpy as np
 
 from conf.files import write_text
 from conf.schema import RetrieverConfig
+from data.checks.queries import check_test
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
-from data.tracks.retrieval.checks import check_test
 from evaluation.metrics.results import RetrievalResult
 from evaluation.reporting import figures, tables
 from evaluation.reporting.table import Table

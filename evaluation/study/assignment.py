@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data.records import LETTERS, SelectionItem
-from data.tracks.quota import named_rng
+from data.seeded_order import named_rng
 
 
 @dataclass(frozen=True)

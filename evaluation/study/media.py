@@ -10,8 +10,8 @@ import numpy as np
 from PIL import Image
 
 from conf.errors import UserError
+from data.frames.frame_cache import FrameReader
 from data.records import SelectionItem
-from data.render.frame_cache import FrameReader
 
 VIDEO, IMAGE = "video/mp4", "image/png"
 PREFIX = -1

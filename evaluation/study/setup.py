@@ -13,11 +13,10 @@ from tqdm import tqdm
 from conf.errors import UserError
 from conf.schema import StudyCommand
 from data.build import ensure_benchmark
-from data.records import FAMILIES, SelectionItem
-from data.render.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader
+from data.records import FAMILIES, MATCHED_ANCHOR, SelectionItem
+from data.seeded_order import interleave, named_rng
 from data.store import Store
-from data.tracks.controls import MATCHED_ANCHOR
-from data.tracks.quota import interleave, named_rng
 from evaluation.study import auth, storage
 from evaluation.study.assignment import assign_items
 from evaluation.study.media import encode_media

@@ -24,8 +24,8 @@ from transformers import AutoConfig
 from conf.errors import UserError
 from conf.runs import rank, world_size
 from conf.schema import RetrieverConfig
+from data.frames.frame_cache import FrameReader
 from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
-from data.render.frame_cache import FrameReader
 from models.attention import choose_attention
 from models.checks import (
     ADAPTER_CONFIG,

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from data.frames.frame_cache import FrameReader
+from data.items.controls import prefix_under_control
 from data.records import (
     FPS,
     FRAMES,
@@ -26,8 +28,6 @@ from data.records import (
     SelectionItem,
     sample_prefix_frames,
 )
-from data.render.frame_cache import FrameReader
-from data.tracks.controls import prefix_under_control
 from teacher.sections import remove_section
 
 MODES = ("reasoning", "answer")
@@ -167,7 +167,7 @@ def selection_sample(
     Args:
         frame_count: Number of frames of the prefix that are visible.
         response: The assistant's text, or None if it is to be generated.
-        control: How the prefix is altered (see `data.tracks.controls`); None leaves it unchanged.
+        control: How the prefix is altered (see `data.items.controls`); None leaves it unchanged.
         text: The instruction; None uses the instruction of the mode and the regime.
     """
     visible = prefix_under_control(item, frame_count, control)

@@ -9,8 +9,9 @@ from math import dist, hypot
 import numpy as np
 
 from conf.schema import RelationBounds
+from data.oracle.contacts import collisions_in
+from data.oracle.displacement import MODEL_SIZE
 from data.records import LETTERS, Candidate, Scene, SelectionItem
-from data.world.displacement import MODEL_SIZE
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
@@ -64,7 +65,7 @@ def extract_facts(
         ObjectFacts(**_cut_fields(scene, i, cut), **_target_fields(scene, i, cut, scene, i, target))
         for i in range(len(scene.objects))
     )
-    contacts = [c.objects for c in scene.collisions if cut < c.frame <= target]
+    contacts = [c.objects for c in collisions_in(scene, cut + 1, target)]
     return Facts(
         instant="at the end of the observation" if cut == stop else "just before the contact",
         moment=moment,

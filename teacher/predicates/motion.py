@@ -7,6 +7,7 @@ from math import hypot
 
 import numpy as np
 
+from data.oracle.contacts import collisions_in, next_collision, touching_pairs
 from data.records import SPEED_BOUNDS, Scene
 from teacher.predicates.facts import SPEEDS, VERY_FAST, Meeting
 from teacher.predicates.places import CONTACT, compass_direction, mean_scale, square_displacement
@@ -33,8 +34,8 @@ def find_cut(scene: Scene, start: int, stop: int) -> int | None:
     The cut is `stop`, or the frame CUT_MARGIN frames before the first collision at or after `stop`,
     whichever is earlier. Returns None if fewer than COURSE_FRAMES frames remain up to the cut.
     """
-    upcoming = [c.frame for c in scene.collisions if c.frame >= stop]
-    cut = min([stop, *(frame - CUT_MARGIN for frame in upcoming)])
+    upcoming = next_collision(scene, stop - 1)
+    cut = min(stop, upcoming.frame - CUT_MARGIN) if upcoming else stop
     return cut if cut - start + 1 >= COURSE_FRAMES else None
 
 
@@ -43,13 +44,13 @@ def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
     velocity on the ground.
 
     The velocity is the mean over an object's last COURSE_FRAMES frames up to the cut, or over those
-    since its last collision. Left out are pairs that collided with each other within these frames,
-    pairs with an object that is hit at the cut, and pairs that hardly move relative to each other.
+    since its last collision. Left out are pairs that touch within these frames, pairs with an
+    object that is hit at the cut, and pairs that hardly move relative to each other.
     """
     ground = scene.positions[:, :, :2]
     count = len(scene.objects)
     starts = [motion_start(scene, i, cut) for i in range(count)]
-    met = {c.objects for c in scene.collisions if cut - COURSE_FRAMES < c.frame <= cut}
+    met = touching_pairs(scene, cut - COURSE_FRAMES + 1, cut)
     step = [(ground[cut, i] - ground[starts[i], i]) / max(cut - starts[i], 1) for i in range(count)]
     pairs = []
     for i, j in combinations(range(count), 2):
@@ -69,16 +70,16 @@ def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
 def motion_start(scene: Scene, index: int, cut: int) -> int:
     """Return the first of the frames up to the cut that determine an object's motion: the last
     COURSE_FRAMES frames, or those since the object was hit."""
-    hits = [c.frame for c in scene.collisions if index in c.objects and c.frame <= cut]
+    hits = [c.frame for c in collisions_in(scene, 1, cut) if index in c.objects]
     return max([cut - COURSE_FRAMES + 1, *hits])
 
 
 def describe_meeting(scene: Scene, pair: tuple[int, int], cut: int) -> Meeting:
     """Return a pair, and when it collides after the cut, if at all."""
     i, j = pair
-    collisions = [c.frame for c in scene.collisions if set(c.objects) == {i, j}]
-    frames = next((frame - cut for frame in collisions if frame > cut), None)
-    if frames is not None:
+    ahead = [c for c in collisions_in(scene, cut + 1, scene.frames) if c.objects == (i, j)]
+    if ahead:
+        frames = ahead[0].frame - cut
         when = "imminent" if frames <= IMMINENT else "soon" if frames <= SOON else "later"
     else:
         gap = scene.positions[-1, j, :2] - scene.positions[-1, i, :2]

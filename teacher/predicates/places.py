@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from itertools import combinations
 from math import atan2, dist, hypot, pi
 
+from data.oracle.displacement import MODEL_SIZE
+from data.oracle.visibility import MIN_VISIBLE
 from data.records import Scene
-from data.world.displacement import MODEL_SIZE
-from data.world.visibility import MIN_VISIBLE
 from teacher.predicates.facts import COMPASS, OUT_OF_VIEW, REGIONS, Closeness
 
 CONTACT = 0.4

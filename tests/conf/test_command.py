@@ -20,7 +20,8 @@ def test_run_writes_its_record_and_can_be_repeated(folder):
     assert (done.returncode, done.stdout) == (0, "")
     assert done.stderr == "x is 2.0 in checkpoints/toy/x-2\n"
     run = folder / "checkpoints/toy/x-2"
-    assert {p.name for p in run.iterdir()} == {"config.yaml", "metrics.json", "run.json", "run.log"}
+    files = {".lock", "config.yaml", "metrics.json", "run.json", "run.log"}
+    assert {p.name for p in run.iterdir()} == files
     assert json.loads((run / "metrics.json").read_text())["loss"] == 4
     assert json.loads((run / "run.json").read_text())["overrides"] == ["x=2", "workers=1"]
     assert "x is 2.0" in (run / "run.log").read_text()

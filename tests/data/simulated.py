@@ -5,7 +5,8 @@ from __future__ import annotations
 from conf.compose import compose
 from conf.schema import BuildCommand, WorldConfig
 from data.records import Scene
-from data.world.sampling import format_scene_id, record_scene, sample_scene
+from data.sim.sampling import sample_scene
+from data.sources.scenes import record_scene
 
 CLEVRER = WorldConfig()
 WORLDS = [
@@ -26,4 +27,4 @@ def preset_world(name: str) -> WorldConfig:
 def simulate_scene(seed: int, index: int, world: WorldConfig = CLEVRER) -> Scene:
     """Simulate scene `index` of a seed; it is a training scene."""
     sample = sample_scene(world, seed, index)
-    return record_scene(format_scene_id(seed, index), "train", sample, world)
+    return record_scene(f"s{seed}-{index:06d}", "train", sample, world)

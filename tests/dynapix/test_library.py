@@ -18,8 +18,8 @@ from PIL import Image
 import dynapix
 from conf.compose import compose
 from conf.schema import BuildCommand
+from data.frames.frame_cache import FrameReader
 from data.records import Rationale
-from data.render.frame_cache import FrameReader
 from data.store import MANIFEST
 from dynapix.__main__ import COMMANDS, overview
 from dynapix.benchmark import _preset_world, preset_names

@@ -11,8 +11,8 @@ from sentence_transformers import SentenceTransformer
 
 from conf.errors import UserError
 from conf.schema import LateConfig, LoraConfig
+from data.items.database import UniqueFrames
 from data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
-from data.tracks.retrieval.database import UniqueFrames
 from models.compat import keep_differentiable
 from models.parameter_counts import count_parameters
 from models.retriever import embedder

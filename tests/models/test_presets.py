@@ -31,8 +31,8 @@ from transformers.quantizers.auto import AutoHfQuantizer
 
 from conf.compose import compose
 from conf.schema import LoraConfig, SftCommand, StudentConfig, TeacherConfig
+from data.frames.frame_cache import FrameReader
 from data.records import FPS, sample_prefix_frames
-from data.render.frame_cache import FrameReader
 from models import loading
 from models.parameter_counts import check_parameter_counts, count_parameters
 from models.student.collator import Collator, encode

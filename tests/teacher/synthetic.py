@@ -72,7 +72,8 @@ def scene(
     for i, j in combinations(range(count), 2):
         near = np.linalg.norm(positions[:, i] - positions[:, j], axis=-1) <= 0.4
         if near.any():
-            collisions.append(Collision(int(near.argmax()), (i, j)))
+            frames_near = np.flatnonzero(near).tolist()
+            collisions.append(Collision(frames_near[0], (i, j), frames_near[-1]))
     quaternions = np.zeros((frames, count, 4))
     quaternions[..., 3] = 1
     return Scene(

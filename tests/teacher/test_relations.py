@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from conf.schema import RelationBounds, TeacherConfig
-from data.world.displacement import MODEL_SIZE
+from data.oracle.displacement import MODEL_SIZE
 from teacher.predicates.facts import Relation
 from teacher.predicates.relations import (
     CLEARLY,

@@ -13,8 +13,8 @@ from transformers import PreTrainedTokenizerBase, ProcessorMixin
 
 from conf.errors import UserError
 from conf.schema import RetrieverConfig, StudentConfig
+from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
-from data.render.frame_cache import FrameReader
 from models.checks import check_widths
 from models.parameter_counts import check_parameter_counts, count_parameters
 from models.retriever.embedder import Retriever, frame_input, query_input

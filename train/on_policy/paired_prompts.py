@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from conf.schema import DistillCommand, SftCommand
+from data.frames.frame_cache import FrameReader
 from data.records import Rationale
-from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.prompts import Sample
 from train.common.held_out import check_not_empty

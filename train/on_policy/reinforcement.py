@@ -28,8 +28,8 @@ from trl.trainer.utils import RepeatSampler
 from conf.errors import UserError
 from conf.runs import Run
 from conf.schema import ReinforceCommand, ReinforceTrainConfig, SftCommand, StudentConfig
+from data.frames.frame_cache import FrameReader
 from data.records import SelectionItem
-from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.distributed import split_batch
 from models.student.collator import MEDIA_INPUTS, Collator

@@ -8,9 +8,9 @@ import numpy as np
 from sentence_transformers.base.sampler import DefaultBatchSampler
 
 from conf.errors import UserError
+from data.checks.queries import check_training
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
-from data.tracks.retrieval.checks import check_training
 from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 
 

@@ -9,10 +9,10 @@ import torch
 from sentence_transformers.base.evaluation import BaseEvaluator
 
 from conf.schema import RetrieverConfig
+from data.frames.frame_cache import FrameReader
+from data.items.database import UniqueFrames
 from data.records import FrameRef, RetrievalQuery
-from data.render.frame_cache import FrameReader
 from data.store import Store
-from data.tracks.retrieval.database import UniqueFrames
 from models.retriever.embedder import Retriever, embed
 
 FRAME_STEP = 6

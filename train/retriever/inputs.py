@@ -9,7 +9,7 @@ import torch
 from accelerate.utils import send_to_device
 
 from conf.schema import RetrieverConfig
-from data.render.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader
 from models.compat import encode_images, encoder_outputs
 from models.retriever.embedder import QueryOrFrame, Retriever, model_inputs
 from models.student.collator import MEDIA

@@ -8,8 +8,8 @@ from pathlib import Path
 from torch.nn.utils.rnn import pad_sequence
 
 from conf.schema import ContrastiveCommand, LoraConfig
+from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
-from data.render.frame_cache import FrameReader
 from models import compat, loading
 from models.retriever.embedder import (
     Retriever,

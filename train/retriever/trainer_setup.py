@@ -12,8 +12,8 @@ from sentence_transformers import (
 
 from conf.runs import Run, world_size
 from conf.schema import ContrastiveCommand, ContrastiveTrainConfig, RetrieverConfig
+from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
-from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.retriever.embedder import Retriever, longest_query
 from train.common.arguments import common_arguments

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from conf.schema import SftCommand, TeacherConfig
+from data.frames.frame_cache import FrameReader
 from data.records import LETTERS, Rationale, SelectionItem, original_scene_id
-from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.prompts import (
     MODES,

@@ -30,8 +30,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from conf.schema import RelationBounds
+from data.oracle.displacement import frame_displacements
 from data.records import Candidate, Scene, SelectionItem
-from data.world.displacement import frame_displacements
 from models.student.prompts import build_response
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.extraction import extract_predicates

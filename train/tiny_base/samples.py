@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from conf.runs import rank, world_size
+from data.frames.frame_cache import FrameReader
 from data.records import LETTERS, SelectionItem, original_scene_id, sample_prefix_frames
-from data.render.frame_cache import FrameReader
 from data.store import Store
 from models.student.prompts import Sample, build_sample, load_clip
 from teacher.candidate_letters import reorder_candidates

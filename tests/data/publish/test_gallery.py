@@ -8,10 +8,10 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from data.frames.frame_cache import FrameReader
 from data.publish.contact_sheets import SheetRows
 from data.publish.gallery import draw_sheets, render_page
 from data.records import LETTERS
-from data.render.frame_cache import FrameReader
 from data.store import Store
 
 pytestmark = pytest.mark.slow

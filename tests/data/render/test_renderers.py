@@ -13,12 +13,14 @@ from PIL import Image
 
 from conf.compose import compose
 from conf.schema import BuildCommand
+from data import versions
 from data.build import ensure_benchmark
 from data.records import Scene
-from data.render import blender, get_renderer
+from data.render import RENDERERS, blender, get_renderer
+from data.render.blender import BPY, SAMPLES
 from data.render.bullet import BulletRenderer
 from data.render.floor import Floor
-from data.world.camera import Camera
+from data.sim.camera import Camera
 from tests.children import run_child
 from tests.data.simulated import CLEVRER, simulate_scene
 from tests.user_errors import raises_user_error
@@ -31,12 +33,16 @@ def scene() -> Scene:
 
 def test_versions_need_no_renderer_package() -> None:
     code = (
-        "import sys\n"
-        "from data.render import RENDERERS\n"
-        "assert all(renderer.version for renderer in RENDERERS.values())\n"
-        "assert not {'pybullet', 'bpy'} & set(sys.modules)"
+        "import sys, data.store\n"
+        "assert not {'pybullet', 'bpy', 'data.render', 'data.items'} & set(sys.modules)"
     )
     run_child([sys.executable, "-c", code], check=True)
+
+
+def test_version_of_blender_names_its_release_and_samples() -> None:
+    assert BPY in versions.RENDERERS["blender"]
+    assert f"{SAMPLES} samples" in versions.RENDERERS["blender"]
+    assert versions.RENDERERS.keys() == RENDERERS.keys()
 
 
 def test_shadow_is_confined_to_its_box() -> None:

@@ -25,8 +25,8 @@ from conf.schema import (
     RetrieverConfig,
     SimilarityCommand,
 )
+from data.frames.frame_cache import FrameReader
 from data.records import FPS, FRAMES, LETTERS, FrameRef, sample_prefix_frames
-from data.render.frame_cache import FrameReader
 from evaluation import retrieve, similarity
 from evaluation.embedders.dual_encoder import unit_rows
 from evaluation.embedders.embedder import EMBEDDINGS

@@ -16,7 +16,7 @@ from sentence_transformers import SentenceTransformer
 
 from conf.files import read_json_lines
 from conf.schema import ContrastiveTrainConfig, LateConfig, RetrieveCommand, RetrieverConfig
-from data.render.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader
 from data.store import open_store
 from evaluation import retrieve
 from evaluation.embedders import joint_encoder

@@ -16,7 +16,7 @@ from PIL import Image
 
 from conf.entry import Run
 from conf.schema import SelectCommand, ServerConfig, StudentConfig
-from data.render.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader
 from evaluation import select
 from evaluation.generators.generator import item_sample, response_settings
 from evaluation.generators.openai_server import ServedModel, restore_thought, served_origin

@@ -13,7 +13,7 @@ from transformers import AutoModelForImageTextToText, AutoProcessor
 from conf.entry import Run
 from conf.files import read_json_lines
 from conf.schema import LoraConfig, SelectCommand, ServerConfig, StudentConfig
-from data.render.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader
 from evaluation import select
 from evaluation.generators.generator import item_sample
 from evaluation.generators.openai_server import request_fields

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from conf.errors import UserError
+from data.frames.frame_cache import FrameReader
 from data.records import LETTERS
-from data.render.frame_cache import FrameReader
 from evaluation.metrics.reasons import item_predicates, read_reasons
 from evaluation.reporting import item_browser
 from evaluation.reporting.run_responses import nearest_candidates, parse_response

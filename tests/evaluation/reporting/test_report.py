@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from conf.schema import ExportStudyCommand, ReportCommand
-from data.tracks.controls import MATCHED_ANCHOR
+from data.records import MATCHED_ANCHOR
 from tests.evaluation.reporting.measured import (
     finish,
     read_table,

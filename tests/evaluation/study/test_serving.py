@@ -19,8 +19,8 @@ from PIL import Image
 
 from conf.entry import Run
 from conf.schema import ExportStudyCommand, StudyCommand
+from data.frames.frame_cache import FrameReader
 from data.records import LETTERS
-from data.render.frame_cache import FrameReader
 from evaluation.study import auth, export, storage
 from evaluation.study.auth import HEADERS
 from evaluation.study.routes import build_app

@@ -32,7 +32,7 @@ def edited(folder: Path, root: Path, edit: Callable[[Rows], Rows]) -> str:
     path = copy / "retrieval.parquet"
     save_rows(edit(load_rows(path)), path)
     manifest = json.loads((copy / store.MANIFEST).read_text())
-    manifest["files"] = store.hash_files(copy, store.built_files(copy))
+    manifest["files"] = store.hash_files(copy, manifest["files"])
     (copy / store.MANIFEST).write_text(json.dumps(with_checksum(manifest)))
     return str(root)
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from data.frames.frame_cache import FrameReader
 from data.records import SelectionItem
-from data.render.frame_cache import FrameReader
 from data.store import Store
 from teacher.predicates.motion import find_cut
 from train.tiny_base.collator import OracleCollator, letter_token_ids

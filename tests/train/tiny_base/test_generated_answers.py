@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from data.render.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader
 from data.store import Store
 from models.student.responses import GeneratedText
 from train.tiny_base import generated_answers

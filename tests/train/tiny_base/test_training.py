@@ -15,7 +15,7 @@ from conf.compose import compose
 from conf.errors import SettingsError
 from conf.runs import Run
 from conf.schema import StageConfig, TinyBaseCommand, TinyBaseTrainConfig
-from data.render.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader
 from data.store import Store
 from models import loading
 from tests.tiny_models import SMALL

@@ -1,0 +1,77 @@
+"""Shortcuts: strategies that answer selection items without predicting the motion.
+
+A simple strategy chooses the candidate with the lowest or the highest value of one score (see
+`data.items.scores.SCORES`). A logistic model combines all scores; it is trained on the items of the
+training split, for each family.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from data.items.scores import SCORES, compare_candidates, order_target_first, rank_shares
+from data.records import SelectionItem
+
+SIMPLE = tuple(f"{score}, {end}" for score in SCORES for end in ("lowest", "highest"))
+"""Names of the simple strategies."""
+PENALTY = 1e-2
+"""Weight of the squared coefficients in the loss of the logistic model."""
+
+
+def score_simple_strategies(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Return the score of each simple strategy on each item, (N, 2 S): 1 if it chooses the target,
+    otherwise 0.
+
+    If the target is among m candidates with the best score, the strategy scores 1 / m.
+
+    Args:
+        scores: (N, S, 4) scores of the candidates.
+        answers: (N,) indices of the targets.
+    """
+    shares = rank_shares(order_target_first(scores, answers))
+    return np.stack([shares[..., 0], shares[..., 3]], axis=-1).reshape(len(scores), -1)
+
+
+def fit_logistic(features: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Return the coefficients (F,) of a conditional logistic model, by maximum likelihood with a
+    small penalty.
+
+    The probability of a candidate is the softmax of its linear score over the four candidates.
+    """
+    from scipy.optimize import minimize
+
+    rows = np.arange(len(answers))
+
+    def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
+        linear = features @ weights
+        linear -= linear.max(axis=-1, keepdims=True)
+        odds = np.exp(linear)
+        probabilities = odds / odds.sum(axis=-1, keepdims=True)
+        likelihood = np.log(probabilities[rows, answers]).mean()
+        residual = probabilities.copy()
+        residual[rows, answers] -= 1
+        gradient = np.einsum("nc,ncf->f", residual, features) / len(rows)
+        penalty = PENALTY * (weights**2).sum() / 2
+        return penalty - likelihood, gradient + PENALTY * weights
+
+    return minimize(loss, np.zeros(features.shape[-1]), jac=True, method="L-BFGS-B").x
+
+
+def score_logistic_model(
+    items: Sequence[SelectionItem], scores: np.ndarray, answers: np.ndarray
+) -> np.ndarray:
+    """Return for each item whether the logistic model of its family is right, (N,): NaN for items
+    of the training split, on which the models are trained, and of families without such items."""
+    right = np.full(len(items), np.nan)
+    features = compare_candidates(scores).swapaxes(-2, -1)
+    families = np.array([item.family for item in items])
+    splits = np.array([item.split for item in items])
+    for family in np.unique(families):
+        train = (families == family) & (splits == "train")
+        test = (families == family) & (splits == "test")
+        if train.any():
+            weights = fit_logistic(features[train], answers[train])
+            right[test] = (features[test] @ weights).argmax(axis=-1) == answers[test]
+    return right

@@ -1,0 +1,217 @@
+"""Makes selection items that only a prediction solves: distractors are alternative futures.
+
+The candidates are the target and frames of other futures of the scene
+(`data.items.futures`), chosen so that no score without prediction reveals the target
+(`data.items.scores`). In the time family, two candidates show the right moment
+and two a wrong one, and two show the scene's own future and two another one.
+
+A subtype keeps the question, prefix and target of its cell. The distractors of the cells named
+`match` and of hard items are those nearest to the target; those of the cells named `cross` and of
+easy items are the farthest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from data.items.futures import (
+    Group,
+    alternative_scene,
+    joint_groups,
+    moving_objects,
+    sample_velocities,
+    scene_states,
+    scene_with_states,
+    simulate_futures,
+)
+from data.items.pickers import Recipe, Timing, new_item
+from data.items.scores import IMAGE_SIZE, SCORES, Balance, CandidateFrames
+from data.oracle.displacement import frame_displacements
+from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
+from data.render import get_renderer
+
+if TYPE_CHECKING:
+    from conf.schema import WorldConfig
+
+FUTURES = {"event": 10, "time": 12, "window": 12}
+"""Number of alternative futures from which the distractors of an item are chosen, by family."""
+NEAREST = {"same_obj_match": True, "same_near": True, "cross_scene": False, "same_far": False}
+"""Whether the distractors of a balanced item are the nearest to the target or the farthest, by the
+distractors that the cell has in the paper's recipe."""
+TRIES = 3
+"""Number of timings of a scene for which futures are simulated in one cell."""
+TARGET = 1
+"""Index of the target among the frames from which candidates are chosen."""
+LARGEST_SHARE = 0.9
+"""Maximum time to the earlier of two moments, as a share of the time to the later one."""
+
+
+@dataclass
+class BalancedPicker:
+    """Makes the balanced items of one cell and one split. It uses the timings and the subjects of
+    the paper's recipe, but not its distractors.
+
+    Attributes:
+        min_displacement: Between any two candidates, the position of at least one object must
+            differ by this many px at 336 x 336.
+        save: Function that stores an alternative future.
+        dropped: Number of timings for which no choice of distractors was suitable.
+    """
+
+    min_displacement: float
+    world: WorldConfig
+    rng: np.random.Generator
+    save: Callable[[Scene], None]
+    dropped: int = 0
+    balance: Balance = field(init=False)
+    _tries: tuple[str, int] = ("", 0)
+
+    def __post_init__(self) -> None:
+        self.balance = Balance(self.rng)
+
+    def make_item(
+        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+    ) -> SelectionItem | None:
+        family, cell = recipe.family, recipe.fields(timing)
+        groups = self._groups(scene, timing, about, family)
+        if not groups:
+            return None
+        moments = [timing.target]
+        if family == "time":
+            moments += self._wrong_moment(scene, timing, about)
+            if len(moments) == 1:
+                return self._drop()
+        futures = self._simulate(scene, timing.stop, max(moments), groups, FUTURES[family])
+        name = f"{scene.scene_id}{ALTERNATIVE}{cell['subtype']}-{timing.stop}"
+        frames, frame_moments = self._candidate_frames(scene, name, timing.stop, moments, futures)
+        displacement = frame_displacements(frames, about)
+        choices = _choices(len(moments), len(futures))
+        choices = _distinct(choices, displacement, self.min_displacement)
+        choices = _of_difficulty(choices, displacement, NEAREST.get(cell["distractors"]))
+        if not len(choices):
+            return self._drop()
+        states = [(frames, k) for k in range(frames.frames)]
+        compared = CandidateFrames.compare(states, frame_moments, self._render(frames))
+        best = self.balance.choose(compared.scores(choices))
+        if best is None:
+            return self._drop()
+        candidates = []
+        for frame in choices[best].tolist():
+            moment = frame_moments[frame]
+            if frame <= len(moments):
+                source = "target" if frame == TARGET else "same_time"
+                candidates.append(Candidate(scene.scene_id, moment, source))
+                continue
+            index = (frame - TARGET - len(moments)) % len(futures)
+            other = f"{name}-{index}"
+            self.save(alternative_scene(scene, other, timing.stop, futures[index], self.world))
+            candidates.append(Candidate(other, moment, "alternative"))
+        pairs = frame_displacements(frames)[np.ix_(choices[best], choices[best])]
+        least = float(pairs[np.triu_indices(4, 1)].min())
+        return new_item(recipe, scene, timing, candidates, least, distractors="alternative")
+
+    def _simulate(
+        self, scene: Scene, frame: int, last: int, groups: Sequence[Group], count: int
+    ) -> np.ndarray:
+        """Simulate futures from `frame` to `last`, (count, last - frame + 1, N, 13) states."""
+        quarter = self.balance.rarest_rank("nearness")
+        velocities = sample_velocities(scene, frame, groups, count, quarter, self.rng)
+        return simulate_futures(scene, frame, last, velocities, self.world)
+
+    def _candidate_frames(
+        self, scene: Scene, name: str, stop: int, moments: Sequence[int], futures: np.ndarray
+    ) -> tuple[Scene, list[int]]:
+        """Return the frames from which candidates are chosen as a scene, and their moments.
+
+        They are the last observed frame, the scene's own frame at each moment (first the target),
+        and all futures at the first moment, then at the second.
+        """
+        own = scene_states(scene)[[stop, *moments]]
+        others = [futures[:, moment - stop] for moment in moments]
+        frames = scene_with_states(scene, name, np.concatenate([own, *others]), self.world)
+        return frames, [stop, *moments, *np.repeat(moments, len(futures)).tolist()]
+
+    def _groups(
+        self, scene: Scene, timing: Timing, about: tuple[int, ...], family: str
+    ) -> list[Group]:
+        """Return the groups of objects whose velocities may be changed to make distractors.
+
+        Their objects move at the end of the prefix, and visibly until the target. In event and
+        window items, objects that collide change by one velocity: otherwise the target would often
+        be the only candidate in which objects touch. Return none after `TRIES` timings of a scene.
+        """
+        shift = frame_displacements(scene, about)[timing.stop, timing.target]
+        moving = moving_objects(scene, timing.stop, about)
+        if not moving or shift < self.min_displacement:
+            return []
+        tried, tries = self._tries
+        self._tries = scene.scene_id, tries + 1 if tried == scene.scene_id else 1
+        if self._tries[1] > TRIES:
+            return []
+        if family != "time":
+            return joint_groups(scene, timing.stop, timing.target, moving)
+        return [(k,) for k in moving]
+
+    def _drop(self) -> None:
+        self.dropped += 1
+
+    def _wrong_moment(self, scene: Scene, timing: Timing, about: tuple[int, ...]) -> list[int]:
+        """Sample a moment after the prefix that differs visibly from the target, on the side of the
+        target that balances its rank in time; return an empty list if there is none.
+
+        The time from the prefix to the earlier of the two moments is a random share of the time to
+        the later one, from the same range on both sides: otherwise the share would tell which
+        moment is right.
+        """
+        horizon = timing.target - timing.stop
+        least = horizon / (scene.frames - 1 - timing.stop)
+        share = self.rng.uniform(least, LARGEST_SHARE)
+        counts = self.balance.counts[SCORES.index("moment")]
+        lead = horizon * share if counts[0] >= counts[3] else horizon / share
+        moment = timing.stop + int(lead)
+        shift = frame_displacements(scene, about)[timing.target, moment]
+        return [moment] if shift >= self.min_displacement else []
+
+    def _render(self, frames: Scene) -> np.ndarray:
+        """Render all frames of a scene as small images, (M, H, W, 3) uint8."""
+        width, height = IMAGE_SIZE
+        size = {"renderer": "bullet", "width": width, "height": height}
+        renderer = get_renderer({**size, "world": asdict(self.world)})
+        return np.stack([np.asarray(renderer.render(frames, k)) for k in range(frames.frames)])
+
+
+def _choices(moments: int, futures: int) -> np.ndarray:
+    """Return all choices of candidates (T, 4) as indices of the frames of `_candidate_frames`; the
+    first is the target.
+
+    With two moments, a choice contains the scene's own and one other future, each at both moments.
+    """
+    first = TARGET + moments
+    if moments == 1:
+        triples = list(combinations(range(first, first + futures), 3))
+        return np.array([[TARGET, *triple] for triple in triples])
+    return np.array([[TARGET, TARGET + 1, first + k, first + futures + k] for k in range(futures)])
+
+
+def _distinct(choices: np.ndarray, displacement: np.ndarray, least: float) -> np.ndarray:
+    """Return the choices whose candidates all differ by at least `least` px."""
+    pairs = displacement[choices[:, :, None], choices[:, None, :]]
+    pairs[:, np.arange(4), np.arange(4)] = np.inf
+    return choices[pairs.min(axis=(1, 2)) >= least]
+
+
+def _of_difficulty(
+    choices: np.ndarray, displacement: np.ndarray, nearest: bool | None
+) -> np.ndarray:
+    """Return the half of the choices whose distractors are nearer to the target, or the other half;
+    all choices if `nearest` is None."""
+    if nearest is None or len(choices) < 2:
+        return choices
+    order = np.argsort(displacement[TARGET, choices[:, 1:]].max(axis=-1), kind="stable")
+    half = (len(choices) + 1) // 2
+    return choices[np.sort(order[:half] if nearest else order[-half:])]

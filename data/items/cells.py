@@ -1,0 +1,233 @@
+"""Makes all items and queries of a benchmark from the oracle alone, one cell after another.
+
+A cell is a subtype of a family of selection items, or a builder, which makes one kind of retrieval
+queries. Each is a separate job with its own random generator. A job writes its result to a file
+whose name is a hash of the job's inputs. A killed build resumes with the files that exist, and a
+build with changed quotas repeats only the jobs whose quotas changed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, astuple
+from functools import lru_cache, partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from conf.files import write_bytes
+from conf.schema import BenchmarkConfig, Quota
+from data.items import recipes, transfer
+from data.items.balanced import BalancedPicker
+from data.items.balanced_subset import RESERVE, choose_items
+from data.items.pickers import (
+    CellInputs,
+    DistractorPicker,
+    Picker,
+    Recipe,
+    fill_quota,
+    shuffle_candidates,
+)
+from data.items.queries import make_counterfactual_queries, make_future_queries
+from data.items.scores import item_scores, order_target_first
+from data.parallel import Workers
+from data.records import FAMILIES, MATCHED_ANCHOR, RetrievalQuery, Scene, SelectionItem
+from data.seeded_order import named_rng
+from data.store import PARTS, load_scene, part_path, save_scene, scene_path
+from data.versions import component_versions
+
+COUNTERFACTUAL = "counterfactual"
+CACHED_SCENES = 20_000
+"""Number of scenes that a worker keeps in memory, at about 50 KB each."""
+QUERY_RESERVE = 1.3
+"""Factor on the quotas of queries: those with near-duplicate targets are dropped later."""
+
+ScenesOfSplit = dict[str, list[str]]
+
+
+def make_items_and_queries(
+    cfg: BenchmarkConfig, folder: Path, scene_ids: ScenesOfSplit, workers: Workers
+) -> tuple[list[SelectionItem], list[RetrievalQuery], dict[str, int]]:
+    """Make the items and queries of the scenes below `folder`, in the order of the config.
+
+    Returns:
+        The items; the queries, up to `QUERY_RESERVE` times their quotas; and the numbers of items
+        and queries that were dropped because no suitable distractors or hard negatives were found.
+    """
+    quotas = {name: _with_reserve(cfg, name, quota) for name, quota in cell_quotas(cfg).items()}
+    settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
+    is_balanced = cfg.distractors == "balanced"
+    recipe = cfg.distractors, cfg.selection.observation
+    inputs = [component_versions(asdict(cfg)), scene_ids, *recipe, *settings]
+    paths = {
+        name: part_path(folder, [*inputs, name, asdict(quota)]) for name, quota in quotas.items()
+    }
+    # Largest quotas first, so that no single worker is left with a large job at the end.
+    jobs, sizes = {}, {}
+    for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train):
+        cell = CellInputs(scene_ids, partial(load_cached, folder), quota, *settings)
+        jobs[paths[name]] = partial(_make_cell, cfg, name, cell, paths[name])
+        sizes[paths[name]] = quota.train + quota.test
+    if is_balanced:
+        remove_other_parts(folder, paths.values())
+    workers.write_files(jobs, "making items and queries", "item", sizes)
+    items: list[SelectionItem] = []
+    scores: dict[str, list[list[list[float]]]] = {}
+    queries: list[RetrievalQuery] = []
+    dropped: Counter[str] = Counter()
+    for name in quotas:
+        part = json.loads(paths[name].read_bytes())
+        if _is_query_cell(name):
+            queries += map(RetrievalQuery.from_row, part["rows"])
+            dropped["queries dropped, too alike"] += part["dropped"]
+        else:
+            made = [SelectionItem.from_row(row) for row in part["rows"]]
+            items += made
+            scores |= zip((i.item_id for i in made), part.get("scores", []), strict=False)
+            reason = "no suitable distractors" if is_balanced else "too alike"
+            dropped[f"items dropped, {reason}/{name.partition('/')[0]}"] += part["dropped"]
+    return _choose_balanced(cfg, items, scores) if is_balanced else items, queries, dict(dropped)
+
+
+def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> None:
+    """Make the items or queries of one cell, and write them to a file."""
+    group, _, subtype = name.partition("/")
+    folder = path.parents[1]
+    part: dict[str, Any] = {}
+    if group == COUNTERFACTUAL:
+        made, dropped = make_counterfactual_queries(cell)
+    elif _is_query_cell(group):
+        made, dropped = make_future_queries(int(group.split()[1]), cell)
+    elif group == MATCHED_ANCHOR:
+        by_time, dropped = fill_quota(name, recipes.MATCHED, cell, partial(_paper_picker, cell))
+        made = [paired for item in by_time for paired in recipes.make_pair(item)]
+    elif cfg.distractors == "paper":
+        recipe = cell_recipe(cfg, group, subtype)
+        made, dropped = fill_quota(subtype, recipe, cell, partial(_paper_picker, cell))
+    else:
+        recipe = cell_recipe(cfg, group, subtype)
+        picker = partial(_balanced_picker, cfg, folder)
+        made, dropped = fill_quota(subtype, recipe, cell, picker)
+        scene_of = partial(load_cached, folder)
+        part["scores"] = [item_scores(i, scene_of, asdict(cfg)).tolist() for i in made]
+    part |= {"rows": [row.to_row() for row in made], "dropped": dropped}
+    write_bytes(path, json.dumps(part).encode())
+
+
+def _paper_picker(cell: CellInputs, split: str, rng: np.random.Generator) -> Picker:
+    return DistractorPicker(cell.min_displacement, cell.scene_ids[split], cell.scene_of, rng)
+
+
+def _balanced_picker(
+    cfg: BenchmarkConfig, folder: Path, split: str, rng: np.random.Generator
+) -> Picker:
+    def save(scene: Scene) -> None:
+        save_scene(scene, scene_path(folder, scene.scene_id))
+
+    return BalancedPicker(cfg.selection.min_displacement, cfg.world, rng, save)
+
+
+def cell_recipe(cfg: BenchmarkConfig, family: str, subtype: str) -> Recipe:
+    """Return the recipe of a cell of a benchmark's suite."""
+    if cfg.item_recipe == "dynapix":
+        return recipes.make_recipe(family, subtype, cfg.selection.observation)
+    return transfer.make_transfer_recipe(cfg.item_recipe, cfg.suite, family, subtype)
+
+
+def list_subtypes(cfg: BenchmarkConfig) -> Mapping[str, tuple[str, ...]]:
+    """Return the subtypes of each family of a benchmark's suite."""
+    return recipes.CELLS if cfg.item_recipe == "dynapix" else transfer.CELLS[cfg.item_recipe]
+
+
+def _choose_balanced(
+    cfg: BenchmarkConfig, items: list[SelectionItem], scores: Mapping[str, Any]
+) -> list[SelectionItem]:
+    """Return the items up to their quotas, chosen so that their scores are even in each family,
+    difficulty and split.
+
+    Args:
+        scores: Scores of the candidates by item id. Items without scores, such as matched pairs,
+            are kept.
+    """
+    pools: dict[tuple[str, ...], list[SelectionItem]] = defaultdict(list)
+    for item in items:
+        if item.item_id in scores:
+            pools[item.split, item.family, item.difficulty or ""].append(item)
+    chosen: dict[str, SelectionItem] = {}
+    quotas = family_quotas(cfg)
+    for (split, family, difficulty), pool in pools.items():
+        rng = named_rng(cfg.seed, "pool", split, family, difficulty)
+        kept = choose_items(
+            order_target_first(
+                np.array([scores[item.item_id] for item in pool]),
+                np.array([item.answer for item in pool]),
+            ),
+            [item.subtype for item in pool],
+            {subtype: getattr(quota, split) for subtype, quota in quotas[family].items()},
+            rng,
+        )
+        for _, cell in groupby((pool[k] for k in kept), key=lambda item: item.subtype):
+            chosen |= {item.item_id: item for item in shuffle_candidates([*cell], rng)}
+    return [
+        chosen.get(i.item_id, i) for i in items if i.item_id in chosen or i.item_id not in scores
+    ]
+
+
+def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:
+    """Return the quotas of selection items by family and subtype."""
+    return {family: getattr(cfg.selection, family) for family in FAMILIES}
+
+
+def cell_quotas(cfg: BenchmarkConfig) -> dict[str, Quota]:
+    """Return the quotas above 0 of all cells and builders, by name."""
+    quotas = {
+        **{
+            f"{family}/{subtype}": quota
+            for family, quotas in family_quotas(cfg).items()
+            for subtype, quota in quotas.items()
+        },
+        MATCHED_ANCHOR: cfg.selection.matched,
+        **{f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()},
+        COUNTERFACTUAL: cfg.retrieval.counterfactual,
+    }
+    return {name: quota for name, quota in quotas.items() if quota.train + quota.test}
+
+
+def builder_name(builder: int | None) -> str:
+    """Return the name of a builder in `cell_quotas`; None is the counterfactual builder."""
+    return COUNTERFACTUAL if builder is None else f"builder {builder}"
+
+
+def _with_reserve(cfg: BenchmarkConfig, name: str, quota: Quota) -> Quota:
+    """Return how many items or queries a job makes, of which those of the quota are chosen."""
+    factor = 1.0
+    if _is_query_cell(name):
+        factor = QUERY_RESERVE
+    elif cfg.distractors == "balanced" and name != MATCHED_ANCHOR:
+        factor = RESERVE
+    return Quota(*(math.ceil(factor * n) for n in astuple(quota)))
+
+
+def _is_query_cell(name: str) -> bool:
+    return name == COUNTERFACTUAL or name.startswith("builder ")
+
+
+@lru_cache(maxsize=CACHED_SCENES)
+def load_cached(folder: Path, scene_id: str) -> Scene:
+    """Load a scene of a store or a partial build, and keep it in memory."""
+    return load_scene(scene_path(folder, scene_id))
+
+
+def remove_other_parts(folder: Path, kept: Iterable[Path]) -> None:
+    """Delete the results of jobs below `folder` that are not in `kept`.
+
+    The alternative futures of balanced items have the same names for other settings, so that a
+    result from before a change of settings may refer to futures that were simulated since.
+    """
+    for path in {*(folder / PARTS).glob("*.json")} - {*kept}:
+        path.unlink()

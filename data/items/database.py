@@ -1,0 +1,162 @@
+"""Databases of frames that retrievers rank, without near-duplicates.
+
+Near-duplicates are frames in which the same objects are visible within a pixel of each other (twins
+in a benchmark's counts). They are found from the oracle, before any frame is rendered.
+
+The database of the future-state queries contains that of the standard test; the counterfactual
+queries have another one (paper, Table 1 and "Query constructions").
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import chain, islice
+
+import numpy as np
+
+from conf.schema import BenchmarkConfig
+from data.items.cells import builder_name, cell_quotas
+from data.oracle.displacement import visible_positions
+from data.records import POOLS, FrameRef, RetrievalQuery, Scene
+from data.seeded_order import named_rng, round_robin
+
+DUPLICATE_DISTANCE = 1.0
+"""Near-duplicates differ by less than this in all coordinates of objects, px at 336 x 336."""
+VISIBLE_FRACTIONS = (0.02, 0.08)
+"""Thresholds of the visible fraction of a visible object. Frames that agree under either threshold
+are near-duplicates, so that a fraction close to one threshold makes no difference."""
+
+
+@dataclass
+class UniqueFrames:
+    """A set of frames without near-duplicates. `left_out` counts the near-duplicates not added."""
+
+    scene_of: Callable[[str], Scene]
+    frames: dict[FrameRef, None] = field(default_factory=dict)
+    left_out: int = 0
+    _positions: dict[tuple, list[np.ndarray]] = field(default_factory=lambda: defaultdict(list))
+
+    def add(self, frame: FrameRef) -> bool:
+        """Add a frame unless it or a near-duplicate is in the set; return whether it was added."""
+        if frame in self.frames:
+            return False
+        appearances = list(_appearances(self.scene_of(frame.scene_id), frame.frame))
+        for objects, positions in appearances:
+            others = self._positions[objects]
+            if any(
+                np.abs(other - positions).max(initial=0) < DUPLICATE_DISTANCE for other in others
+            ):
+                self.left_out += 1
+                return False
+        for objects, positions in appearances:
+            self._positions[objects].append(positions)
+        self.frames[frame] = None
+        return True
+
+    def fill(self, names: list[str], wanted: int, seed: int) -> list[FrameRef]:
+        """Add `wanted` frames of the scenes `names`, a random frame of each scene in turn.
+
+        Returns:
+            The added frames; fewer than `wanted` if the scenes have no more.
+        """
+
+        def new_frames(name: str) -> Iterator[FrameRef]:
+            order = named_rng(seed, "database", name).permutation(self.scene_of(name).frames)
+            frames = (FrameRef(name, frame) for frame in reversed(order.tolist()))
+            return (frame for frame in frames if self.add(frame))
+
+        return list(islice(round_robin(map(new_frames, names)), max(wanted, 0)))
+
+
+def _appearances(scene: Scene, frame: int) -> Iterable[tuple[tuple, np.ndarray]]:
+    """Yield a frame's visible objects and their positions for each of `VISIBLE_FRACTIONS`."""
+    visible = scene.visible_fraction[frame]
+    # NaN means that the simulator records only whether the object is in view.
+    visible = np.where(np.isnan(visible), 1.0, visible) * scene.in_view[frame]
+    positions = visible_positions(scene)[0][frame]
+    order = sorted(range(len(scene.objects)), key=lambda k: str(scene.objects[k]))
+    for bound in VISIBLE_FRACTIONS:
+        present = [k for k in order if visible[k] >= bound]
+        yield tuple(scene.objects[k] for k in present), positions[present]
+
+
+def make_databases(
+    cfg: BenchmarkConfig,
+    queries: list[RetrievalQuery],
+    scene_ids: dict[str, list[str]],
+    scene_of: Callable[[str], Scene],
+) -> tuple[list[RetrievalQuery], dict[str, list[FrameRef]], dict[str, int]]:
+    """Choose the frames of every database.
+
+    Returns:
+        The queries whose target has no near-duplicate in its database; frames by database; and
+        counts of the queries and frames that were left out.
+    """
+    unique, kept, dropped = {}, {}, {}
+    for pool in POOLS:
+        unique[pool] = UniqueFrames(scene_of)
+        own = [q for q in queries if q.pool == pool]
+        kept[pool] = drop_duplicates(cfg, own, unique[pool])
+        dropped[pool] = unique[pool].left_out
+    test, future = future_databases(cfg, kept["future"], scene_ids, unique["future"])
+    counterfactual = counterfactual_database(cfg, kept["counterfactual"], unique["counterfactual"])
+    counts = {
+        "queries dropped, target has a twin": sum(dropped.values()),
+        "frames left out, twins": sum(unique[p].left_out - dropped[p] for p in POOLS),
+    }
+    databases = {"test": test, "future": future, "counterfactual": counterfactual}
+    return [*kept["future"], *kept["counterfactual"]], databases, counts
+
+
+def future_databases(
+    cfg: BenchmarkConfig,
+    queries: list[RetrievalQuery],
+    scene_ids: dict[str, list[str]],
+    unique: UniqueFrames,
+) -> tuple[list[FrameRef], list[FrameRef]]:
+    """Return the database of the standard test, which has frames of test scenes only, and the
+    database of all future-state queries, which contains it."""
+    if not queries:
+        return [], []
+    track = cfg.retrieval
+    targets = dict.fromkeys(q.target for q in queries if q.split == "test")
+    test = [*targets, *unique.fill(scene_ids["test"], track.database - len(targets), cfg.seed)]
+    source = [*test, *(f for f in dict.fromkeys(q.target for q in queries) if f not in targets)]
+    every = [*scene_ids["train"], *scene_ids["test"]]
+    return test, [*source, *unique.fill(every, track.source - len(source), cfg.seed)]
+
+
+def counterfactual_database(
+    cfg: BenchmarkConfig, queries: list[RetrievalQuery], unique: UniqueFrames
+) -> list[FrameRef]:
+    """Return the database of the counterfactual queries.
+
+    It contains their targets, then their hard negatives (the factual frames of all queries first),
+    then other frames of the counterfactual scenes. The hard negatives of test queries come before
+    those of training queries, because only test queries are evaluated on this database.
+    """
+    wanted = cfg.retrieval.counterfactual_source
+    ranked = sorted(queries, key=lambda q: q.split != "test")
+    for frame in chain.from_iterable(zip(*(q.hard_negatives for q in ranked), strict=True)):
+        if len(unique.frames) < wanted:
+            unique.add(frame)
+    scenes = sorted({q.target.scene_id for q in queries})
+    unique.fill(scenes, wanted - len(unique.frames), cfg.seed)
+    return list(unique.frames)
+
+
+def drop_duplicates(
+    cfg: BenchmarkConfig, queries: list[RetrievalQuery], unique: UniqueFrames
+) -> list[RetrievalQuery]:
+    """Return queries up to their quotas, without those whose target is a near-duplicate of another
+    query's target: both frames would be right answers. Test queries are kept first."""
+    quotas, kept, chosen = cell_quotas(cfg), Counter(), set()
+    for query in sorted(queries, key=lambda q: q.split != "test"):
+        cell = builder_name(query.builder), query.split
+        is_full = kept[cell] >= getattr(quotas[cell[0]], query.split)
+        if not is_full and (query.target in unique.frames or unique.add(query.target)):
+            kept[cell] += 1
+            chosen.add(query.query_id)
+    return [q for q in queries if q.query_id in chosen]

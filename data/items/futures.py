@@ -1,0 +1,150 @@
+"""Alternative futures of a scene: what would happen if objects moved differently from a frame on.
+
+An alternative future equals the scene up to a frame, at which some objects get other velocities.
+Its frames look as plausible as those of the scene, so that only a model that predicts the motion
+can tell them apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from data.oracle.contacts import collisions_in
+from data.oracle.displacement import visible_positions
+from data.records import Scene
+from data.sim.physics import shared_simulator
+from data.sources.scenes import oracle_arrays
+
+if TYPE_CHECKING:
+    from conf.schema import WorldConfig
+
+MOVING = 0.1
+"""Speed (simulator units/s) above which an object counts as moving."""
+SEEN_FRAMES = 5
+"""Number of last frames of a prefix in which an object must be visible to get another velocity: in
+fewer frames, its true velocity could not be observed."""
+MAX_LOG_FACTOR = np.log(2.0)
+"""Speeds differ from a central speed by a factor of at most 2; this is its logarithm."""
+MAX_TURN = np.radians(60)
+"""Maximum angle between a direction and the central direction, to either side."""
+
+Group = tuple[int, ...]
+"""Indices of objects whose velocities change together."""
+
+
+def moving_objects(scene: Scene, frame: int, about: Sequence[int]) -> list[int]:
+    """Return the objects of `about` that move along the ground at a frame and that are visible in
+    the last `SEEN_FRAMES` frames up to it."""
+    speeds = np.linalg.norm(scene.velocities[frame, :, :2], axis=-1)
+    seen = visible_positions(scene)[1][max(frame - SEEN_FRAMES + 1, 0) : frame + 1].all(axis=0)
+    return [k for k in about if speeds[k] > MOVING and seen[k]]
+
+
+def joint_groups(scene: Scene, frame: int, last: int, moving: Sequence[int]) -> list[Group]:
+    """Divide moving objects into groups that keep the collisions of the scene.
+
+    Objects that collide with each other after `frame` and up to `last`, directly or through others,
+    form a group: if all get the same additional velocity, they still collide at the same moments.
+    Objects that do not collide form groups of their own.
+    """
+    groups = [{k} for k in range(len(scene.objects))]
+    for collision in collisions_in(scene, frame + 1, last):
+        one, two = (next(g for g in groups if k in g) for k in collision.objects)
+        if one is not two:
+            groups.remove(two)
+            one |= two
+    return [tuple(sorted(group)) for group in groups if group & {*moving}]
+
+
+def sample_velocities(
+    scene: Scene,
+    frame: int,
+    groups: Sequence[Group],
+    count: int,
+    quarter: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Sample other velocities of one or two groups of objects at a frame.
+
+    The same groups change in all futures. The mean velocity of a group gets another speed and
+    direction; the velocities of its objects relative to each other stay. The true velocity is one
+    more sample of the distribution of the others: all have a random distance from a centre. If the
+    true velocity were the centre itself, the most typical candidate would be right.
+
+    Args:
+        groups: Groups of objects, from which one or two are chosen.
+        quarter: The quarter of the range of speeds in which the true speed lies: with 0, most other
+            speeds are higher, and with 3, most are lower.
+
+    Returns:
+        (count, N, 6) linear and angular velocities.
+    """
+    original = np.concatenate([scene.velocities[frame], scene.angular_velocities[frame]], axis=-1)
+    velocities = np.repeat(original[None].astype(float), count, axis=0)
+    chosen = rng.choice(len(groups), min(len(groups), int(rng.integers(1, 3))), replace=False)
+    for group in (list(groups[k]) for k in chosen):
+        true_speed = MAX_LOG_FACTOR * (rng.uniform(quarter, quarter + 1) / 2 - 1)
+        factors = np.exp(rng.uniform(-MAX_LOG_FACTOR, MAX_LOG_FACTOR, count) - true_speed)
+        angles = rng.uniform(-MAX_TURN, MAX_TURN, count) - rng.uniform(-MAX_TURN, MAX_TURN)
+        for changed, factor, angle in zip(velocities, factors, angles, strict=True):
+            if len(group) == 1:
+                changed[group] = factor * _turn(changed[group[0]], angle)
+            else:
+                mean = changed[group].mean(axis=0)
+                changed[group, :3] += (factor * _turn(mean, angle) - mean)[:3]
+    return velocities
+
+
+def _turn(velocity: np.ndarray, angle: float) -> np.ndarray:
+    """Rotate a linear and an angular velocity (6,) about the vertical."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y, z = velocity.reshape(2, 3).T
+    return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1).ravel()
+
+
+def simulate_futures(
+    scene: Scene, frame: int, last: int, velocities: np.ndarray, world: WorldConfig
+) -> np.ndarray:
+    """Simulate a scene from `frame` to `last` with other velocities (K, N, 6) at `frame`.
+
+    Returns:
+        (K, last - frame + 1, N, 13) states.
+    """
+    return shared_simulator().simulate_branches(
+        scene.objects,
+        scene.object_scales,
+        scene_states(scene)[frame].astype(float),
+        velocities,
+        world,
+        last - frame + 1,
+    )
+
+
+def scene_states(scene: Scene) -> np.ndarray:
+    """Return positions, quaternions, linear and angular velocities as one array (F, N, 13)."""
+    parts = scene.positions, scene.quaternions, scene.velocities, scene.angular_velocities
+    return np.concatenate(parts, axis=-1)
+
+
+def scene_with_states(scene: Scene, name: str, states: np.ndarray, world: WorldConfig) -> Scene:
+    """Return a scene with the objects of another one and the states (F, N, 13) of each frame. Its
+    collisions and landings are empty."""
+    arrays = oracle_arrays(scene.objects, scene.object_scales, states, world)
+    return replace(scene, scene_id=name, collisions=(), landings=(), **arrays)
+
+
+def alternative_scene(
+    scene: Scene, name: str, frame: int, states: np.ndarray, world: WorldConfig
+) -> Scene:
+    """Return an alternative future as a scene: the frames of `scene` up to `frame`, then those of
+    `states`, whose first frame is `frame`."""
+    future = scene_with_states(scene, name, states[1:], world)
+    arrays = {
+        key: np.concatenate([getattr(scene, key)[: frame + 1], getattr(future, key)])
+        for key in Scene.ARRAYS
+    }
+    return replace(future, **arrays)

@@ -1,0 +1,252 @@
+"""Makes the items of a cell from its recipe: timings, candidates that differ visibly, quotas.
+
+A cell is one kind of items. Its recipe (`data.items.recipes`) says where the prefix and the target
+can be in a scene, which objects the item is about, and which frames can be distractors. A picker
+chooses the distractors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, islice
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from data.oracle.displacement import (
+    cross_scene_displacement,
+    frame_displacements,
+    visible_positions,
+)
+from data.records import SPLITS, Candidate, FrameRef, Scene, SelectionItem
+from data.seeded_order import named_rng
+
+if TYPE_CHECKING:
+    from conf.schema import Quota
+
+Pool = tuple[Iterable[Candidate], int]
+"""Possible distractors in order of preference, and the maximum number of them to use."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Frame indices of an item: its prefix (`stop` included), its target, and its event, if any."""
+
+    start: int
+    stop: int
+    target: int
+    event: int | None = None
+
+    @property
+    def observed(self) -> int:
+        """Number of frames of the prefix."""
+        return self.stop - self.start + 1
+
+    def outside_prefix(self, frames: Iterable[int]) -> list[int]:
+        """Return the frames outside the prefix; a model would recognise frames from inside it."""
+        return [int(f) for f in frames if not self.start <= f <= self.stop]
+
+
+def visible_objects(scene: Scene, timing: Timing) -> tuple[int, ...]:
+    """Return the indices of the objects that are visible in at least one frame of the prefix.
+
+    Only these objects may distinguish candidates of one scene, because a model cannot predict that
+    another object will enter.
+    """
+    visible = visible_positions(scene)[1][timing.start : timing.stop + 1]
+    return tuple(np.flatnonzero(visible.any(axis=0)).tolist())
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the items of one cell are made.
+
+    Attributes:
+        timings: Function that returns the timings that an item can have in a scene.
+        fields: Function that returns the item's question, its subtype and its other fields that
+            depend on the cell.
+        pools: Function that returns the possible distractors of an item, given the scene, the
+            timing, the objects that count, a random generator and the picker.
+        subjects: Function that returns the indices of the objects whose positions count in frames
+            of the item's scene. Without any, there is no item at this timing. In frames of other
+            scenes, all objects count.
+    """
+
+    family: str
+    timings: Callable[[Scene], list[Timing]]
+    fields: Callable[[Timing], Mapping[str, Any]]
+    pools: Callable[
+        [Scene, Timing, tuple[int, ...], np.random.Generator, DistractorPicker], Sequence[Pool]
+    ]
+    subjects: Callable[[Scene, Timing], tuple[int, ...]] = visible_objects
+
+
+class Picker(Protocol):
+    """Chooses distractors. `dropped` counts the timings for which too few are suitable."""
+
+    dropped: int
+
+    def make_item(
+        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+    ) -> SelectionItem | None:
+        """Return an item whose first candidate is the target, or None if too few distractors are
+        suitable."""
+        ...
+
+
+@dataclass
+class DistractorPicker:
+    """Takes the first distractors of the recipe's pools that differ visibly from each other.
+
+    Attributes:
+        min_displacement: Between any two candidates, the position of at least one object must
+            differ by this many px at 336 x 336.
+        scene_ids: Scenes of the split; cross-scene distractors come from these.
+        scene_of: Function that loads a scene by its id.
+    """
+
+    min_displacement: float
+    scene_ids: list[str]
+    scene_of: Callable[[str], Scene]
+    rng: np.random.Generator
+    dropped: int = 0
+
+    def make_item(
+        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+    ) -> SelectionItem | None:
+        pools = recipe.pools(scene, timing, about, self.rng, self)
+        chosen = [Candidate(scene.scene_id, timing.target)]
+        for k, (pool, count) in enumerate(pools):
+            # Stop if the remaining pools cannot complete the item.
+            if len(chosen) + sum(limit for _, limit in pools[k:]) < 4:
+                break
+            fitting = (
+                candidate
+                for candidate in pool
+                if all(
+                    self._displacement(candidate, c, about) >= self.min_displacement for c in chosen
+                )
+            )
+            # `fitting` is lazy, so it also compares each candidate with those chosen in this loop.
+            for candidate in islice(fitting, min(count, 4 - len(chosen))):
+                chosen.append(candidate)
+        if len(chosen) < 4:
+            self.dropped += 1
+            return None
+        least = min(self._displacement(a, b) for a, b in combinations(chosen, 2))
+        return new_item(recipe, scene, timing, chosen, least)
+
+    def _displacement(
+        self, a: FrameRef, b: FrameRef, about: tuple[int, ...] | None = None
+    ) -> float:
+        scene = self.scene_of(a.scene_id)
+        if a.scene_id == b.scene_id:
+            return float(frame_displacements(scene, about)[a.frame, b.frame])
+        return cross_scene_displacement(scene, a.frame, self.scene_of(b.scene_id), b.frame)
+
+
+def new_item(
+    recipe: Recipe,
+    scene: Scene,
+    timing: Timing,
+    candidates: Sequence[Candidate],
+    min_displacement: float,
+    **fields: Any,
+) -> SelectionItem:
+    """Return an item whose first candidate is the target. `fields` replace those of the recipe."""
+    values = {"suite": "dynapix", **recipe.fields(timing), **fields}
+    return SelectionItem(
+        item_id=f"{recipe.family}-{values['subtype']}-{scene.scene_id}-{timing.target}",
+        split=scene.split,
+        family=recipe.family,
+        scene_id=scene.scene_id,
+        prefix_start=timing.start,
+        prefix_stop=timing.stop,
+        target_frame=timing.target,
+        event_frame=timing.event,
+        candidates=tuple(candidates),
+        answer=0,
+        min_displacement=min_displacement,
+        **values,
+    )
+
+
+@dataclass(frozen=True)
+class CellInputs:
+    """The inputs for making the items or queries of one cell.
+
+    Attributes:
+        scene_ids: Scene ids by split.
+        scene_of: Function that loads a scene by its id.
+        min_displacement: Minimum displacement between two candidates, px at 336 x 336.
+        hard_negatives: Number of hard negatives of a query.
+    """
+
+    scene_ids: dict[str, list[str]]
+    scene_of: Callable[[str], Scene]
+    quota: Quota
+    seed: int
+    min_displacement: float
+    hard_negatives: int = 0
+
+
+def fill_quota(
+    cell_name: str,
+    recipe: Recipe,
+    cell: CellInputs,
+    make_picker: Callable[[str, np.random.Generator], Picker],
+) -> tuple[list[SelectionItem], int]:
+    """Make the items of one cell, at most one per scene, from scenes in a seeded order.
+
+    The timings of a scene are tried in a random order.
+
+    Args:
+        make_picker: Function that returns the picker for a split and its random generator.
+
+    Returns:
+        The items of each split up to its quota, and the number of timings that were dropped because
+        no three distractors are suitable.
+    """
+    items, dropped = [], 0
+    for split in SPLITS:
+        scene_ids = cell.scene_ids[split]
+        rng = named_rng(cell.seed, cell_name, split)
+        picker = make_picker(split, rng)
+        made: list[SelectionItem] = []
+        for index in rng.permutation(len(scene_ids)):
+            if len(made) == getattr(cell.quota, split):
+                break
+            if item := scene_item(recipe, cell.scene_of(scene_ids[index]), picker, rng):
+                made.append(item)
+        items += shuffle_candidates(made, rng)
+        dropped += picker.dropped
+    return items, dropped
+
+
+def scene_item(
+    recipe: Recipe, scene: Scene, picker: Picker, rng: np.random.Generator
+) -> SelectionItem | None:
+    """Return the item of the first timing, in a random order, at which one can be made."""
+    timings = recipe.timings(scene)
+    for k in rng.permutation(len(timings)):
+        about = recipe.subjects(scene, timings[k])
+        if about and (item := picker.make_item(recipe, scene, timings[k], about)):
+            return item
+    return None
+
+
+def shuffle_candidates(
+    items: Sequence[SelectionItem], rng: np.random.Generator
+) -> list[SelectionItem]:
+    """Return items with their candidates in a random order, each letter being the answer equally
+    often. Where the number of items is not divisible by 4, a random first letter decides which
+    letters are the answer once more."""
+    positions = rng.permutation((np.arange(len(items)) + rng.integers(4)) % 4)
+    shuffled = []
+    for item, position in zip(items, positions.tolist(), strict=True):
+        distractors = [c for k, c in enumerate(item.candidates) if k != item.answer]
+        candidates = [distractors[k] for k in rng.permutation(3)]
+        candidates.insert(position, item.candidates[item.answer])
+        shuffled.append(replace(item, candidates=tuple(candidates), answer=position))
+    return shuffled

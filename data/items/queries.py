@@ -1,0 +1,255 @@
+"""Makes retrieval queries: a prefix, a question and the target frame, with hard negatives.
+
+Six builders make future-state queries. The questions of two builders state a time, and those of
+four refer to a collision. One second is 25 frames. The end of the clip is the last frame of the
+scene.
+
+Counterfactual queries ask where an object would be had another one been absent. The scene is
+simulated again from the same start without that object; the target is a frame of this
+counterfactual scene. The prefix shows the factual scene and ends before the object's first contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from conf.schema.benchmark import QUERIES_PER_SCENE
+from data.items.pickers import CellInputs
+from data.items.recipes import spell_seconds
+from data.oracle.contacts import collision_frames, next_collision
+from data.oracle.displacement import (
+    cross_scene_displacement,
+    frame_displacements,
+    visible_positions,
+)
+from data.oracle.interventions import (
+    counterfactual_id,
+    last_factual_frame,
+    removal_displacements,
+    removed_object,
+)
+from data.records import FPS, SPLITS, FrameRef, RetrievalQuery, Scene
+from data.seeded_order import named_rng, round_robin
+
+EVENTS_PER_SCENE = 3
+"""Maximum number of events of a scene that builder 3 uses."""
+LEAD = 5
+"""Number of frames from the end of a prefix of builder 3 to the event."""
+MIN_OBSERVED = 12
+"""Minimum number of frames of a prefix of builder 3: the number that a model is shown."""
+HORIZONS = (1, 2, 3, 4)
+"""Seconds from the end of the prefix to the target of a counterfactual query."""
+OFFSETS = (16, 32, 48)
+"""Preferred offsets of hard negatives from the target, in frames on either side."""
+DENSE_STEP = 4
+"""Step in frames of the grid from which hard negatives are chosen if `OFFSETS` do not suffice."""
+NEXT_COLLISION = "Which frame shows the scene at the moment of the next collision?"
+AFTER_COLLISION = (
+    "The observation ends at a collision. Which frame shows the scene 1 second after that "
+    "collision?"
+)
+AFTER_NEXT_COLLISION = "Which frame shows the scene half a second after the next collision?"
+
+TimedQuestion = tuple[str, int, int, int]
+"""A question about a scene, the first and last frame of its prefix, and its target frame."""
+
+
+def _clip_end(scene: Scene) -> Iterator[TimedQuestion]:
+    for seconds in (2, 3, 4):
+        text = "Which frame shows the scene at the end of the clip, {} after the observation ends?"
+        yield text.format(spell_seconds(5 - seconds)), 0, seconds * FPS, scene.frames - 1
+
+
+def _clock(scene: Scene) -> Iterator[TimedQuestion]:
+    for seconds in (1, 2, 3):
+        text = f"Which frame shows the scene {spell_seconds(seconds)} after the observation ends?"
+        yield text, 0, 2 * FPS, (2 + seconds) * FPS
+
+
+def _next_event(scene: Scene) -> Iterator[TimedQuestion]:
+    events = [e for e in collision_frames(scene) if _is_next(scene, e - LEAD, e)]
+    for event in [e for e in events if e - LEAD + 1 >= MIN_OBSERVED][:EVENTS_PER_SCENE]:
+        yield NEXT_COLLISION, 0, event - LEAD, event
+
+
+def _around_event(lead: int, text: str, scene: Scene) -> Iterator[TimedQuestion]:
+    """Yield questions whose prefix ends `lead` frames before an event and 1 s before the target."""
+    for event in collision_frames(scene):
+        stop = event - lead
+        if stop >= FPS and stop + FPS < scene.frames and (not lead or _is_next(scene, stop, event)):
+            yield text, stop - FPS, stop, stop + FPS
+
+
+def _is_next(scene: Scene, stop: int, event: int) -> bool:
+    collision = next_collision(scene, stop)
+    return collision is not None and collision.frame == event
+
+
+BUILDERS: dict[int, Callable[[Scene], Iterator[TimedQuestion]]] = {
+    1: _clip_end,
+    2: _clock,
+    3: _next_event,
+    4: partial(_around_event, 0, AFTER_COLLISION),
+    5: partial(_around_event, FPS, NEXT_COLLISION),
+    6: partial(_around_event, FPS // 2, AFTER_NEXT_COLLISION),
+}
+"""Each builder yields all questions that it can ask about a scene."""
+
+
+def make_future_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
+    """Make the queries of one builder, and count those dropped; see `fill_query_quota`."""
+
+    def queries_of(scene: Scene) -> Iterator[RetrievalQuery]:
+        for question, start, stop, target in BUILDERS[builder](scene):
+            yield RetrievalQuery(
+                query_id=f"future-{builder}-{scene.scene_id}-{start}-{stop}-{target}",
+                split=scene.split,
+                pool="future",
+                builder=builder,
+                anchor="time" if builder in (1, 2) else "event",
+                question=question,
+                scene_id=scene.scene_id,
+                prefix_start=start,
+                prefix_stop=stop,
+                target=FrameRef(scene.scene_id, target),
+            )
+
+    return fill_query_quota(
+        str(builder), cell, queries_of, QUERIES_PER_SCENE.get(str(builder)) == 1
+    )
+
+
+def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
+    """Make the counterfactual queries, and count those that are dropped; see `fill_query_quota`.
+
+    A query names the removed object and the visible object that its absence displaces most. The
+    first hard negative is the same frame of the factual scene; the others are other frames of the
+    counterfactual scene.
+    """
+
+    def queries_of(scene: Scene) -> Iterator[RetrievalQuery]:
+        removed = removed_object(scene, cell.seed)
+        if removed is None:
+            return
+        stop = last_factual_frame(scene, removed)
+        other = counterfactual_id(scene.scene_id, removed)
+        shifts = removal_displacements(scene, cell.scene_of(other), removed)
+        # The question can only name an object that the observation shows.
+        shifts[:, ~visible_positions(scene)[1][: stop + 1].any(axis=0)] = 0.0
+        for seconds in HORIZONS:
+            target = stop + seconds * FPS
+            if target >= scene.frames or shifts[target].max() < cell.min_displacement:
+                continue
+            absent, asked = (
+                scene.objects[k].noun_phrase for k in (removed, int(shifts[target].argmax()))
+            )
+            yield RetrievalQuery(
+                query_id=f"counterfactual-{other}-{stop}-{target}",
+                split=scene.split,
+                pool="counterfactual",
+                builder=None,
+                anchor="intervention",
+                question=(
+                    f"Had the {absent} been absent, where would the {asked} be "
+                    f"{spell_seconds(seconds)} after the observation ends? Which frame shows it?"
+                ),
+                scene_id=scene.scene_id,
+                prefix_start=0,
+                prefix_stop=stop,
+                target=FrameRef(other, target),
+                hard_negatives=(FrameRef(scene.scene_id, target),),
+                removed_object=absent,
+                asked_object=asked,
+            )
+
+    return fill_query_quota("counterfactual", cell, queries_of)
+
+
+def fill_query_quota(
+    builder: str,
+    cell: CellInputs,
+    queries_of: Callable[[Scene], Iterable[RetrievalQuery]],
+    one_per_scene: bool = False,
+) -> tuple[list[RetrievalQuery], int]:
+    """Make the queries of one builder up to its quota in each split.
+
+    Scenes take turns in a seeded order: each gives one query before any gives a second one.
+
+    Args:
+        queries_of: Function that returns all queries about a scene, for `add_hard_negatives`.
+        one_per_scene: Whether a scene gives at most one query.
+
+    Returns:
+        The queries, and the number of queries that were dropped because they have too few
+        distinguishable hard negatives.
+    """
+
+    def attempts(
+        queries: list[RetrievalQuery], rng: np.random.Generator
+    ) -> Iterator[RetrievalQuery | None]:
+        for query in queries:
+            completed = add_hard_negatives(query, cell, rng)
+            yield completed
+            if completed is not None and one_per_scene:
+                return
+
+    made: list[RetrievalQuery] = []
+    dropped = 0
+    for split in SPLITS:
+        rng = named_rng(cell.seed, "retrieval", builder, split)
+        scene_ids, wanted = cell.scene_ids[split], getattr(cell.quota, split) + len(made)
+        queues = []
+        for index in rng.permutation(len(scene_ids)) if wanted > len(made) else ():
+            queries = list(queries_of(cell.scene_of(scene_ids[index])))
+            order = rng.permutation(len(queries))[::-1]
+            queues.append(attempts([queries[k] for k in order], rng))
+        for query in round_robin(queues):
+            if query is None:
+                dropped += 1
+                continue
+            made.append(query)
+            if len(made) == wanted:
+                break
+    return made, dropped
+
+
+def add_hard_negatives(
+    query: RetrievalQuery, cell: CellInputs, rng: np.random.Generator
+) -> RetrievalQuery | None:
+    """Complete a query's hard negatives with other frames of its target's scene.
+
+    The added frames differ from the target, from each other and from the hard negatives that the
+    query already has by at least `cell.min_displacement`. Frames of the prefix are included: the
+    database contains them too, and a retriever has to rank them below the target.
+
+    Returns:
+        The query, or None if there are too few such frames.
+    """
+    scene, target = cell.scene_of(query.target.scene_id), query.target.frame
+    displacements = frame_displacements(scene)
+    preferred = [target + side * offset for offset in OFFSETS for side in (-1, 1)]
+    dense = list(range(target % DENSE_STEP, scene.frames, DENSE_STEP))
+    count = 1 + cell.hard_negatives - len(query.hard_negatives)
+    chosen = [target]
+    for frame in [*rng.permutation(preferred), *rng.permutation(dense)]:
+        if len(chosen) == count:
+            break
+        if (
+            0 <= frame < scene.frames
+            and displacements[frame, chosen].min() >= cell.min_displacement
+        ):
+            chosen.append(int(frame))
+    wrong = chosen[1:]
+    if len(chosen) < count or any(
+        cross_scene_displacement(cell.scene_of(given.scene_id), given.frame, scene, frame)
+        < cell.min_displacement
+        for given in query.hard_negatives
+        for frame in wrong
+    ):
+        return None
+    negatives = (FrameRef(scene.scene_id, frame) for frame in wrong)
+    return replace(query, hard_negatives=(*query.hard_negatives, *negatives))

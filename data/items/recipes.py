@@ -1,0 +1,301 @@
+"""The recipes of the suite `dynapix`: one for each cell of the three families, and matched pairs.
+
+*event*: the target shows the scene at, or just after, a collision. Framing *future*: the prefix
+ends `gap` frames before the next collision, whose frame is the target. Framing *contact*: the
+prefix ends at the collision, and the target is `gap` frames later.
+
+*time*: the prefix is the first second, and the target is one or two seconds after it.
+
+*window*: the target is a few frames (the horizon) after the prefix. The group is that of the
+events (`window_group`). The window family selects the objects that the item is about, among those
+on screen in the prefix (A: all, B: the pair of the next collision, C: the object that moves most).
+Distractors of hard items are the frames most similar to the target; those of easy items are random
+frames of the less similar half.
+
+*matched*: the two items of a matched-anchor pair share prefix, target and candidates; the target is
+the next collision, one or two seconds after the prefix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import islice, product
+from typing import Any
+
+import numpy as np
+
+from conf.schema.benchmark import WINDOW_DIFFICULTIES, WINDOW_FAMILIES, WINDOW_HORIZONS
+from data.items.pickers import DistractorPicker, Pool, Recipe, Timing, visible_objects
+from data.oracle.contacts import collision_frames, next_collision
+from data.oracle.displacement import object_match_scores, visible_positions
+from data.oracle.events import window_group
+from data.records import MATCHED_ANCHOR, SELECTION_SECOND, Candidate, Scene, SelectionItem
+
+EVENT_OBSERVED, WINDOW_OBSERVED = 21, 16
+"""Default numbers of frames of a prefix. The first and last frame of event items differ by 20."""
+TAIL = 10
+"""Minimum number of frames after the target of an event item."""
+OFFSETS = (16, 32, 48)
+"""Offsets of same-scene distractors from the target of an event item, in frames on either side."""
+CROSS_SCENES = 24
+"""Number of other scenes to sample for cross-scene distractors."""
+
+EVENT_QUESTION = "Which image is closest to the correct future state of the whole scene?"
+WINDOW_QUESTION = "Which image best matches the next scene state?"
+TIME_QUESTION = (
+    "Watch the 1-second observation video. Which image best shows what the scene will look like "
+    "{} after the observation ends?"
+)
+MATCHED_QUESTION = (
+    "Watch the 1-second observation video. Which image best shows what the scene will look like "
+    "at the moment of the next collision?"
+)
+
+EVENT_CELLS = {
+    "future_cross_gap10": ("future", "cross_scene", 10),
+    "future_offset_gap10": ("future", "same_offset", 10),
+    "future_match_gap10": ("future", "same_obj_match", 10),
+    "future_match_gap5": ("future", "same_obj_match", 5),
+    "contact_cross": ("contact", "cross_scene", 10),
+    "contact_offset": ("contact", "same_offset", 10),
+    "contact_match": ("contact", "same_obj_match", 10),
+}
+"""Framing, distractors and gap by subtype (paper, Table "The seven event-anchored subtypes")."""
+TIME_CELLS = {"in_1s": 1, "in_2s": 2}
+"""Seconds between the prefix and the target, by subtype."""
+WINDOW_CELLS = {
+    f"{group}_{family}_h{horizon}_{difficulty}": (group, family, horizon, difficulty)
+    for group, families in WINDOW_FAMILIES.items()
+    for family, horizon, difficulty in product(families, WINDOW_HORIZONS, WINDOW_DIFFICULTIES)
+}
+"""Group, window family, horizon and difficulty by subtype."""
+CELLS = {"event": tuple(EVENT_CELLS), "time": tuple(TIME_CELLS), "window": tuple(WINDOW_CELLS)}
+"""The subtypes of each family."""
+OBSERVATIONS = ("event", "window")
+"""Families whose number of observed frames is a setting."""
+
+
+def make_recipe(family: str, subtype: str, observation: Mapping[str, int]) -> Recipe:
+    """Return the recipe of a cell.
+
+    Args:
+        observation: Numbers of observed frames by subtype or family, where they are not the
+            defaults.
+    """
+    observed = observation.get(subtype, observation.get(family))
+    if family == "event":
+        return event_recipe(subtype, observed or EVENT_OBSERVED)
+    if family == "time":
+        return Recipe(
+            "time", partial(time_timings, TIME_CELLS[subtype]), time_fields, frames_after_prefix
+        )
+    return window_recipe(subtype, observed or WINDOW_OBSERVED)
+
+
+def event_recipe(subtype: str, observed: int) -> Recipe:
+    framing, distractors, gap = EVENT_CELLS[subtype]
+
+    def timings(scene: Scene) -> list[Timing]:
+        lead = gap if framing == "future" else 0
+        every = [
+            Timing(stop - observed + 1, stop, stop + gap, event)
+            for event in collision_frames(scene)
+            if (stop := event - lead) >= observed - 1 and stop + gap <= scene.frames - 1 - TAIL
+        ]
+        return [t for t in every if framing == "contact" or is_next(scene, t)]
+
+    def pools(
+        scene: Scene,
+        timing: Timing,
+        about: tuple[int, ...],
+        rng: np.random.Generator,
+        picker: DistractorPicker,
+    ) -> Sequence[Pool]:
+        if distractors == "cross_scene":
+            return [(cross_scene_targets(picker, scene, timings, rng, CROSS_SCENES), 3)]
+        if distractors == "same_offset":
+            sides = [f for o in OFFSETS for f in (timing.target - o, timing.target + o)]
+            frames = rng.permutation([f for f in sides if 0 <= f < scene.frames])
+        else:
+            frames = similar_frames(scene, timing.target)
+        wrong = scene_candidates(scene, timing.outside_prefix(frames), distractors)
+        return balance_in_time(wrong, timing.target, rng)
+
+    fields = {
+        "subtype": subtype, "question": EVENT_QUESTION, "framing": framing,
+        "distractors": distractors, "gap": gap,
+    }  # fmt: skip
+    return Recipe("event", timings, lambda timing: fields, pools)
+
+
+def is_next(scene: Scene, timing: Timing) -> bool:
+    """Return whether the event of a timing is the first collision after its prefix."""
+    collision = next_collision(scene, timing.stop)
+    return collision is not None and collision.frame == timing.event
+
+
+def time_timings(seconds: int, scene: Scene) -> list[Timing]:
+    """Return the single timing of a scene, whose prefix is the first second. The target is the
+    first frame after the stated seconds."""
+    target = SELECTION_SECOND * (1 + seconds)
+    return [Timing(0, SELECTION_SECOND - 1, target)] if target < scene.frames else []
+
+
+def time_fields(timing: Timing) -> dict[str, Any]:
+    horizon = timing.target - timing.stop
+    seconds = horizon // SELECTION_SECOND
+    return {
+        "subtype": f"in_{seconds}s",
+        "question": TIME_QUESTION.format(spell_seconds(seconds)),
+        "distractors": "same_time",
+        "horizon": horizon,
+    }
+
+
+def spell_seconds(count: int) -> str:
+    return "1 second" if count == 1 else f"{count} seconds"
+
+
+def frames_after_prefix(
+    scene: Scene,
+    timing: Timing,
+    about: tuple[int, ...],
+    rng: np.random.Generator,
+    picker: DistractorPicker,
+) -> Sequence[Pool]:
+    """Return pools of the other frames after the prefix."""
+    later = rng.permutation(np.arange(timing.stop + 1, scene.frames))
+    wrong = scene_candidates(scene, later[later != timing.target], "same_time")
+    return balance_in_time(wrong, timing.target, rng)
+
+
+def window_recipe(subtype: str, observed: int) -> Recipe:
+    group, window_family, horizon, difficulty = WINDOW_CELLS[subtype]
+    is_hard = difficulty == "hard"
+    source = "same_near" if is_hard else "same_far"
+
+    def timings(scene: Scene) -> list[Timing]:
+        stops = range(observed - 1, scene.frames - horizon)
+        return [Timing(stop - observed + 1, stop, stop + horizon) for stop in stops]
+
+    def subjects(scene: Scene, timing: Timing) -> tuple[int, ...]:
+        if window_group(scene, timing.start, timing.stop, horizon) != group:
+            return ()
+        visible = visible_objects(scene, timing)
+        return tuple(k for k in window_subjects(window_family, scene, timing) if k in visible)
+
+    def pools(
+        scene: Scene,
+        timing: Timing,
+        about: tuple[int, ...],
+        rng: np.random.Generator,
+        picker: DistractorPicker,
+    ) -> Sequence[Pool]:
+        frames = timing.outside_prefix(similar_frames(scene, timing.target, about))
+        if not is_hard:
+            # Shuffled, because the least similar frames are consecutive and the target would stand
+            # out.
+            frames = rng.permutation(frames[len(frames) // 2 :])
+        return balance_in_time(scene_candidates(scene, frames, source), timing.target, rng)
+
+    fields = {
+        "subtype": subtype, "question": WINDOW_QUESTION, "distractors": source, "group": group,
+        "window_family": window_family, "horizon": horizon, "difficulty": difficulty,
+    }  # fmt: skip
+    return Recipe("window", timings, lambda timing: fields, pools, subjects)
+
+
+def window_subjects(window_family: str, scene: Scene, timing: Timing) -> tuple[int, ...]:
+    """Return the objects that a window family selects: none if no collision occurs up to the target
+    (B), or nothing visible moves (C)."""
+    stop, target = timing.stop, timing.target
+    if window_family == "A":
+        return tuple(range(len(scene.objects)))
+    if window_family == "B":
+        collision = next_collision(scene, stop)
+        return collision.objects if collision and collision.frame <= target else ()
+    positions, visible = visible_positions(scene)
+    moved = np.linalg.norm(positions[target] - positions[stop], axis=-1)
+    moved[~(visible[target] & visible[stop])] = 0
+    return (int(moved.argmax()),) if moved.max() > 0 else ()
+
+
+def matched_timings(scene: Scene) -> list[Timing]:
+    """Return timings with a 1-second prefix and the next collision as target, one or two seconds
+    later as the time family counts them."""
+    every = [
+        Timing(stop - SELECTION_SECOND + 1, stop, target, event=target)
+        for target in collision_frames(scene)
+        for seconds in TIME_CELLS.values()
+        if (stop := target - seconds * SELECTION_SECOND - 1) >= SELECTION_SECOND - 1
+        and target <= scene.frames - 1 - TAIL
+    ]
+    return [timing for timing in every if is_next(scene, timing)]
+
+
+MATCHED = Recipe("time", matched_timings, time_fields, frames_after_prefix)
+"""The recipe of the time items of matched-anchor pairs."""
+
+
+def make_pair(item: SelectionItem) -> tuple[SelectionItem, SelectionItem]:
+    """Return the event item and the time item of the pair that a time item belongs to."""
+    key = pair_key(item)
+    by_time = replace(item, suite=MATCHED_ANCHOR, item_id=f"{MATCHED_ANCHOR}-time-{key}")
+    by_event = replace(
+        by_time,
+        item_id=f"{MATCHED_ANCHOR}-event-{key}",
+        family="event",
+        subtype="next_collision",
+        question=MATCHED_QUESTION,
+    )
+    return by_event, by_time
+
+
+def pair_key(item: SelectionItem) -> str:
+    return f"{item.scene_id}-{item.prefix_stop}-{item.target_frame}"
+
+
+def similar_frames(scene: Scene, target: int, about: tuple[int, ...] | None = None) -> np.ndarray:
+    """Return the frames of a scene except the target, those most similar to it first."""
+    similar = np.argsort(object_match_scores(scene, target, about), kind="stable")
+    return similar[similar != target]
+
+
+def scene_candidates(scene: Scene, frames: Iterable[int], source: str) -> Iterator[Candidate]:
+    """Yield frames of a scene as candidates with this `source`."""
+    return (Candidate(scene.scene_id, int(frame), source) for frame in frames)
+
+
+def cross_scene_targets(
+    picker: DistractorPicker,
+    scene: Scene,
+    timings: Callable[[Scene], Sequence[Timing]],
+    rng: np.random.Generator,
+    count: int,
+) -> list[Candidate]:
+    """Return the first target of up to `count` other scenes of the split and of the scene's
+    scenario. Scenes that share more objects with `scene` come first."""
+    # The generators are lazy: no more scenes are loaded than needed.
+    scenes = (picker.scene_of(picker.scene_ids[k]) for k in rng.permutation(len(picker.scene_ids)))
+    others = (s for s in scenes if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
+    found = islice(((s, own) for s in others if (own := timings(s))), count)
+    objects = {*scene.objects}
+    ranked = sorted(found, key=lambda pair: -len(objects & {*pair[0].objects}))
+    return [Candidate(s.scene_id, own[0].target, "cross_scene") for s, own in ranked]
+
+
+def balance_in_time(
+    pool: Iterable[Candidate], target: int, rng: np.random.Generator
+) -> tuple[Pool, Pool, Pool]:
+    """Divide a pool so that a random number (0 to 3) of the distractors precedes the target.
+
+    The pools are frames before the target, frames after it, and all frames in case these are too
+    few. Without this, the candidates' order in time would often reveal the target.
+    """
+    pool = list(pool)
+    earlier = int(rng.integers(4))
+    before = [c for c in pool if c.frame < target]
+    after = [c for c in pool if c.frame > target]
+    return (before, earlier), (after, 3 - earlier), (pool, 3)

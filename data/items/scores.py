@@ -1,0 +1,224 @@
+"""Scores of candidates that involve no prediction, and the balance of the target's rank in them.
+
+A strategy that does not predict chooses the candidate with the lowest or highest score. It is right
+in a quarter of the items if the target has each of the four ranks equally often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from data.frames.frame_cache import render_frames
+from data.oracle.displacement import DIAGONAL, cross_scene_displacement, visible_positions
+from data.records import FrameRef, Scene, SelectionItem
+from data.sim.shapes import RADIUS
+
+SCORES = (
+    "nearness", "pixel nearness", "oddness", "pixel oddness", "moment", "travel", "visible", "gap",
+)  # fmt: skip
+"""Scores of a candidate: displacement from the last observed frame, mean difference of pixels from
+it, sums of displacements and of pixel differences from the other candidates, index of the frame,
+sum of the displacements of all objects since the last observed frame, number of visible objects,
+and the smallest gap between two of them."""
+TOUCHING = 0.05
+"""Gap (simulator units) below which two objects count as touching."""
+APART = 10.0
+"""Gap (simulator units) of a frame in which fewer than two objects are visible."""
+LIMIT, TOLERANCE = 1.75, 0.015
+"""The number of targets with one rank may differ from a quarter of the items by at most
+LIMIT + TOLERANCE * items."""
+IMAGE_SIZE = 72, 48
+"""Width and height in px of the images that are compared by pixels."""
+START = 0.75
+"""The initial counts are samples from [-START, START], less the mean of each score's four
+counts."""
+
+
+@dataclass(frozen=True)
+class CandidateFrames:
+    """The last observed frame and frames from which candidates are chosen, as scores need them.
+
+    Attributes:
+        displacement: (M, M) displacement between two frames, px at 336 x 336.
+        pixels: (M, M) mean difference of pixels.
+        single: (4, M) moment, travel, number of visible objects and gap of each frame.
+    Frame 0 is the last observed frame.
+    """
+
+    displacement: np.ndarray
+    pixels: np.ndarray
+    single: np.ndarray
+
+    @classmethod
+    def compare(
+        cls, frames: Sequence[tuple[Scene, int]], moments: Sequence[int], images: np.ndarray
+    ) -> CandidateFrames:
+        """Compare frames, given as scenes and indices, whose images are (M, H, W, 3) uint8.
+
+        Args:
+            moments: (M,) indices of the frames in time.
+        """
+        displacement = np.zeros((len(frames), len(frames)))
+        for a, b in combinations(range(len(frames)), 2):
+            distance = cross_scene_displacement(*frames[a], *frames[b])
+            displacement[a, b] = displacement[b, a] = distance
+        flat = images.reshape(len(images), -1).astype(np.float32)
+        single = [
+            moments,
+            [_travel(*frames[0], *frame) for frame in frames],
+            [visible_positions(scene)[1][frame].sum() for scene, frame in frames],
+            [_gap(scene, frame) for scene, frame in frames],
+        ]
+        pixels = np.stack([np.abs(flat - image).mean(axis=-1) for image in flat])
+        return cls(displacement, pixels, np.array(single, dtype=float))
+
+    def scores(self, candidates: np.ndarray) -> np.ndarray:
+        """Return the scores (S, T, 4) of T choices of candidates, (T, 4) indices of frames."""
+        one, other = candidates[:, :, None], candidates[:, None, :]
+        return np.stack(
+            [
+                self.displacement[0, candidates],
+                self.pixels[0, candidates],
+                self.displacement[one, other].sum(axis=-1),
+                self.pixels[one, other].sum(axis=-1),
+                *self.single[:, candidates],
+            ]
+        )
+
+
+def _travel(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:
+    """Return the sum of the displacements of all objects between frames of two scenes, px at
+    336 x 336. An object that one scene lacks counts with the image's diagonal."""
+    positions, visible = (array[frame] for array in visible_positions(scene))
+    other_positions, other_visible = (array[other_frame] for array in visible_positions(other))
+    index = {key: k for k, key in enumerate(other.object_keys)}
+    total = 0.0
+    for k, key in enumerate(scene.object_keys):
+        match = index.pop(key, None)
+        if match is None:
+            total += DIAGONAL * visible[k]
+        elif visible[k] or other_visible[match]:
+            total += float(np.linalg.norm(positions[k] - other_positions[match]))
+    return total + DIAGONAL * float(other_visible[list(index.values())].sum())
+
+
+def _gap(scene: Scene, frame: int) -> float:
+    """Return the smallest gap between two visible objects of a frame, simulator units. Gaps below
+    `TOUCHING` count as equal."""
+    seen = np.flatnonzero(visible_positions(scene)[1][frame])
+    scales = scene.object_scales
+    gaps = [
+        np.linalg.norm(scene.positions[frame, a] - scene.positions[frame, b])
+        - RADIUS * (scales[a] + scales[b])
+        for a, b in combinations(seen.tolist(), 2)
+    ]
+    return max(float(min(gaps, default=APART)), TOUCHING)
+
+
+def nearly_equal(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return whether scores differ by less than the precision of the stored positions."""
+    return np.isclose(one, other, rtol=1e-4, atol=1e-3)
+
+
+def rank_shares(scores: np.ndarray) -> np.ndarray:
+    """Return the distribution (..., 4) of the rank of the first of four candidates (..., 4).
+
+    The rank is the number of candidates with lower scores; candidates with equal scores share the
+    ranks.
+    """
+    target, others = scores[..., :1], scores[..., 1:]
+    close = nearly_equal(others, target)
+    lower = (others < target) & ~close
+    first, count = lower.sum(axis=-1), close.sum(axis=-1) + 1
+    ranks = np.arange(4)
+    shared = (ranks >= first[..., None]) & (ranks < (first + count)[..., None])
+    return shared / count[..., None]
+
+
+def compare_candidates(scores: np.ndarray) -> np.ndarray:
+    """Return the scores (..., S, 4) of four candidates relative to each other, (..., 3 S, 4): in
+    standard deviations from their mean, and whether each is the lowest or the highest."""
+    spread = scores.std(axis=-1, keepdims=True)
+    relative = (scores - scores.mean(axis=-1, keepdims=True)) / np.maximum(spread, 1e-6)
+    is_lowest = nearly_equal(scores, scores.min(axis=-1, keepdims=True))
+    is_highest = nearly_equal(scores, scores.max(axis=-1, keepdims=True))
+    return np.concatenate([relative, is_lowest, is_highest], axis=-2)
+
+
+class Balance:
+    """Counts how often the targets of a cell have each rank in each score.
+
+    The counts start at random values near 0, so that the few items of many small cells do not all
+    begin with the same ranks.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.items = 0
+        start = rng.uniform(-START, START, (len(SCORES), 4))
+        self.counts = start - start.mean(axis=-1, keepdims=True)
+
+    def rarest_rank(self, score: str) -> int:
+        """Return the rank that the fewest targets have in a score."""
+        return int(self.counts[SCORES.index(score)].argmin())
+
+    def choose(self, scores: np.ndarray) -> int | None:
+        """Return the choice of candidates that keeps the counts of ranks most even, and count it.
+
+        Args:
+            scores: (S, T, 4) scores of T choices; the first of four candidates is the target.
+
+        Returns:
+            The index of the choice, or None if each would make the count of a rank differ too much
+            from a quarter of the items (see `LIMIT`) and the counts less even as a whole.
+        """
+        shares = rank_shares(scores).swapaxes(0, 1)
+        excess = self.counts + shares - (self.items + 1) / 4
+        unevenness = (excess**2).sum(axis=(1, 2))
+        # Without the second condition, a cell could reach counts at which it refuses every item.
+        allowed = (np.abs(excess).max(axis=(1, 2)) <= LIMIT + TOLERANCE * self.items) | (
+            unevenness < ((self.counts - self.items / 4) ** 2).sum()
+        )
+        if not allowed.any():
+            return None
+        best = int(np.where(allowed, unevenness, np.inf).argmin())
+        self.counts = self.counts + shares[best]
+        self.items += 1
+        return best
+
+
+def item_scores(
+    item: SelectionItem, scene_of: Callable[[str], Scene], config: Mapping[str, Any]
+) -> np.ndarray:
+    """Return the scores (S, 4) of an item's candidates, in the order of `SCORES`.
+
+    Args:
+        scene_of: Function that loads a scene by its id.
+        config: Settings of the benchmark.
+    """
+    frames = [FrameRef(item.scene_id, item.prefix_stop), *item.candidates]
+    states = [(scene_of(f.scene_id), f.frame) for f in frames]
+    images = np.stack([_small_image(*state, config) for state in states])
+    compared = CandidateFrames.compare(states, [f.frame for f in frames], images)
+    return compared.scores(np.array([[1, 2, 3, 4]]))[:, 0]
+
+
+def _small_image(scene: Scene, frame: int, config: Mapping[str, Any]) -> np.ndarray:
+    """Return a frame as a small (H, W, 3) image, rendered by Bullet if its scene was simulated."""
+    width, height = IMAGE_SIZE
+    small = {"renderer": "bullet", "width": width, "height": height}
+    pixels = render_frames(scene, [frame], {**config, **small})[frame]
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    return np.asarray(Image.fromarray(pixels).resize(IMAGE_SIZE))
+
+
+def order_target_first(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Return scores (N, S, 4) with those of the target, whose index is in `answers`, first."""
+    order = np.array([[a, *(k for k in range(4) if k != a)] for a in answers.tolist()])
+    return np.take_along_axis(scores, order[:, None, :], axis=-1)

@@ -1,0 +1,113 @@
+"""The recipes of the transfer suites, which test students on scenes of MoVi-A and Physion.
+
+A suite is a set of items that are made in the same way. The transfer suites have the questions of
+the suite `dynapix`. Items from CLEVRER's scenes belong to the suite `dynapix`.
+
+Spans and gaps are the paper's numbers of frames at every frame rate. A scene of MoVi-A lasts two
+seconds, so there is no in_2s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from data.items.pickers import DistractorPicker, Pool, Recipe, Timing
+from data.items.recipes import (
+    EVENT_QUESTION,
+    TIME_CELLS,
+    TIME_QUESTION,
+    cross_scene_targets,
+    scene_candidates,
+    spell_seconds,
+)
+from data.oracle.contacts import collision_frames, first_collisions
+from data.oracle.events import find_motion_onsets
+from data.records import Scene
+
+SPAN, GAP = 20, 10
+"""Number of frames from the first to the last frame of the prefix of an event item, and from there
+to the event, which is the target."""
+MIN_PREFIX_FRAMES = 5
+"""Minimum number of frames in a prefix, for prefixes that are cut at the start of the scene."""
+CROSS_SCENES = 8
+"""Number of other scenes to sample for cross-scene distractors."""
+
+EVENTS: dict[str, dict[str, Callable[[Scene], list[int]]]] = {
+    "movi_a": {"contact": collision_frames},
+    "physion": {
+        "A1_contact": lambda scene: [c.frame for c in first_collisions(scene)[:1]],
+        "A2_motion": lambda scene: [frame for frame, _ in find_motion_onsets(scene)],
+        "A3_landing": lambda scene: [landing.frame for landing in scene.landings],
+    },
+}
+"""Functions that return the frames of a scene's events, by suite and subtype. A1 is the first
+contact of a trial."""
+CELLS = {
+    "movi_a": {"event": tuple(EVENTS["movi_a"]), "time": ("in_1s",), "window": ()},
+    "physion": {"event": tuple(EVENTS["physion"]), "time": tuple(TIME_CELLS), "window": ()},
+}
+"""The subtypes of each family, by suite."""
+
+
+def make_transfer_recipe(recipe: str, suite: str, family: str, subtype: str) -> Recipe:
+    """Return the recipe of a cell.
+
+    Args:
+        recipe: `movi_a` or `physion`. In MoVi-A, one distractor comes from the item's own scene,
+            from after the prefix; in Physion two, from after the target. The others are targets
+            from other scenes of the same scenario.
+        suite: Name of the suite of the items, that of the recipe or of a stand-in.
+    """
+    is_event = family == "event"
+
+    def timings(scene: Scene) -> list[Timing]:
+        if is_event:
+            return event_timings(EVENTS[recipe][subtype](scene))
+        return time_timings(scene, TIME_CELLS[subtype])
+
+    def fields(timing: Timing) -> dict[str, Any]:
+        lead = timing.target - timing.stop
+        axes = {"framing": "future", "gap": lead} if is_event else {"horizon": lead}
+        question = EVENT_QUESTION
+        if not is_event:
+            question = TIME_QUESTION.format(spell_seconds(TIME_CELLS[subtype]))
+        fixed = {"suite": suite, "subtype": subtype, "distractors": "mixed"}
+        return {**fixed, "question": question, **axes}
+
+    def pools(
+        scene: Scene,
+        timing: Timing,
+        about: tuple[int, ...],
+        rng: np.random.Generator,
+        picker: DistractorPicker,
+    ) -> Sequence[Pool]:
+        own, first = (1, timing.stop) if recipe == "movi_a" else (2, timing.target)
+        frames = rng.permutation(np.arange(first + 1, scene.frames))
+        wrong = scene_candidates(scene, frames[frames != timing.target], "same_time")
+        others = cross_scene_targets(picker, scene, timings, rng, CROSS_SCENES)
+        return [(wrong, own), (others, 3 - own)]
+
+    return Recipe(family, timings, fields, pools, lambda scene, _: (*range(len(scene.objects)),))
+
+
+def event_timings(events: Sequence[int]) -> list[Timing]:
+    """Return a timing for each event, which is its target."""
+    stops = [frame - GAP for frame in sorted({*events})]
+    return [
+        Timing(max(stop - SPAN, 0), stop, stop + GAP, event=stop + GAP)
+        for stop in stops
+        if stop + 1 >= MIN_PREFIX_FRAMES
+    ]
+
+
+def time_timings(scene: Scene, seconds: int) -> list[Timing]:
+    """Return the single timing of a scene that is long enough: its prefix is the first second."""
+    second = round(scene.fps)
+    # As in the suite `dynapix`, the target is the first frame after the stated seconds; a scene
+    # of MoVi-A ends one frame earlier.
+    target = min(second * (1 + seconds), scene.frames - 1)
+    is_long_enough = scene.frames >= second * (1 + seconds)
+    return [Timing(0, second - 1, target)] if is_long_enough else []

@@ -1,0 +1,65 @@
+"""Contacts of objects, and what follows from them: the next collision, first and repeated ones.
+
+A scene records every contact of every pair. A pair that touches in the first frame is in contact
+from the start: this contact is no event.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from data.records import FPS, Collision, Scene
+from data.sim.physics import CONTACT_FREE_FRAMES
+
+Pair = tuple[int, int]
+
+
+def group_contacts(
+    touching: Mapping[Pair, Iterable[int]], fps: float = FPS
+) -> tuple[Collision, ...]:
+    """Group the frames in which pairs touch into contacts, in order of frame.
+
+    A contact ends when more than `CONTACT_FREE_FRAMES` frames of Bullet's scenes, or as much time
+    at another frame rate, follow without touch.
+    """
+    gap = max(1, round(CONTACT_FREE_FRAMES * fps / FPS))
+    contacts = []
+    for (one, other), frames in touching.items():
+        pair = (min(one, other), max(one, other))
+        start = end = None
+        for frame in sorted(frames):
+            if end is not None and frame - end > gap + 1:
+                contacts.append(Collision(start, pair, end))
+                start = None
+            start, end = frame if start is None else start, frame
+        if end is not None:
+            contacts.append(Collision(start, pair, end))
+    return tuple(sorted(contacts, key=lambda contact: (contact.frame, contact.objects)))
+
+
+def collisions_in(scene: Scene, first: int, last: int) -> list[Collision]:
+    """Return the contacts that begin at frames `first` to `last`, inclusive, and not at frame 0."""
+    return [c for c in scene.collisions if max(first, 1) <= c.frame <= last]
+
+
+def collision_frames(scene: Scene) -> list[int]:
+    """Return the frames at which contacts begin, in order, without repetitions."""
+    return list(dict.fromkeys(c.frame for c in collisions_in(scene, 1, scene.frames)))
+
+
+def next_collision(scene: Scene, frame: int) -> Collision | None:
+    """Return the first contact that begins after a frame, or None."""
+    return next(iter(collisions_in(scene, frame + 1, scene.frames)), None)
+
+
+def first_collisions(scene: Scene) -> list[Collision]:
+    """Return the first contact of each pair that does not touch from the start, in order."""
+    first: dict[Pair, Collision] = {}
+    for contact in scene.collisions:
+        first.setdefault(contact.objects, contact)
+    return [contact for contact in first.values() if contact.frame > 0]
+
+
+def touching_pairs(scene: Scene, first: int, last: int) -> set[Pair]:
+    """Return the pairs that are in contact at any of the frames `first` to `last`."""
+    return {c.objects for c in scene.collisions if c.frame <= last and c.end >= first}

@@ -1,0 +1,300 @@
+"""Simulation of rigid bodies with Bullet.
+
+`pybullet` is imported when a client connects, so that reading a built benchmark does not need it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from itertools import chain, combinations, pairwise, product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from data.records import Landing, SceneObject
+from data.sim.parts import part_box
+from data.sim.shapes import CUBE_HALF, RADIUS, half_height
+
+if TYPE_CHECKING:
+    from pybullet_utils.bullet_client import BulletClient
+
+    from conf.schema import PartConfig, WorldConfig
+
+SOLVER_ITERATIONS = 20
+CONTACT_FREE_FRAMES = 5
+"""A contact of a pair ends when more frames than this without contact follow."""
+TOUCHING = 0.02
+"""Distance (simulator units) below which bodies touch at the start."""
+
+Touching = Mapping[tuple[int, int], Sequence[int]]
+"""The frames in which each pair of objects (lower index first) touches, in order."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """An object and its initial state: ground position, yaw in radians, ground velocity."""
+
+    object: SceneObject
+    position: Sequence[float] | np.ndarray
+    yaw: float
+    velocity: Sequence[float] | np.ndarray = (0.0, 0.0)
+    height: float | None = None
+    """Initial height of the centre of a body in the air; None for a body on the floor."""
+    scale: float = 1.0
+    """Size, as a multiple of the standard size of the shape."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The simulated motion of some bodies.
+
+    Attributes:
+        states: (F, N, 13) positions, quaternions, linear and angular velocities as in `Scene`.
+        touching: The frames in which each pair touches.
+        touching_at_start: Whether any two bodies, or a body and a part, touch at the first frame.
+            Such a motion is not simulated: it has the first frame only.
+        landings: Landings, on the floor or on a part, of bodies that start in the air.
+        is_rejected: Whether the simulation stopped because the caller rejected its contacts.
+    """
+
+    states: np.ndarray
+    touching: Touching
+    touching_at_start: bool
+    landings: tuple[Landing, ...] = ()
+    is_rejected: bool = False
+
+    @property
+    def positions(self) -> np.ndarray:
+        return self.states[..., 0:3]
+
+    @property
+    def velocities(self) -> np.ndarray:
+        return self.states[..., 7:10]
+
+
+def start_bullet() -> BulletClient:
+    """Start a Bullet client without a window, and suppress what it prints."""
+    with silence(1), silence(2):
+        import pybullet
+        from pybullet_utils.bullet_client import BulletClient
+
+        return BulletClient(pybullet.DIRECT)
+
+
+@contextmanager
+def silence(descriptor: int) -> Iterator[None]:
+    """Discard the output of C code to a file descriptor."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = os.dup(descriptor)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), descriptor)
+    try:
+        yield
+    finally:
+        # Otherwise the buffered output of C would appear later, in the middle of a progress bar.
+        ctypes.CDLL(None).fflush(None)
+        os.dup2(kept, descriptor)
+        os.close(kept)
+
+
+class Simulator:
+    """A Bullet client that runs one simulation after another."""
+
+    def __init__(self) -> None:
+        self._bullet = start_bullet()
+
+    def simulate(
+        self,
+        bodies: Sequence[Body],
+        world: WorldConfig,
+        frames: int | None = None,
+        is_rejected: Callable[[Touching], bool] = lambda touching: False,
+    ) -> Motion:
+        """Simulate bodies in a world. Equal arguments give bit-identical results.
+
+        Args:
+            frames: Number of frames; that of the world by default.
+            is_rejected: Whether the contacts so far make the motion useless. The simulation then
+                stops, and the result is the motion up to this frame.
+        """
+        fixed = self._reset(world)
+        handles = [self._add_body(body, world) for body in bodies]
+        if any(
+            self._bullet.getClosestPoints(a, b, TOUCHING)
+            for a, b in chain(combinations(handles, 2), product(handles, fixed[1:]))
+        ):
+            states = self._state(handles)[None]
+            return Motion(states, {}, touching_at_start=True)
+        frames = frames or world.physics.frames
+        recorded = np.zeros((frames, len(bodies), 13))
+        recorded[0] = self._state(handles)
+        in_air = {k for k, body in enumerate(bodies) if body.height is not None}
+        touching: dict[tuple[int, int], list[int]] = defaultdict(list)
+        landings, rejected = [], False
+        step, list_contacts = self._bullet.stepSimulation, self._bullet.getContactPoints
+        for frame in range(1, frames):
+            pairs = set()
+            # Bullet also lists points of pairs that have separated; contacts have a normal force.
+            for _ in range(world.physics.substeps):
+                step()
+                for point in list_contacts():
+                    if point[1] not in fixed and point[2] not in fixed and point[9] > 0:
+                        pairs.add(tuple(sorted(map(handles.index, point[1:3]))))
+                for k in list(in_air):
+                    points = chain.from_iterable(
+                        list_contacts(surface, handles[k]) for surface in fixed
+                    )
+                    if any(point[9] > 0 for point in points):
+                        in_air.remove(k)
+                        landings.append(Landing(frame, k))
+            for pair in sorted(pairs):
+                touching[pair].append(frame)
+            recorded[frame] = self._state(handles)
+            if pairs and (rejected := is_rejected(touching)):
+                recorded = recorded[: frame + 1]
+                break
+        return Motion(
+            recorded,
+            dict(touching),
+            touching_at_start=False,
+            landings=tuple(landings),
+            is_rejected=rejected,
+        )
+
+    def simulate_branches(
+        self,
+        objects: Sequence[SceneObject],
+        scales: Sequence[float],
+        states: np.ndarray,
+        velocities: np.ndarray,
+        world: WorldConfig,
+        frames: int,
+    ) -> np.ndarray:
+        """Simulate objects from one state with several choices of their velocities.
+
+        Args:
+            states: (N, 13) states of the objects, such as those at a frame of a scene.
+            velocities: (K, N, 6) linear and angular velocities of each branch, instead of those in
+                `states`.
+            frames: Number of frames, of which the first has the given state.
+
+        Returns:
+            (K, frames, N, 13) states, bit-identical for equal arguments. A branch with the
+            velocities of `states` is close to an uninterrupted simulation, but not equal, because
+            Bullet keeps contacts from step to step.
+        """
+        self._reset(world)
+        handles = [
+            self._add(*each, world) for each in zip(objects, scales, states.tolist(), strict=True)
+        ]
+        start = self._bullet.saveState()
+        recorded = np.zeros((len(velocities), frames, len(handles), 13))
+        for branch, own in zip(recorded, velocities.tolist(), strict=True):
+            self._bullet.restoreState(start)
+            for handle, velocity in zip(handles, own, strict=True):
+                self._bullet.resetBaseVelocity(handle, velocity[:3], velocity[3:])
+            branch[0] = self._state(handles)
+            for frame in range(1, frames):
+                for _ in range(world.physics.substeps):
+                    self._bullet.stepSimulation()
+                branch[frame] = self._state(handles)
+        self._bullet.removeState(start)
+        return recorded
+
+    def _reset(self, world: WorldConfig) -> list[int]:
+        """Empty Bullet's world, add the floor and the parts, and return their handles."""
+        bullet, physics = self._bullet, world.physics
+        bullet.resetSimulation()
+        bullet.setGravity(0, 0, -physics.gravity)
+        # With a residual threshold above 0, the number of iterations depends on all objects, so
+        # that removing an object would change the motion of objects that it never touches.
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=1 / (physics.fps * physics.substeps),
+            numSolverIterations=SOLVER_ITERATIONS,
+            solverResidualThreshold=0,
+            deterministicOverlappingPairs=1,
+        )
+        floor = bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))
+        bullet.changeDynamics(
+            floor,
+            -1,
+            lateralFriction=physics.floor_friction,
+            restitution=physics.floor_restitution,
+        )
+        return [floor, *(self._add_part(part) for part in world.parts.values())]
+
+    def _add_part(self, part: PartConfig) -> int:
+        bullet, box = self._bullet, part_box(part)
+        form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=box.half)
+        handle = bullet.createMultiBody(0, form, -1, box.position, box.quaternion)
+        bullet.changeDynamics(
+            handle, -1, lateralFriction=part.friction, restitution=part.restitution
+        )
+        return handle
+
+    def _add_body(self, body: Body, world: WorldConfig) -> int:
+        height = body.height
+        if height is None:
+            height = half_height(body.object.shape, body.scale)
+        turn = self._bullet.getQuaternionFromEuler([0, 0, body.yaw])
+        state = [*body.position, height, *turn, *body.velocity, 0.0, 0.0, 0.0, 0.0]
+        return self._add(body.object, body.scale, state, world)
+
+    def _add(
+        self, scene_object: SceneObject, scale: float, state: Sequence[float], world: WorldConfig
+    ) -> int:
+        """Add an object with a state (13,), and return its handle."""
+        bullet, physics = self._bullet, world.physics
+        shape, material = scene_object.shape, scene_object.material
+        radius = RADIUS * scale
+        sizes = {
+            "sphere": (bullet.GEOM_SPHERE, {"radius": radius}),
+            "cube": (bullet.GEOM_BOX, {"halfExtents": [CUBE_HALF * scale] * 3}),
+            "cylinder": (bullet.GEOM_CYLINDER, {"radius": radius, "height": 2 * radius}),
+        }
+        kind, size = sizes[shape]
+        form = bullet.createCollisionShape(kind, **size)
+        mass = getattr(world.objects.mass, material) * scale**3
+        handle = bullet.createMultiBody(mass, form, -1, state[:3], state[3:7])
+        # Sliding friction stops cubes and upright cylinders. With rolling friction at their
+        # contacts, the solver takes a third longer.
+        rolling_friction = physics.rolling_friction if shape == "sphere" else 0.0
+        bullet.changeDynamics(
+            handle,
+            -1,
+            lateralFriction=physics.object_friction,
+            rollingFriction=rolling_friction,
+            spinningFriction=rolling_friction,
+            restitution=getattr(physics.restitution, material),
+            linearDamping=0,
+            angularDamping=0,
+        )
+        bullet.resetBaseVelocity(handle, state[7:10], state[10:13])
+        return handle
+
+    def _state(self, handles: Sequence[int]) -> np.ndarray:
+        pose, velocity = self._bullet.getBasePositionAndOrientation, self._bullet.getBaseVelocity
+        return np.array([list(chain(*pose(k), *velocity(k))) for k in handles])
+
+
+@cache
+def shared_simulator() -> Simulator:
+    """Return the simulator of this process."""
+    return Simulator()
+
+
+def has_repeated(touching: Touching) -> bool:
+    """Return whether any pair has a second, separate contact."""
+    return any(
+        after - before > CONTACT_FREE_FRAMES + 1
+        for frames in touching.values()
+        for before, after in pairwise(frames)
+    )

@@ -1,0 +1,173 @@
+"""CLEVRER's release: an annotation (JSON) and a video (mp4) per scene.
+
+    <folder>/annotation_train/annotation_00000-01000/annotation_00000.json
+             video_train/video_00000-01000/video_00000.mp4
+
+The folder of a video is the folder of its annotation with `video` in place of `annotation`, so
+`annotations/train/...` beside `videos/train/...` can be read too.
+
+`orientation` is read as angles in radians of rotations about the fixed x, y and z axes, in this
+order, as in Bullet's getEulerFromQuaternion and Blender's rotation mode XYZ.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from PIL import Image
+from pydantic import Field, conlist
+
+from data.oracle.contacts import group_contacts
+from data.oracle.visibility import compute_visibility
+from data.records import COLORS, FRAMES, MATERIALS, SHAPES, Scene, SceneObject
+from data.sim.camera import Camera
+from data.sources.validation import Layout, RecordError, check_unique_scenes, read_json, scene_id
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+
+FOLDER_CONTENTS = (
+    "annotation_train/annotation_00000-01000/annotation_00000.json and so on beside "
+    "video_train/video_00000-01000/video_00000.mp4"
+)
+Vector = conlist(float, min_length=3, max_length=3)
+
+
+# The layout of an annotation.
+class ObjectProperty(Layout):
+    object_id: int
+    shape: Literal[SHAPES]
+    material: Literal[MATERIALS]
+    color: Literal[COLORS]
+
+
+class ObjectState(Layout):
+    object_id: int
+    location: Vector
+    orientation: Vector
+    velocity: Vector
+    angular_velocity: Vector
+    inside_camera_view: bool
+
+
+class FrameStates(Layout):
+    frame_id: int
+    objects: list[ObjectState]
+
+
+class Contact(Layout):
+    object_ids: conlist(int, min_length=2, max_length=2)
+    frame_id: Annotated[int, Field(ge=0, lt=FRAMES)]
+
+
+class Annotation(Layout):
+    video_filename: str
+    object_property: conlist(ObjectProperty, min_length=1)
+    motion_trajectory: conlist(FrameStates, min_length=FRAMES, max_length=FRAMES)
+    collision: list[Contact]
+
+
+def list_scenes(folder: Path) -> list[Path]:
+    """Return the paths of the annotations below a folder, in order of their numbers."""
+    paths = sorted(folder.rglob("annotation_*.json"), key=lambda path: (path.stem, path))
+    return check_unique_scenes(folder, paths, _scene_id, FOLDER_CONTENTS)
+
+
+def _scene_id(path: Path) -> str:
+    return scene_id("clevrer", path.stem.removeprefix("annotation_"))
+
+
+def read_scene(path: Path, folder: Path, split: str) -> Scene:
+    """Return the scene of an annotation.
+
+    Visible fractions are computed from the poses; whether an object is in view is read from the
+    annotation.
+    """
+    from scipy.spatial.transform import Rotation
+
+    annotation = read_json(path, Annotation)
+    appearances = {
+        o.object_id: SceneObject(o.shape, o.material, o.color) for o in annotation.object_property
+    }
+    ids, objects = list(appearances), tuple(appearances.values())
+    touching: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for contact in annotation.collision:
+        one, other = contact.object_ids
+        if one == other or not {one, other} <= set(ids):
+            raise RecordError(f"{path}: collision of {contact.object_ids}, expected two of {ids}")
+        touching[tuple(sorted(map(ids.index, contact.object_ids)))].append(contact.frame_id)
+    states = []
+    for index, frame in enumerate(annotation.motion_trajectory):
+        by_id = {state.object_id: state for state in frame.objects}
+        if frame.frame_id != index or by_id.keys() != set(ids):
+            raise RecordError(
+                f"{path}: frame {frame.frame_id} lists objects {sorted(by_id)}, expected frame "
+                f"{index} with objects {sorted(ids)}"
+            )
+        states.append([by_id[k] for k in ids])
+
+    def array(key: str, dtype: type = np.float32) -> np.ndarray:
+        return np.array([[getattr(state, key) for state in row] for row in states], dtype)
+
+    footage = Path(str(path.relative_to(folder)).replace("annotation", "video"))
+    footage = footage.with_name(annotation.video_filename)
+    with _open_video(folder / footage) as video:
+        # Counting packets is faster than decoding the frames.
+        count = sum(packet.size > 0 for packet in video.demux(video=0))
+    if count != FRAMES:
+        raise RecordError(f"{folder / footage} has {count} frames, expected {FRAMES}")
+    angles = array("orientation").astype(np.float64).reshape(-1, 3)
+    quaternions = Rotation.from_euler("xyz", angles).as_quat().reshape(FRAMES, -1, 4)
+    camera, positions = Camera(), array("location").astype(np.float64)
+    image_positions, _ = camera.project(positions)
+    _, fraction = compute_visibility(objects, positions, quaternions, camera)
+    return Scene(
+        scene_id=_scene_id(path),
+        split=split,
+        objects=objects,
+        collisions=group_contacts(touching),
+        positions=array("location"),
+        quaternions=quaternions.astype(np.float32),
+        velocities=array("velocity"),
+        angular_velocities=array("angular_velocity"),
+        image_positions=image_positions.astype(np.float32),
+        in_view=array("inside_camera_view", bool),
+        visible_fraction=fraction.astype(np.float32),
+        image_size=(camera.width, camera.height),
+        footage=footage.as_posix(),
+    )
+
+
+def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
+    """Return frames of a scene's video as RGB images, by frame index."""
+    missing = set(frames)
+    images: dict[int, Image.Image] = {}
+    path = folder / str(scene.footage)
+    with _open_video(path) as video:
+        for index, frame in enumerate(video.decode(video=0)):
+            if index in missing:
+                images[index] = frame.to_image()
+                missing.remove(index)
+            if not missing:
+                return images
+    raise RecordError(f"{path} ends before frame {min(missing)}", "damaged-file")
+
+
+@contextmanager
+def _open_video(path: Path) -> Iterator[InputContainer]:
+    import av
+
+    if not path.is_file():
+        raise RecordError(f"{path}, the video of an annotation, is missing", "missing-file")
+    try:
+        with av.open(str(path)) as video:
+            if not video.streams.video:
+                raise RecordError(f"{path} contains no video")
+            yield video
+    except av.FFmpegError as error:
+        raise RecordError(f"{path} cannot be decoded: {error.strerror}", "damaged-file") from error

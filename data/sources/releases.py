@@ -1,0 +1,120 @@
+"""Reads the scenes of other simulators' releases, and the pixels of their frames.
+
+There is one reader per simulator, a module with three functions:
+
+    list_scenes(folder) -> list[Path]           one path per scene, in a stable order
+    read_scene(path, folder, split) -> Scene    the scene at one of these paths
+    load_images(scene, folder, frames) -> dict  RGB images by frame index
+
+`folder` is the release's folder; `Scene.footage` is relative to it. `list_scenes` raises UserError
+for a folder without scenes, and for a scene that occurs twice. `read_scene` reads only the scene's
+own files and checks that its frames exist, so scenes can be read in any order and in separate
+processes. `read_scene` and `load_images` raise `RecordError` for a record that is damaged or does
+not have the published layout. `physion.read_scene` also has the argument `fps`, because Physion's
+trials do not record their frame rate.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+from conf.errors import UserError
+from conf.files import write_bytes
+from conf.schema import BenchmarkConfig
+from data.parallel import Workers
+from data.records import SPLITS
+from data.sources import clevrer, movi_a, physion
+from data.sources.validation import RecordError
+from data.store import part_path, save_scene, scene_path
+
+log = logging.getLogger(__name__)
+
+READERS: dict[str, ModuleType] = {"clevrer": clevrer, "movi_a": movi_a, "physion": physion}
+LOGGED_PROBLEMS = 5
+"""Maximum number of invalid records that are logged one by one; the others are counted."""
+
+
+def list_release(cfg: BenchmarkConfig) -> list[Path]:
+    """Return the paths of a release's scenes, at most `cfg.scenes`. Raises UserError as the readers
+    do, and if the release's folder is not set."""
+    if cfg.folder is None:
+        raise UserError(
+            f"benchmark.simulator={cfg.simulator} reads a release: set its folder with "
+            "benchmark.folder=FOLDER",
+            code="missing-setting",
+        )
+    return READERS[cfg.simulator].list_scenes(Path(cfg.folder))[: cfg.scenes]
+
+
+def read_release(
+    cfg: BenchmarkConfig,
+    splits: dict[str, list[Path]],
+    folder: Path,
+    workers: Workers,
+    strict: bool,
+) -> tuple[dict[str, list[str]], dict[str, int]]:
+    """Write the scenes at the paths `splits` of a release below `folder`; see `make_scenes`.
+
+    An invalid record is logged and left out, unless `strict` is set.
+    """
+    jobs, split_of = {}, {}
+    for split, paths in splits.items():
+        for path in paths:
+            file = path if path.exists() else path.parent
+            # Size and time of the file, so that a record that has changed is read again.
+            inputs = [str(path), split, file.stat().st_size, file.stat().st_mtime_ns]
+            part = part_path(folder, inputs)
+            if _problem_of(part):
+                # The problem may have been fixed since, such as a missing video beside the record.
+                part.unlink()
+            jobs[part] = partial(_read_one, cfg, path, split, folder, part)
+            split_of[part] = split
+    workers.write_files(jobs, f"reading {cfg.simulator}", "scene")
+    scene_ids: dict[str, list[str]] = {split: [] for split in SPLITS}
+    problems = []
+    for part, split in split_of.items():
+        if problem := _problem_of(part):
+            problems.append(problem)
+        else:
+            scene_ids[split].append(json.loads(part.read_bytes())["scene_id"])
+    if problems and strict:
+        raise UserError(
+            f"{problems[0]} (strict=false leaves such records out)", code="invalid-record"
+        )
+    for problem in problems[:LOGGED_PROBLEMS]:
+        log.warning("left out: %s", problem)
+    if len(problems) > LOGGED_PROBLEMS:
+        more = len(problems) - LOGGED_PROBLEMS
+        log.warning("left out: %d more invalid records of %d", more, len(split_of))
+    return scene_ids, {"bad records left out": len(problems)}
+
+
+def _problem_of(part: Path) -> str | None:
+    """Return why a record was left out; None if it was read, or not yet."""
+    return json.loads(part.read_bytes()).get("problem") if part.exists() else None
+
+
+def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: Path) -> None:
+    reader, source = READERS[cfg.simulator], Path(cfg.folder)
+    rate = {"fps": cfg.fps} if cfg.simulator == "physion" else {}
+    try:
+        scene = reader.read_scene(path, source, split, **rate)
+    except RecordError as error:
+        outcome = {"problem": str(error)}
+    except PermissionError as error:
+        # It is no fault of the record, which must not be left out without notice.
+        raise UserError(
+            f"{error.filename or path} cannot be read (permission denied): let this user read the "
+            "release",
+            code="unreadable-file",
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        outcome = {"problem": f"{getattr(error, 'filename', None) or path}: {error}"}
+    else:
+        save_scene(scene, scene_path(folder, scene.scene_id))
+        outcome = {"scene_id": scene.scene_id}
+    write_bytes(part, json.dumps(outcome).encode())

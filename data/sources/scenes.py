@@ -1,0 +1,176 @@
+"""Simulates the scenes of a benchmark or reads them from a release, in two splits.
+
+A simulated scene records its contacts, the positions of its objects in the image, and which of them
+are visible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from conf.errors import UserError
+from conf.schema import BenchmarkConfig, WorldConfig
+from data.oracle.contacts import group_contacts
+from data.oracle.interventions import counterfactual_id, removed_object
+from data.oracle.visibility import compute_visibility
+from data.parallel import Workers
+from data.records import SPEED_BOUNDS, SPLITS, Scene, SceneObject
+from data.seeded_order import named_rng
+from data.sim.camera import HEIGHT, WIDTH, Camera
+from data.sim.parts import world_boxes
+from data.sim.physics import Body, shared_simulator
+from data.sim.sampling import sample_scene
+from data.sim.starts import Sample
+from data.sources.releases import list_release, read_release
+from data.store import save_scene, scene_path
+
+SPLIT_BLOCK = 5
+"""Number of consecutive scenes in a block; each block is divided between the splits."""
+Element = TypeVar("Element")
+
+
+def make_scenes(
+    cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool
+) -> tuple[dict[str, list[str]], dict[str, int]]:
+    """Write every missing scene below `folder`.
+
+    Returns:
+        Scene ids by split, in a stable order, and the number of invalid records.
+
+    Raises:
+        UserError: a split would be empty, the release is missing, or `strict` is set and a record
+            is invalid.
+    """
+    if cfg.simulator != "bullet":
+        splits = split_scenes(cfg, list_release(cfg))
+        return read_release(cfg, splits, folder, workers, strict)
+    names = [scene_prefix(cfg) + f"s{cfg.seed}-{k:06d}" for k in range(cfg.scenes)]
+    scene_ids = split_scenes(cfg, names)
+    split_of = {name: split for split, ids in scene_ids.items() for name in ids}
+    paths = {name: scene_path(folder, name) for name in names}
+    jobs = {
+        paths[name]: partial(_simulate_one, cfg, index, split_of[name], paths[name])
+        for index, name in enumerate(names)
+    }
+    workers.write_files(jobs, "simulating scenes", "scene")
+    return scene_ids, {}
+
+
+def scene_prefix(cfg: BenchmarkConfig) -> str:
+    """Return the start of the ids of a benchmark's scenes, so that ids differ between worlds."""
+    if cfg.item_recipe != "dynapix":
+        return f"{cfg.suite}-"
+    return "" if cfg.world.name == "clevrer" else f"{cfg.world.name}-"
+
+
+def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, list[Element]]:
+    """Assign a random share of every `SPLIT_BLOCK` scenes to the test split; the order is kept.
+
+    A scene's split depends only on its index, the seed and the test share, so that a scene has the
+    same split in a smaller and in a larger benchmark.
+
+    Raises:
+        UserError: a split would be empty.
+    """
+    splits: dict[str, list[Element]] = {split: [] for split in SPLITS}
+    for first in range(0, len(scenes), SPLIT_BLOCK):
+        share = [round(cfg.test_share * n) for n in (first, first + SPLIT_BLOCK)]
+        order = np.random.default_rng([cfg.seed, first // SPLIT_BLOCK]).permutation(SPLIT_BLOCK)
+        test = set(order[: share[1] - share[0]].tolist())
+        for k, scene in enumerate(scenes[first : first + SPLIT_BLOCK]):
+            splits["test" if k in test else "train"].append(scene)
+    for split in SPLITS if cfg.test_share < 1 else ("test",):
+        if not splits[split]:
+            raise UserError(
+                f"benchmark.test_share={cfg.test_share} of {len(scenes)} scenes leaves no {split} "
+                f"scene: change it, or use more scenes (benchmark.scenes={cfg.scenes})",
+                code="empty-split",
+            )
+    return splits
+
+
+def keep_test_scenes(cfg: BenchmarkConfig, scene_ids: dict[str, list[str]]) -> dict[str, list[str]]:
+    """Keep `cfg.test_scenes` random scenes of the test split; the others become the split `spare`,
+    which nothing uses. The order is kept."""
+    test = scene_ids["test"]
+    if cfg.test_scenes is None or cfg.test_scenes >= len(test):
+        return scene_ids
+    order = named_rng(cfg.seed, "test scenes").permutation(len(test))
+    chosen = {*order[: cfg.test_scenes].tolist()}
+    return scene_ids | {
+        "test": [name for k, name in enumerate(test) if k in chosen],
+        "spare": [name for k, name in enumerate(test) if k not in chosen],
+    }
+
+
+def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> None:
+    """Simulate a scene and, for counterfactual queries, the scene without one of its objects."""
+    sample = sample_scene(cfg.world, cfg.seed, index)
+    scene = record_scene(path.stem, split, sample, cfg.world)
+    if getattr(cfg.retrieval.counterfactual, split):
+        removed = removed_object(scene, cfg.seed)
+        if removed is not None:
+            name = counterfactual_id(scene.scene_id, removed)
+            other = simulate_without(name, split, sample.bodies, removed, cfg.world)
+            save_scene(other, path.with_name(f"{name}.npz"))
+    # This file is saved last, because it marks the job as done.
+    save_scene(scene, path)
+
+
+def simulate_without(
+    name: str, split: str, bodies: list[Body], removed: int, world: WorldConfig
+) -> Scene:
+    """Simulate a scene again without object `removed`.
+
+    Objects that the removed object never affects, directly or through others, move bit-identically.
+    """
+    rest = bodies[:removed] + bodies[removed + 1 :]
+    return record_scene(name, split, Sample(rest, shared_simulator().simulate(rest, world)), world)
+
+
+def record_scene(name: str, split: str, sample: Sample, world: WorldConfig) -> Scene:
+    """Return the oracle of a sampled scene, with image positions and visibility."""
+    scales = tuple(body.scale for body in sample.bodies)
+    bounds = tuple(world.speed_bounds)
+    return Scene(
+        scene_id=name,
+        split=split,
+        objects=(objects := tuple(body.object for body in sample.bodies)),
+        collisions=group_contacts(sample.motion.touching),
+        image_size=(WIDTH, HEIGHT),
+        fps=world.physics.fps,
+        landings=sample.motion.landings,
+        scenario=sample.scenario,
+        scales=() if set(scales) == {1.0} else scales,
+        speed_bounds=() if bounds == SPEED_BOUNDS else bounds,
+        **oracle_arrays(objects, scales, sample.motion.states, world),
+    )
+
+
+def oracle_arrays(
+    objects: tuple[SceneObject, ...],
+    scales: Sequence[float],
+    states: np.ndarray,
+    world: WorldConfig,
+) -> dict[str, np.ndarray]:
+    """Return the arrays of a scene (`Scene.ARRAYS`) for the states (F, N, 13) of its objects."""
+    camera = Camera.from_settings(world.camera)
+    positions, quaternions, velocities, angular_velocities = np.split(states, [3, 7, 10], axis=-1)
+    in_view, fraction = compute_visibility(
+        objects, positions, quaternions, camera, scales, world_boxes(world)
+    )
+    floats = {
+        "positions": positions,
+        "quaternions": quaternions,
+        "velocities": velocities,
+        "angular_velocities": angular_velocities,
+        "image_positions": camera.project(positions)[0],
+        "visible_fraction": fraction,
+    }
+    arrays = {key: array.astype(np.float32) for key, array in floats.items()}
+    return arrays | {"in_view": in_view}

@@ -1,0 +1,114 @@
+"""Files in the published layout of CLEVRER are read; damaged, missing and other files are
+refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from data.records import Collision
+from data.sim.shapes import rotation_matrix
+from data.sources import clevrer
+from data.sources.validation import RecordError
+from tests.data.sources.clevrer_files import clevrer_annotation, write_clevrer_scene
+from tests.user_errors import raises_user_error
+
+
+def test_a_scene_has_the_values_of_its_annotation(tmp_path: Path) -> None:
+    write_clevrer_scene(tmp_path, clevrer_annotation(7), 7)
+    (path,) = clevrer.list_scenes(tmp_path)
+    scene = clevrer.read_scene(path, tmp_path, "test")
+    assert (scene.scene_id, scene.split, scene.fps) == ("clevrer-00007", "test", 25)
+    assert [o.noun_phrase for o in scene.objects] == ["red metal cube", "blue rubber sphere"]
+    assert scene.collisions == (Collision(20, (0, 1), 20),)
+    np.testing.assert_allclose(scene.positions[40, 1], [0.5, 1.0, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(scene.velocities[40, 1], [0, 1.25, 0])
+    np.testing.assert_allclose(scene.angular_velocities[40, 1], [-6.25, 0, 0])
+    np.testing.assert_allclose(scene.image_positions[:, 0], np.tile([240, 160], (128, 1)))
+    # in_view is read from the annotation instead of being computed from the camera.
+    assert scene.in_view[:, 1].tolist() == [f < 90 for f in range(128)]
+    assert (scene.visible_fraction[:, 0] == 1).sum() < 128
+
+
+def test_orientation_is_read_as_extrinsic_xyz_angles(tmp_path: Path) -> None:
+    path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
+    turn = rotation_matrix(clevrer.read_scene(path, tmp_path, "test").quaternions[0, 0])
+    x, y, z = (Rotation.from_rotvec(a * np.eye(3)[k]) for k, a in enumerate((0.3, -0.5, 1.1)))
+    np.testing.assert_allclose(turn, (z * y * x).as_matrix(), atol=1e-6)
+
+
+def test_images_are_the_requested_frames(tmp_path: Path) -> None:
+    path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
+    scene = clevrer.read_scene(path, tmp_path, "test")
+    images = clevrer.load_images(scene, tmp_path, [100, 5, 127])
+    assert sorted(images) == [5, 100, 127]
+    for frame, image in images.items():
+        assert np.asarray(image).mean() == pytest.approx(frame + 60, abs=1.5)
+    assert clevrer.load_images(scene, tmp_path, []) == {}
+
+
+DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
+    "a key of another name": (lambda r: r.update(collisions=r.pop("collision")), "collision:"),
+    "quaternions": (
+        lambda r: r["motion_trajectory"][3]["objects"][1].update(orientation=[0.0, 0.0, 0.0, 1.0]),
+        "objects.1.orientation",
+    ),
+    "a frame without an object": (
+        lambda r: r["motion_trajectory"][9]["objects"].pop(0), "frame 9"
+    ),
+    "one frame too few": (lambda r: r["motion_trajectory"].pop(), "127"),
+    "an unknown shape": (lambda r: r["object_property"][0].update(shape="cone"), "0.shape"),
+    "a collision with an unknown object": (
+        lambda r: r["collision"][0].update(object_ids=[0, 5]), "[0, 5]"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_an_annotation_without_the_published_layout_is_refused(tmp_path: Path, defect: str) -> None:
+    change, named = DEFECTS[defect]
+    record = clevrer_annotation()
+    change(record)
+    path, _ = write_clevrer_scene(tmp_path, record)
+    with raises_user_error("invalid-record", contains=(str(path), named)):
+        clevrer.read_scene(path, tmp_path, "test")
+
+
+def test_a_broken_annotation_is_refused(tmp_path: Path) -> None:
+    truncated = json.dumps(clevrer_annotation())[:4000]
+    damaged = (("", "damaged-file"), (truncated, "damaged-file"), ("[]", "invalid-record"))
+    for text, code in damaged:
+        path, _ = write_clevrer_scene(tmp_path, text, 10800)
+        with raises_user_error(code, contains="annotation_10800.json"):
+            clevrer.read_scene(path, tmp_path, "test")
+
+
+def test_an_incomplete_damaged_or_missing_video_is_refused(tmp_path: Path) -> None:
+    path, video = write_clevrer_scene(tmp_path, clevrer_annotation(), video_frames=120)
+    with raises_user_error("invalid-record", contains=("video_00000.mp4", "120")):
+        clevrer.read_scene(path, tmp_path, "test")
+    whole = video.read_bytes()
+    for damaged in (whole[: len(whole) // 2], b"no video at all"):
+        video.write_bytes(damaged)
+        with pytest.raises(RecordError, match=r"video_00000.mp4"):
+            clevrer.read_scene(path, tmp_path, "test")
+    video.unlink()
+    with raises_user_error("missing-file", contains="video_00000.mp4"):
+        clevrer.read_scene(path, tmp_path, "test")
+
+
+def test_scenes_are_listed_in_order_and_duplicates_are_refused(tmp_path: Path) -> None:
+    with raises_user_error("empty-release", contains="annotation_train/"):
+        clevrer.list_scenes(tmp_path)
+    for index in (1200, 3, 10):
+        write_clevrer_scene(tmp_path / "original", clevrer_annotation(index), index, 1)
+    names = [path.stem for path in clevrer.list_scenes(tmp_path / "original")]
+    assert names == ["annotation_00003", "annotation_00010", "annotation_01200"]
+    write_clevrer_scene(tmp_path / "copy", clevrer_annotation(3), 3, 1)
+    with raises_user_error("duplicate-scene", contains="clevrer-00003"):
+        clevrer.list_scenes(tmp_path)
