@@ -56,7 +56,12 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
         checkpoint = newest_checkpoint(run.folder)
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     training, validation = split_queries(
-        store, cfg.train.batch, cfg.train.hard_negatives, cfg.train.validation_queries, cfg.seed
+        store,
+        cfg.train.batch,
+        cfg.train.hard_negatives,
+        cfg.train.validation_queries,
+        cfg.seed,
+        cfg.train.hold_out,
     )
 
     data = data_digest(store.identity, (q.query_id for q in (*training, *validation)))

@@ -37,6 +37,10 @@ class TrainConfig(Settings):
     gradient_checkpointing: bool = False
     """Recompute activations in the backward pass. This saves memory and costs about a third of the
     speed."""
+    hold_out: bool = True
+    """Hold out a tenth of the training scenes, on whose items or queries the evaluations of the run
+    are measured. false trains on all of them, as the paper does; the evaluations are then measured
+    on a sample of what the run trains on."""
     evaluations: int = setting(10, least=1)
     """Number of evaluations, evenly spaced over the run and in addition to one before the first
     step. A run saves as many checkpoints, also evenly spaced, but at least two unless
@@ -59,6 +63,12 @@ class TrainConfig(Settings):
             yield (
                 f"{group}max_steps={self.max_steps} and {group}epochs={self.epochs}: give 1 or "
                 f"more steps, or {group}max_steps=-1 and {group}epochs above 0"
+            )
+        if self.best_metric is not None and not self.hold_out:
+            yield (
+                f"{group}best_metric={self.best_metric} with {group}hold_out=false: a metric of "
+                f"trained items selects no checkpoint; set {group}best_metric=null or "
+                f"{group}hold_out=true"
             )
         if self.best_metric is not None and self.evaluations == 1:
             yield (
@@ -259,6 +269,10 @@ class TinyBaseTrainConfig(Settings):
     """Maximum norm of the gradient of the model's weights, to which it is clipped."""
     precision: str = setting("auto", ("auto", "bf16", "fp32"))
     """Precision of the forward and backward pass, as in `train.sft`."""
+    hold_out: bool = True
+    """Hold out a tenth of the training scenes, on whose items or queries the evaluations of the run
+    are measured. false trains on all of them, as the paper does; the evaluations are then measured
+    on a sample of what the run trains on."""
     evaluations: int = setting(10, least=1)
     """Number of evaluations of each stage. A checkpoint follows each evaluation."""
     checkpoint_steps: int = setting(200, least=1)

@@ -81,7 +81,9 @@ def load_datasets(
     """
     frames, frame_count = FrameReader(store, trained.student.image_size), trained.student.frames
     by_item = {r.item_id: r for r in rationales}
-    training, validation = split_items(store, cfg.train.validation_items, cfg.seed)
+    training, validation = split_items(
+        store, cfg.train.validation_items, cfg.seed, cfg.train.hold_out
+    )
     shared = (by_item, trained.train.regime, trained.teacher)
     permute = cfg.train.permute_candidates
     samples = [

@@ -80,7 +80,8 @@ def load_items(
         regime, count = trained.train.regime, trained.student.frames
         return selection_sample(item, "reasoning", regime, frames, count)
 
-    training, validation = map(with_predicates, split_items(store, cfg.validation_items, seed))
+    split = split_items(store, cfg.validation_items, seed, cfg.hold_out)
+    training, validation = map(with_predicates, split)
     check_not_empty(len(training), "training items with predicates", "teacher.narrate")
     check_not_empty(len(validation), "held-out items with predicates", "teacher.narrate")
     return training, validation

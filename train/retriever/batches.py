@@ -15,19 +15,27 @@ from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 
 
 def split_queries(
-    store: Store, batch: int, negatives: int, max_validation: int, seed: int
+    store: Store,
+    batch: int,
+    negatives: int,
+    max_validation: int,
+    seed: int,
+    hold_out: bool = True,
 ) -> tuple[list[RetrievalQuery], list[RetrievalQuery]]:
     """Return the training queries, and up to `max_validation` queries of held-out training scenes.
+    Without `hold_out`, all queries of the training split are trained on, and some of them returned
+    a second time.
 
     Raises:
         UserError: One list is empty, a batch cannot be filled, or `check_training` raises.
     """
     queries = store.retrieval("train")
     check_training(store, queries, negatives)
-    held_out = held_out_scenes(store)
+    held_out = held_out_scenes(store) if hold_out else set()
     training = [q for q in queries if q.scene_id not in held_out]
+    kept = [q for q in queries if q.scene_id in held_out] if hold_out else queries
     # The benchmark lists the queries by type of question; a shuffled part has all types.
-    validation = shuffled([q for q in queries if q.scene_id in held_out], seed)[:max_validation]
+    validation = shuffled(kept, seed)[:max_validation]
     check_not_empty(len(training), "training queries")
     check_not_empty(len(validation), "queries of held-out training scenes")
     if len(training) < batch:

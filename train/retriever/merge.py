@@ -53,7 +53,12 @@ class RetrieverMerge:
         settings, train = self.settings, self.settings.train
         store = require_benchmark(settings.benchmark, root, workers)
         _, queries = split_queries(
-            store, train.batch, train.hard_negatives, train.validation_queries, settings.seed
+            store,
+            train.batch,
+            train.hard_negatives,
+            train.validation_queries,
+            settings.seed,
+            train.hold_out,
         )
         return queries[:MAX_QUERIES], FrameReader(store, settings.retriever.image_size)
 

@@ -136,13 +136,18 @@ def supervised_items(
 
 
 def split_items(
-    store: Store, validation_items: int, seed: int
+    store: Store, validation_items: int, seed: int, hold_out: bool = True
 ) -> tuple[list[SelectionItem], list[SelectionItem]]:
     """Return the training items, and a sample of the items of held-out training scenes. No frame of
-    a held-out scene is visible in training, not even as a distractor."""
+    a held-out scene is visible in training, not even as a distractor.
+
+    Without `hold_out`, return all items of the training split, and a sample of them.
+    """
+    items = store.selection("train")
+    if not hold_out:
+        return items, shuffled(items, seed)[:validation_items]
     held_out = held_out_scenes(store)
     training_scenes = set(store.scene_ids("train")) - held_out
-    items = store.selection("train")
     training = [item for item in items if uses_only(item, training_scenes)]
     # The items are sorted by family; a part of them has all families only if they are shuffled.
     validation = shuffled([i for i in items if i.scene_id in held_out], seed)
@@ -161,7 +166,9 @@ def load_datasets(
     frames = FrameReader(store, cfg.student.image_size)
     if train.regime != "answer_only":
         check_not_empty(len(rationales), "accepted rationales", "teacher.narrate")
-    training_items, validation_items = split_items(store, train.validation_items, cfg.seed)
+    training_items, validation_items = split_items(
+        store, train.validation_items, cfg.seed, train.hold_out
+    )
     by_item = {r.item_id: r for r in rationales}
 
     def samples_of(
