@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 EXPORT_RECORD, CARD = "export.json", "README.md"
-EXPORT_VERSION = "2"
+EXPORT_VERSION = "3"
 """Changes whenever the same store would give another dataset."""
 GROUP_IMAGES = 512
 """Images in a parquet row group (about 30 MB at 480 x 320 px), which an export keeps in memory."""
@@ -51,6 +51,30 @@ GROUP_ROWS = 5_000
 """Number of rows in a row group without images."""
 SHARD_GROUPS = 10
 """Number of row groups in a shard."""
+ORIGINS: dict[str, dict[str, str]] = {
+    "bullet": {"license": "apache-2.0"},
+    "clevrer": {
+        "title": "CLEVRER",
+        "license": "cc0-1.0",
+        "terms": "CC0 1.0",
+        "link": "http://clevrer.csail.mit.edu",
+    },
+    "movi_a": {
+        "title": "MOVi-A",
+        "license": "other",
+        "name": "kubric-movi-a",
+        "terms": "see the link",
+        "link": "https://github.com/google-research/kubric/tree/main/challenges/movi",
+    },
+    "physion": {
+        "title": "Physion",
+        "license": "other",
+        "name": "physion",
+        "terms": "see the link",
+        "link": "https://github.com/cogtoolslab/physics-benchmarking-neurips2021",
+    },
+}
+"""Licence and source of the scenes by simulator, as the card states them."""
 Shard = dict[str, Any]
 """Entry of a parquet file in export.json: configuration, split, path relative to the export's
 folder, rows, bytes and sha256."""
@@ -149,11 +173,12 @@ def render_card(store: Store, shards: Sequence[Shard], images: bool) -> str:
     """Return the dataset card (README.md) of an export with these shards."""
     from jinja2 import Template
 
-    settings = store.manifest["config"]
+    # The folder of a release is that of the machine on which the benchmark was built.
+    settings = store.manifest["config"] | {"folder": None}
     rows: dict[str, Counter[str]] = {}
     for shard in shards:
         rows.setdefault(shard["configuration"], Counter())[shard["split"]] += shard["rows"]
-    items = store.selection()
+    items = [i for suite in (store.suite, MATCHED_ANCHOR) for i in store.selection(suite=suite)]
     queries = [q for pool in POOLS for q in store.retrieval(pool=pool)]
     text = (files("data.publish") / "templates/dataset_card.md").read_text()
     return Template(text).render(
@@ -161,8 +186,10 @@ def render_card(store: Store, shards: Sequence[Shard], images: bool) -> str:
         images=images,
         scene=store.scene(store.scene_ids("test")[0]),
         scenes={split: len(store.scene_ids(split)) for split in SPLITS},
-        families=_count_rows(items, "family"),
-        subtypes=_count_rows(items, "family", "subtype"),
+        origin=ORIGINS[settings["simulator"]],
+        is_simulated=settings["simulator"] == "bullet",
+        families=_count_rows(items, "suite", "family"),
+        subtypes=_count_rows(items, "suite", "family", "subtype"),
         queries=_count_rows(queries, "pool", "builder", "anchor"),
         rows=rows,
         columns=list_columns(images),

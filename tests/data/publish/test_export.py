@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,15 @@ from huggingface_hub import DatasetCard
 from data.frames.frame_cache import FrameReader
 from data.publish import huggingface
 from data.publish.columns import COLUMNS, DESCRIPTIONS, dataset_features
-from data.publish.huggingface import ensure_export
-from data.records import MATCHED_ANCHOR, POOLS, RetrievalQuery, SelectionItem, sample_prefix_frames
+from data.publish.huggingface import ensure_export, render_card
+from data.records import (
+    MATCHED_ANCHOR,
+    POOLS,
+    SPLITS,
+    RetrievalQuery,
+    SelectionItem,
+    sample_prefix_frames,
+)
 from data.store import Store
 from tests.user_errors import raises_user_error
 
@@ -169,6 +177,31 @@ def test_the_card_describes_the_export(micro_store, exported) -> None:
     counts = micro_store.manifest["counts"]
     for family in ("event", "time", "window"):
         train, test = (counts[f"selection/{family}/{split}"] for split in ("train", "test"))
-        assert f"| {family} | all | {train:,} | {test:,} |" in card.text
+        assert f"| dynapix | {family} | all | {train:,} | {test:,} |" in card.text
     for item in micro_store.selection():
-        assert f"| {item.family} | {item.subtype} |" in card.text
+        assert f"| {item.suite} | {item.family} | {item.subtype} |" in card.text
+
+
+@pytest.mark.parametrize(
+    ("simulator", "licence"), [("clevrer", "cc0-1.0"), ("movi_a", "other"), ("physion", "other")]
+)
+def test_the_card_of_a_release_states_its_licence_and_no_local_path(
+    micro_store, simulator, licence
+) -> None:
+    local = {"simulator": simulator, "folder": "/home/somebody/releases"}
+    config = micro_store.manifest["config"] | local
+    release = replace(micro_store, manifest=micro_store.manifest | {"config": config})
+    card = DatasetCard(render_card(release, [], images=False))
+    assert card.data.license == licence
+    assert card.data.source_datasets == ["extended"]
+    assert "somebody" not in str(card)
+    assert "Scenes are simulated" not in str(card)
+
+
+def test_the_card_counts_the_rows_of_every_suite(exported) -> None:
+    text = (exported / "README.md").read_text()
+    family = r"^\| (?:dynapix|matched_anchor) \| \w+ \| all \| (\d+) \| (\d+) \|$"
+    counted = re.findall(family, text, re.MULTILINE)
+    rows = {split: len(load_dataset(str(exported), "selection", split=split)) for split in SPLITS}
+    assert sum(int(train) for train, _ in counted) == rows["train"]
+    assert sum(int(test) for _, test in counted) == rows["test"]
