@@ -1,5 +1,5 @@
 """Measure a retriever and its untrained base: for each query of the standard test and each width,
-rank all frames of the test database."""
+rank all frames of the test database. A baseline knows the scene and nothing else."""
 
 from __future__ import annotations
 
@@ -35,6 +35,9 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         )
         rows += results.retrieval_results(store.name, name, ranks[name], queries, cfg.seed)
 
+    scene_alone = standard_test.rank_scene_alone(queries, database)
+    name = results.SCENE_ALONE
+    rows += results.retrieval_results(store.name, name, scene_alone, queries, cfg.seed)
     differences = results.compare_retrievers(ranks, queries, cfg.seed)
     extra = [tables.rank_differences_table(differences)] if differences else []
     exact_search.write_ranks(run.folder, ranks, queries)

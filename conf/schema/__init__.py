@@ -1,7 +1,7 @@
 """Settings of every command: one dataclass per command and per group of settings.
 
-The docstring below a field is its description in `--help`. Defaults are the paper's values; a
-preset (`conf/<group>/<name>.yaml`) sets the values that differ. `check()` returns one message for
+The docstring below a field is its description in `--help`. A preset (`conf/<group>/<name>.yaml`)
+sets the values that differ from the defaults. `check()` returns one message for
 each invalid value or combination of values; a message names keys as the user types them.
 """
 

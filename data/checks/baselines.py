@@ -1,15 +1,19 @@
-"""Baselines that answer selection items from the oracle by simple rules, without simulating the
-scene. A high accuracy of one that does not predict shows that items can be answered by a shortcut;
-`velocity` predicts."""
+"""Baselines: simple rules that answer selection items from the oracle, and a ranker that only
+recognises the scene of a retrieval query.
+
+A high accuracy of a rule that does not predict shows that items can be answered by a shortcut;
+`velocity` predicts.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from data.oracle.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
-from data.records import Candidate, SelectionItem
+from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
 from data.sim.camera import Camera
 from data.store import Store
 
@@ -84,3 +88,26 @@ def score_baselines(item: SelectionItem, store: Store) -> dict[str, float]:
         best = np.flatnonzero(costs == costs.min())
         scores[name] = float(item.answer in best) / len(best) if len(best) else np.nan
     return scores
+
+
+def count_frames_of_scene(
+    queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
+) -> np.ndarray:
+    """Return for each query the number of frames of its target's scene in the database, (Q,)."""
+    frames = Counter(frame.scene_id for frame in database)
+    return np.array([frames[query.target.scene_id] for query in queries])
+
+
+def score_scene_alone(
+    queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
+) -> dict[str, float]:
+    """Return the expected measures of a ranker that puts the frames of the target's scene first, in
+    a random order: recalls, the mean reciprocal rank and the median of the mean ranks."""
+    counts = count_frames_of_scene(queries, database)
+    harmonic = np.cumsum(1 / np.arange(1, counts.max() + 1))
+    recalls = {f"recall@{k}": float(np.minimum(k / counts, 1).mean()) for k in (1, 10, 50)}
+    return recalls | {
+        "mrr": float((harmonic[counts - 1] / counts).mean()),
+        "median rank": float(np.median((counts + 1) / 2)),
+        "frames per scene": float(counts.mean()),
+    }

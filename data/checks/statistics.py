@@ -10,7 +10,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from data.checks import shortcuts
-from data.checks.baselines import BASELINES, score_baselines
+from data.checks.baselines import BASELINES, score_baselines, score_scene_alone
 from data.items.scores import item_scores
 from data.oracle.displacement import cross_scene_displacement
 from data.records import FAMILIES, LETTERS, SPLITS, SelectionItem
@@ -29,11 +29,13 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
         ``scenes``: distributions of objects, collisions and event frames. ``answers``: items by
         letter. ``cells``: items and quotas by family, window group and subtype. ``candidates``:
         median displacements, and items by number of distractors earlier than the target, by
-        category. ``baselines``: accuracies by category. ``shortcuts``: accuracies of the strategies
-        of `data.checks.shortcuts` on the test split, by category. A category is a family, a kind of
-        distractors in the event family, or a difficulty in the window family.
+        category. ``baselines``: accuracies by category. ``retrieval``: measures of a ranker that
+        only recognises the scene, on the standard test. ``shortcuts``: accuracies of the strategies
+        of `data.checks.shortcuts` on the test split, by category. ``shortfalls``: cells with fewer
+        records than their quotas. A category is a family, a kind of distractors in the event
+        family, or a difficulty in the window family.
     """
-    items = store.selection()
+    items, queries = store.selection(), store.standard_test()
     progress = tqdm(items, desc="describing items", unit="item")
     rows = pd.DataFrame([_describe_item(item, store) for item in progress])
     categories = rows.explode("category").groupby("category")
@@ -49,7 +51,9 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
         "cells": count_cells(items, store.manifest["config"]["selection"]),
         "candidates": candidates.fillna(0).to_dict("index"),
         "baselines": _without_nan(baselines),
+        "retrieval": score_scene_alone(queries, store.database()) if queries else {},
         "shortcuts": _without_nan(measure_shortcuts(items, store, blind)),
+        "shortfalls": store.manifest["shortfalls"],
     }
 
 
@@ -159,6 +163,13 @@ def format_statistics(statistics: dict[str, Any]) -> str:
         + candidates.to_string(),
         "Items and quotas\n" + cells.to_string(),
     ]
+    if retrieval := statistics["retrieval"]:
+        measures = "  ".join(f"{name} {value:.3g}" for name, value in retrieval.items())
+        sections.append(f"Standard test, a ranker that only recognises the scene\n{measures}")
+    if shortfalls := statistics["shortfalls"]:
+        sections.append(
+            "Short of their quotas\n" + "\n".join(f"{k}: {n}" for k, n in shortfalls.items())
+        )
     return "\n\n".join(sections)
 
 

@@ -25,7 +25,6 @@ from conf.errors import UserError
 from conf.files import write_bytes
 from data.records import Scene
 from data.render import get_renderer
-from data.sources.releases import READERS
 from data.store import FRAMES_FOLDER, Store
 
 log = logging.getLogger(__name__)
@@ -105,6 +104,9 @@ def render_frames(
         (height, width, 3) uint8 arrays.
     """
     if scene.footage is not None:
+        # Reading the frames of simulated scenes does not need pydantic.
+        from data.sources.releases import READERS
+
         reader = READERS[config["simulator"]]
         images = reader.load_images(scene, Path(config["folder"]), frames)
     else:

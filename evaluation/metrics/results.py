@@ -27,6 +27,8 @@ UNTRAINED = "untrained"
 """First word of the names of Qwen3-VL retrievers that this project has not trained."""
 BASELINE = "baseline"
 """Mode of the results of baselines, which choose by simple rules from the oracle."""
+SCENE_ALONE = "baseline: the scene alone"
+"""Name of the results of a ranker that puts all frames of the target's scene first."""
 SIMILARITY = "similarity"
 """Mode of the results of `evaluation.similarity`: a retriever chooses the nearest candidate."""
 
@@ -253,7 +255,7 @@ def retrieval_results(
     benchmark: str, name: str, ranks: Ranks, queries: Sequence[RetrievalQuery], seed: int
 ) -> list[RetrievalResult]:
     """Return a result for each width, widest first: over all queries, then for each builder. `seed`
-    is the seed of the bootstrap over scenes."""
+    is the seed of the bootstrap over scenes. A baseline has the width None."""
     results = []
     for builder in (None, *sorted({q.builder for q in queries if q.builder})):
         indices = [i for i, q in enumerate(queries) if builder in (None, q.builder)]
@@ -262,7 +264,9 @@ def retrieval_results(
             per_query = _query_metrics(ranks, k, indices)
             measures = [_summarize(name, per_query[name], scenes) for name in MEASURES]
             sizes = (len(indices), ranks.frames)
-            cost = (ranks.vectors * width * np.dtype(np.float32).itemsize, ranks.seconds)
+            cost = (None, None)
+            if width is not None:
+                cost = (ranks.vectors * width * np.dtype(np.float32).itemsize, ranks.seconds)
             results.append(
                 RetrievalResult(benchmark, name, width, builder, *measures, *sizes, *cost)
             )

@@ -12,7 +12,7 @@ from typing import Any
 
 from conf.schema.benchmark import store_name
 from data.records import SelectionItem
-from evaluation.metrics.results import UNTRAINED, RetrievalResult, SelectionResult
+from evaluation.metrics.results import SCENE_ALONE, UNTRAINED, RetrievalResult, SelectionResult
 from evaluation.metrics.significance import PairedComparison, compare_runs
 from evaluation.reporting.run_responses import Responses
 from evaluation.reporting.runs import FinishedRun
@@ -125,8 +125,9 @@ def read_measurements(runs: Iterable[FinishedRun], kinds: Sequence[str]) -> list
     for run in runs:
         if run.kind in kinds:
             for row in run.report.rows:
-                # The report of a trained retriever also has rows for its untrained base.
-                trained = None if row.name.startswith(UNTRAINED) else run.training
+                # The report of a trained retriever also has rows for its base and a baseline.
+                is_trained = not row.name.startswith((UNTRAINED, SCENE_ALONE))
+                trained = run.training if is_trained else None
                 measurements.append(Measurement(row, run, row.name, trained))
     return measurements
 

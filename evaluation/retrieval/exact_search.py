@@ -32,7 +32,7 @@ class Ranks:
     """The numbers of frames that determine the rank of each query's target.
 
     Attributes:
-        widths: Embedding widths, widest first.
+        widths: Embedding widths, widest first; None for a baseline without embeddings.
         above, tied: (widths, queries) numbers of frames that score above the target, and of other
             frames that score exactly as the target does.
         found: (queries,) False for a miss: a query that could not be ranked.
@@ -41,7 +41,7 @@ class Ranks:
         seconds: Time to rank the database for all queries at all widths.
     """
 
-    widths: tuple[int, ...]
+    widths: tuple[int | None, ...]
     above: np.ndarray
     tied: np.ndarray
     found: np.ndarray
@@ -158,7 +158,7 @@ def exact_ranks(
         queries: (queries, entries) finite fp32 embeddings.
         targets: (queries, entries) embeddings of each query's target, which is in the database.
         database: Parts (frames, entries) in any order; only one of them is in memory at a time.
-        widths: Embedding widths, widest first.
+        widths: Embedding widths, widest first; None for a baseline without embeddings.
     """
     began = time.perf_counter()
     grid = GridEmbeddings(queries, widths)

@@ -1,7 +1,7 @@
 """The standard test of retrieval: its queries and database, and the report.
 
-The queries are test queries, equally many of each builder (the procedure that made a query). The
-database holds frames of test scenes, with every target among them.
+The queries are the future-state queries of the test split. The database holds frames of test
+scenes, with every target among them.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 
 from conf.files import write_text
 from conf.schema import RetrieverConfig
+from data.checks.baselines import count_frames_of_scene
 from data.checks.queries import check_test
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
@@ -47,6 +48,13 @@ def rank_targets(
 
         return late_ranks(queries, targets, database, preset.late.width)
     return exact_ranks(queries, targets, database, preset.widths)
+
+
+def rank_scene_alone(queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]) -> Ranks:
+    """Rank as a retriever that only recognises the scene: its frames tie above all others."""
+    tied = count_frames_of_scene(queries, database)[None] - 1
+    found = np.ones(len(queries), bool)
+    return Ranks((None,), np.zeros_like(tied), tied, found, len(database), 0, 0.0)
 
 
 def write_report(

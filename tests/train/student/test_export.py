@@ -218,7 +218,7 @@ def test_an_export_that_differs_too_much_is_deleted(settings, runs, tmp_path, mo
     monkeypatch.setattr(loading, "merge_adapters", lambda base, *_: base.dequantize(torch.float32))
     with raises_user_error("merge-difference"):
         exported(settings, runs, "fp32", tmp_path)
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.glob("[!.]*")) == []
 
 
 def test_missing_rationales_are_not_narrated(settings, tmp_path, micro_store) -> None:
@@ -233,7 +233,7 @@ def test_leftovers_of_a_killed_export_are_deleted(settings, runs, exports, tmp_p
     (tmp_path / ".student.partial").mkdir()
     (tmp_path / ".student.partial" / "model.safetensors").write_bytes(b"half")
     _, folder = exported(settings, runs, "adapter", tmp_path)
-    assert [p.name for p in tmp_path.iterdir()] == ["student"]
+    assert {p.name for p in tmp_path.iterdir()} == {".student.lock", "student"}
     names = {p.name for p in folder.iterdir()}
     assert "model.safetensors" not in names
     assert names == {p.name for p in exports["adapter"][1].iterdir()}
@@ -307,7 +307,7 @@ def test_a_run_that_cannot_be_exported_is_refused(settings, runs, tmp_path, dama
     damage(tmp_path / "runs" / "sft" / "run")
     with raises_user_error(code):
         exported(settings, tmp_path / "runs", "adapter", tmp_path / "into")
-    assert list((tmp_path / "into").iterdir()) == []
+    assert [p.name for p in (tmp_path / "into").iterdir() if p.suffix != ".lock"] == []
 
 
 def test_a_damaged_export_is_refused(settings, exports, tmp_path) -> None:
