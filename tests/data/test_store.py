@@ -90,6 +90,48 @@ def test_killed_build_resumes_to_identical_bytes(built, tmp_path, part) -> None:
     assert all((kept / name).stat().st_mtime_ns == modified for name, modified in first.items())
 
 
+KILLED = {
+    "more scenes": {"scenes": 12},
+    "fewer test scenes": {"scenes": 12, "test_scenes": 1},
+    "another quota": {"selection": SelectionConfig(time={"in_1s": Quota(train=1, test=1)})},
+    "another displacement": {
+        "selection": SelectionConfig(time={"in_1s": Quota(2, 1)}, min_displacement=40.0)
+    },
+    "alternative futures": {"distractors": "balanced"},
+    "another suite": {"recipe": "physion", "retrieval": RetrievalTrackConfig()},
+    "counterfactual scenes": {
+        "retrieval": RetrievalTrackConfig(counterfactual=Quota(1, 1), counterfactual_source=4)
+    },
+    "another seed": {"seed": 1},
+}
+"""Settings of a build that is killed, as changes of `small`."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["make_items_and_queries", "make_databases", "count_records"])
+@pytest.mark.parametrize("killed", KILLED.values(), ids=KILLED)
+def test_build_resumed_at_other_settings_equals_a_fresh_one_or_is_refused(
+    built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: dict, stage: str
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"data.build.{stage}", stop)
+        with pytest.raises(KeyboardInterrupt):
+            build(small(**killed), tmp_path / "small", Workers(1))
+    if killed in (KILLED["counterfactual scenes"], KILLED["another seed"]):
+        with raises_user_error("other-settings"):
+            build(small(), tmp_path / "small", Workers(1))
+        return
+    build(small(), tmp_path / "small", Workers(1))
+    made = {p.relative_to(tmp_path / "small").as_posix() for p in (tmp_path / "small").rglob("*.*")}
+    expected = {*file_hashes(built), MANIFEST}
+    assert made == expected
+    assert file_hashes(tmp_path / "small") == file_hashes(built)
+    assert (tmp_path / "small" / MANIFEST).read_text() == (built / MANIFEST).read_text()
+
+
 @pytest.mark.slow
 def test_partial_build_with_other_scenes_is_kept(tmp_path) -> None:
     nothing = {"selection": SelectionConfig(), "retrieval": RetrievalTrackConfig()}
