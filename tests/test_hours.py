@@ -20,7 +20,7 @@ def runs() -> dict[str, hours.TrainingRun]:
 
 
 def test_a_run_trains_on_the_papers_samples_in_each_epoch(runs) -> None:
-    items, queries, epochs = 1_151 + 1_619 + 6_598, 18_000, 3
+    items, queries, epochs = 1_151 + 1_619 + 6_598, 20_498, 3
     assert runs["train.sft +exp=answer_only"].samples == items * epochs
     assert runs[COT].samples == 2 * items * epochs
     assert runs["train.contrastive"].samples == queries * epochs

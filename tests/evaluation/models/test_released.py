@@ -32,6 +32,7 @@ from evaluation.embedders.dual_encoder import unit_rows
 from evaluation.embedders.embedder import EMBEDDINGS
 from evaluation.embedders.joint_encoder import load_encoder
 from evaluation.embedders.languagebind import LanguageBindVideo, spread
+from evaluation.metrics.results import SCENE_ALONE
 from evaluation.metrics.selection import choose_letters, credit_choices
 from tests.evaluation.models import released
 from tests.user_errors import raises_user_error
@@ -237,8 +238,9 @@ def test_the_nearest_candidate_is_chosen_and_embeddings_are_computed_once(
 
 def test_a_released_model_is_measured_by_retrieval(measure, presets) -> None:
     report = measure(retrieve, RetrieveCommand, presets["vlm2vec"], "ranked")
-    (row,) = [r for r in report["rows"] if r["builder"] is None]
+    row, baseline = [r for r in report["rows"] if r["builder"] is None]
     assert (row["name"], row["width"]) == ("vlm2vec", 32)
+    assert (baseline["name"], baseline["width"]) == (SCENE_ALONE, None)
 
 
 def test_tied_candidates_share_the_credit() -> None:

@@ -16,11 +16,13 @@ from sentence_transformers import SentenceTransformer
 
 from conf.files import read_json_lines
 from conf.schema import ContrastiveTrainConfig, LateConfig, RetrieveCommand, RetrieverConfig
+from data.checks.baselines import score_scene_alone
 from data.frames.frame_cache import FrameReader
 from data.store import open_store
 from evaluation import retrieve
 from evaluation.embedders import joint_encoder
 from evaluation.embedders.embedder import EMBEDDINGS, Embedder, open_embedders
+from evaluation.metrics.results import SCENE_ALONE
 from models.retriever import embedder
 from tests.evaluation.metrics.reference import matrix_metrics, ranking_metrics
 from tests.evaluation.models.conftest import RETRIEVER, new_run, save_retriever
@@ -138,7 +140,12 @@ def test_a_multi_vector_retriever_is_measured_by_late_interaction(
     assert row["mrr"]["value"] == pytest.approx(expected["mrr"], rel=0.01)
     assert row["bytes"] == sum(v.numel() for v in frame_rows) * 4
     names = dict.fromkeys((row["name"], row["width"]) for row in first["rows"])
-    assert list(names) == [("run", 24), ("untrained small, late", 24)]
+    assert list(names) == [("run", 24), ("untrained small, late", 24), (SCENE_ALONE, None)]
+    baseline = next(r for r in first["rows"] if r["name"] == SCENE_ALONE)
+    scene_alone = score_scene_alone(queries, database)
+    assert baseline["recall_1"]["value"] == pytest.approx(scene_alone["recall@1"])
+    assert baseline["mrr"]["value"] == pytest.approx(scene_alone["mrr"])
+    assert baseline["median_rank"]["value"] == pytest.approx(scene_alone["median rank"])
     assert "MiB" in (tmp_path / "one" / "report.txt").read_text()
     (tmp_path / "run" / "retriever" / "config.json").unlink()
     (tmp_path / "run" / "untrained" / "config.json").unlink()
