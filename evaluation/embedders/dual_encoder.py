@@ -147,15 +147,14 @@ def load_dual(preset: RetrieverConfig, precision: str) -> DualEncoder:
 def load_complete(
     kind: Any, source: str, precision: str, key: str = "model", **options: Any
 ) -> PreTrainedModel:
-    """Load a model from safetensors, onto a GPU if there is one. Raise UserError if weights are
-    missing, since the library would initialise them at random."""
+    """Load a model from safetensors, unless `options` say otherwise, onto a GPU if there is one.
+    Raise UserError if weights are missing, since the library would initialise them at random."""
     model, loading_info = kind.from_pretrained(
         source,
         dtype=DTYPES[precision],
-        use_safetensors=True,
         output_loading_info=True,
         ignore_mismatched_sizes=True,
-        **options,
+        **{"use_safetensors": True, **options},
     )
     mismatched = (name for name, *_ in loading_info["mismatched_keys"])
     if missing := sorted({*loading_info["missing_keys"], *mismatched}):

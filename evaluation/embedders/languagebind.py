@@ -117,4 +117,7 @@ def load_tower(
                 code="wrong-frame-count",
             )
         check_size(preset, config)
-        return load_complete(kind, source, precision, key, revision=revision, config=config)
+        # The released folders have pytorch_model.bin only, from which the library loads tensors but
+        # no code.
+        options = {"revision": revision, "config": config, "use_safetensors": None}
+        return load_complete(kind, source, precision, key, **options)

@@ -79,8 +79,9 @@ def siglip2(folder: Path) -> Path:
 
 
 def languagebind(videos: Path, images: Path) -> tuple[Path, Path]:
-    """Write a video model and an image model. Their config files have model types that transformers
-    does not know, and there is no processor file."""
+    """Write a video model and an image model, with the weights as pytorch_model.bin as released.
+    Their config files have model types that transformers does not know, and there is no processor
+    file."""
     torch.manual_seed(0)
     tokenizer = clip_tokenizer()
     config = clip_config(tokenizer, add_time_attn=True, num_frames=CLIP_FRAMES)
@@ -92,6 +93,8 @@ def languagebind(videos: Path, images: Path) -> tuple[Path, Path]:
         (CLIPModel(clip_config(tokenizer)), images, "LanguageBindImage"),
     ):
         model.save_pretrained(folder)
+        (folder / "model.safetensors").unlink()
+        torch.save(model.state_dict(), folder / "pytorch_model.bin")
         tokenizer.save_pretrained(folder)
         saved = json.loads((folder / "config.json").read_text())
         (folder / "config.json").write_text(json.dumps(saved | {"model_type": kind}))
