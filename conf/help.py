@@ -21,7 +21,7 @@ ALL = "all"
 """Word after `--help` that lists every setting."""
 COMMON = (
     "run", "seed", "limit", "model", "modes", "suite", "control", "runs", "items", "annotators",
-    "host", "port", "public", "folder", "format", "product", "verify", "frames", "frames_gb",
+    "host", "port", "public", "folder", "format", "product", "verify", "frames",
     "examples", "gpus", "routes", "images", "benchmark.name", "benchmark.scenes", "benchmark.seed",
     "benchmark.folder", "benchmark.renderer", "teacher.url", "teacher.model", "teacher.attempts",
     "teacher.predicates", "teacher_model", "teacher_server.url", "sampling_server.url",

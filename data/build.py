@@ -60,10 +60,10 @@ file in `PARTS` is a hash of its job's inputs."""
 def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
     if cfg.frames != "none":
         check_renderer(cfg.benchmark, Path(cfg.store))
-    workers = Workers(cfg.workers, cfg.parallel)
+    workers = Workers(cfg.workers)
     store = ensure_items(cfg.benchmark, Path(cfg.store), workers, cfg.strict, cfg.verify)
     if cfg.frames != "none":
-        prerender_frames(store, cfg.frames, cfg.frames_gb, workers)
+        prerender_frames(store, cfg.frames, workers)
     log.info(summarize_store(store))
     return {name: float(count) for name, count in store.manifest["counts"].items()}
 
@@ -73,7 +73,7 @@ def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
     check_renderer(cfg, root)
     store = ensure_items(cfg, root, Workers(workers))
     if not (store.folder / FRAMES_FOLDER / FRAMES_RECORD).exists():
-        prerender_frames(store, "named", None, Workers(workers))
+        prerender_frames(store, "named", Workers(workers))
     return store
 
 

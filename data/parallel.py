@@ -1,4 +1,4 @@
-"""Runs jobs in worker processes of this machine or of a Ray cluster, with joblib.
+"""Runs jobs in worker processes with joblib.
 
 A job writes its files atomically, so that another worker can repeat the job of a worker that died.
 """
@@ -12,13 +12,12 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from conf.errors import UserError, import_extra
+from conf.errors import UserError
 
 log = logging.getLogger(__name__)
 
@@ -32,16 +31,9 @@ MAX_DEATHS = 3
 
 @dataclass(frozen=True)
 class Workers:
-    """A pool of worker processes.
-
-    Attributes:
-        count: Number of processes.
-        engine: `loky` uses this machine. `ray` uses the cluster at the environment variable
-            RAY_ADDRESS, or starts one on this machine if the variable is not set.
-    """
+    """A pool of `count` worker processes."""
 
     count: int
-    engine: str = "loky"
 
     def run(
         self,
@@ -66,6 +58,8 @@ class Workers:
         remaining = dict(jobs)
         sizes = sizes or dict.fromkeys(jobs, 1)
         total = done + sum(sizes[name] for name in jobs)
+        from joblib.externals.loky import BrokenProcessPool
+
         with tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=1.0) as bar:
             deaths = 0
             while remaining:
@@ -75,7 +69,7 @@ class Workers:
                         bar.update(sizes[name])
                         deaths = 0
                         yield name, result
-                except _death_errors(self.engine) as error:
+                except BrokenProcessPool as error:
                     deaths += 1
                     if deaths > MAX_DEATHS:
                         raise UserError(
@@ -102,13 +96,9 @@ class Workers:
     def _results(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Any]]:
         from joblib import Parallel, delayed
 
-        if self.engine == "ray":
-            _connect_to_ray(self.count)
-            # Ray's backend cannot return results one by one.
-            options = {}
-        else:
-            options = {"return_as": "generator_unordered", "initializer": _exit_with_parent}
-        parallel = Parallel(self.count, backend=self.engine, **options)
+        parallel = Parallel(
+            self.count, return_as="generator_unordered", initializer=_exit_with_parent
+        )
         # Loky restarts a worker whose memory grows; workers grow because they cache scenes.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs")
         # A caller may stop before the last result.
@@ -124,27 +114,6 @@ def batched(elements: list[Element], size: int) -> Iterator[list[Element]]:
 
 def _run_job(name: str, job: Job) -> tuple[str, Any]:
     return name, job()
-
-
-def _death_errors(engine: str) -> tuple[type[Exception], ...]:
-    if engine == "ray":
-        from ray.exceptions import RayActorError, WorkerCrashedError
-
-        return RayActorError, WorkerCrashedError
-    from joblib.externals.loky import BrokenProcessPool
-
-    return (BrokenProcessPool,)
-
-
-@cache
-def _connect_to_ray(count: int) -> None:
-    ray = import_extra("ray", "parallel=ray")
-    from ray.util.joblib import register_ray
-
-    if not ray.is_initialized():
-        local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": count}
-        ray.init(log_to_driver=False, include_dashboard=False, **local)
-    register_ray()
 
 
 def _exit_with_parent() -> None:

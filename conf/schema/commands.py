@@ -19,7 +19,6 @@ from conf.schema.training import (
     TinyBaseTrainConfig,
 )
 
-PARALLEL_BACKENDS = ("loky", "ray")
 BASE_LAYERS, BASE_HEADS = 7, 6
 """Minimum numbers of language layers and of attention heads of a base that `train.base` trains: its
 targets refer to the first seven layers, and in one of them to six heads: one for the clip, one for
@@ -61,15 +60,11 @@ class BuildCommand(CommandConfig):
     frames: str = setting("named", ("named", "all", "none"))
     """Frames to render during the build: named (frames that an item, query or database uses), all
     or none. Missing frames are rendered on demand."""
-    frames_gb: float | None = setting(None, least=0)
-    """Maximum disk space (GB) of rendered frames; null sets no limit."""
     strict: bool = False
     """Stop the build at an invalid record of a release instead of logging and skipping it."""
     verify: bool = False
     """Hash every file of a built benchmark. Otherwise, only files whose size or modification time
     differs from the last check are hashed."""
-    parallel: str = setting("loky", PARALLEL_BACKENDS)
-    """loky runs the work in processes of this machine, ray on a Ray cluster."""
 
 
 @dataclass

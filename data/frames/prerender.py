@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections import defaultdict
 from collections.abc import Mapping
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,22 +16,17 @@ from data.parallel import Workers
 from data.records import MATCHED_ANCHOR, POOLS, original_scene_id, sample_prefix_frames
 from data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path
 
-log = logging.getLogger(__name__)
-
 FRAMES_RECORD = "frames.json"
 """File with the options and results of the last prerendering, which is not repeated."""
 
 
-def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: Workers) -> None:
+def prerender_frames(store: Store, which: str, workers: Workers) -> None:
     """Render a store's missing frames to its cache.
 
     Args:
         which: `all`, or `named` for those that items, queries and databases refer to.
-        limit_gb: Maximum total size of these frames on disk. Rendering stops when the next scene
-            would exceed it. The archives of the remaining scenes are deleted, and their frames are
-            rendered on demand.
     """
-    options = {"frames": which, "frames_gb": limit_gb, "renderer": store.manifest["renderer"]}
+    options = {"frames": which, "renderer": store.manifest["renderer"]}
     record = store.folder / FRAMES_FOLDER / FRAMES_RECORD
 
     def is_done() -> bool:
@@ -44,35 +37,19 @@ def prerender_frames(store: Store, which: str, limit_gb: float | None, workers: 
     if not is_done():
         with lock_file(record.with_name(LOCK), busy, wait=True):
             if not is_done():
-                summary = _render_scenes(store, which, limit_gb, workers)
+                summary = _render_scenes(store, which, workers)
                 write_bytes(record, json.dumps(options | summary, indent=1).encode())
 
 
-def _render_scenes(
-    store: Store, which: str, limit_gb: float | None, workers: Workers
-) -> dict[str, float]:
+def _render_scenes(store: Store, which: str, workers: Workers) -> dict[str, int]:
     """Render missing frames, and return the number of scenes and bytes that are on disk."""
     config = store.manifest["config"]
     jobs = {
         scene: partial(_render_scene, store.folder, config, scene, frames)
         for scene, frames in frames_to_render(store, which).items()
     }
-    total, kept = 0.0, set()
-    # Closing the results stops the workers, which could write further archives.
-    with closing(workers.run(jobs, "rendering scenes", "scene")) as results:
-        for scene, size in results:
-            if limit_gb is not None and total + size > limit_gb * 1e9:
-                break
-            total += size
-            kept.add(scene)
-    if others := jobs.keys() - kept:
-        for scene in others:
-            frames_path(store.folder, scene).unlink(missing_ok=True)
-        log.info(
-            "frames_gb=%g: the frames of %d of %d scenes are on disk; the others are rendered on "
-            "demand", limit_gb, len(kept), len(jobs),
-        )  # fmt: skip
-    return {"scenes": len(kept), "bytes": total}
+    sizes = [size for _, size in workers.run(jobs, "rendering scenes", "scene")]
+    return {"scenes": len(sizes), "bytes": sum(sizes)}
 
 
 def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:

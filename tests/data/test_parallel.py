@@ -1,4 +1,4 @@
-"""Worker pools finish every job, on this machine and on a Ray cluster, even if a worker dies."""
+"""Worker pools finish every job, even if a worker dies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from conf.schema import PARALLEL_BACKENDS
 from data.parallel import Workers
 from tests.user_errors import raises_user_error
 
@@ -27,11 +26,10 @@ def kill_worker(number: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", PARALLEL_BACKENDS)
-def test_jobs_of_a_killed_worker_are_retried(tmp_path, backend) -> None:
+def test_jobs_of_a_killed_worker_are_retried(tmp_path) -> None:
     jobs = {str(k): partial(square, k) for k in range(20)}
     jobs["7"] = partial(square, 7, tmp_path / "marker")
-    results = dict(Workers(2, backend).run(jobs, "squaring", "number"))
+    results = dict(Workers(2).run(jobs, "squaring", "number"))
     assert (tmp_path / "marker").exists()
     assert results == {str(k): k * k for k in range(20)}
 
