@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -96,9 +97,9 @@ class Workers:
     def _results(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Any]]:
         from joblib import Parallel, delayed
 
-        parallel = Parallel(
-            self.count, return_as="generator_unordered", initializer=_exit_with_parent
-        )
+        # The parent may be killed before a worker has started, and then has another process id there.
+        watch = partial(_exit_with_parent, os.getpid())
+        parallel = Parallel(self.count, return_as="generator_unordered", initializer=watch)
         # Loky restarts a worker whose memory grows; workers grow because they cache scenes.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs")
         # A caller may stop before the last result.
@@ -116,9 +117,9 @@ def _run_job(name: str, job: Job) -> tuple[str, Any]:
     return name, job()
 
 
-def _exit_with_parent() -> None:
-    """End this worker when its parent is killed; it would otherwise wait for jobs for minutes."""
-    parent = os.getppid()
+def _exit_with_parent(parent: int) -> None:
+    """End this worker when its parent, a process id, is killed; it would otherwise wait for jobs
+    for minutes."""
 
     def watch() -> None:
         while os.getppid() == parent:
