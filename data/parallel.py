@@ -97,7 +97,7 @@ class Workers:
     def _results(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Any]]:
         from joblib import Parallel, delayed
 
-        # The parent may be killed before a worker has started, and then has another process id there.
+        # A worker that asked for its parent could start too late, after the parent was killed.
         watch = partial(_exit_with_parent, os.getpid())
         parallel = Parallel(self.count, return_as="generator_unordered", initializer=watch)
         # Loky restarts a worker whose memory grows; workers grow because they cache scenes.
