@@ -44,8 +44,9 @@ from data.versions import component_versions
 COUNTERFACTUAL = "counterfactual"
 CACHED_SCENES = 20_000
 """Number of scenes that a worker keeps in memory, at about 50 KB each."""
-QUERY_RESERVE = 1.3
-"""Factor on the quotas of queries: those with near-duplicate targets are dropped later."""
+QUERY_RESERVE = 1.6
+"""Factor on the quotas of queries: those with near-duplicate targets are dropped later. In worlds
+whose objects come to rest, these are many."""
 
 ScenesOfSplit = dict[str, list[str]]
 

@@ -1,16 +1,25 @@
-"""Settings of the selection track: observed frames, and how quotas are divided among cells."""
+"""Settings of the selection track: observed frames, quotas, test scenes, minimum displacement."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from conf.compose import compose
-from conf.schema import BenchmarkConfig, BuildCommand, Quota, SelectionConfig
+from conf.schema import (
+    BenchmarkConfig,
+    BuildCommand,
+    Quota,
+    RetrievalTrackConfig,
+    SelectionConfig,
+)
 from conf.schema.benchmark import divide_window_quotas
 from data.build import check_quota_names, ensure_items
+from data.frames.frame_cache import FrameReader
 from data.parallel import Workers
+from data.store import DATABASES
 from tests.user_errors import raises_user_error
 
 
@@ -39,6 +48,60 @@ def test_observation_sets_the_frames_of_a_family_or_of_a_subtype(tmp_path: Path)
         "G1_A_h8_easy": 20,
         "G2_A_h24_easy": 24,
     }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(96, 64), (240, 160)])
+def test_candidates_are_distinct_in_pixels_at_the_least_displacement(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
+    width, height = size
+    few = Quota(train=0, test=12)
+    cfg = config(
+        event={"future_match_gap10": few, "contact_offset": few},
+        time={"in_1s": few},
+        window={"G1_A_h8_hard": few, "G2_C_h8_hard": few},
+        min_displacement=336 / height,
+    )
+    cfg.width, cfg.height = width, height
+    assert not list(cfg.find_problems("benchmark."))
+    store = ensure_items(cfg, tmp_path, Workers(1))
+    frames = FrameReader(store)
+    for item in store.selection():
+        pixels = {frames.array(c.scene_id, c.frame).tobytes() for c in item.candidates}
+        assert len(pixels) == 4, item.item_id
+
+
+def test_displacements_below_a_pixel_are_refused() -> None:
+    for least in (0.0, 336 / 320 - 0.01):
+        [problem] = config(min_displacement=least).find_problems("benchmark.")
+        assert "benchmark.selection.min_displacement" in problem
+
+
+def test_test_scenes_that_cannot_carry_a_quota_are_refused() -> None:
+    cfg = config(time={"in_2s": Quota(0, 12)}, event={"contact_match": Quota(0, 9)})
+    cfg.retrieval.builders = {"1": Quota(0, 30), "5": Quota(0, 11)}
+    cfg.test_scenes = 10
+    problems = [*cfg.find_problems("benchmark.")]
+    assert len(problems) == 2
+    assert "benchmark.selection.time.in_2s.test=12" in problems[0]
+    assert "benchmark.retrieval.builders.5.test=11" in problems[1]
+
+
+@pytest.mark.slow
+def test_spare_scenes_are_used_by_nothing(tmp_path: Path) -> None:
+    cfg = config(time={"in_1s": Quota(4, 3)}, event={"contact_cross": Quota(4, 3)})
+    cfg = replace(cfg, scenes=40, test_share=0.5, test_scenes=5)
+    cfg.retrieval = RetrievalTrackConfig(
+        builders={"1": Quota(4, 4)}, hard_negatives=1, database=60, source=80
+    )
+    store = ensure_items(cfg, tmp_path, Workers(1))
+    assert [len(store.scene_ids(s)) for s in ("train", "test", "spare")] == [20, 5, 15]
+    candidates = (c.scene_id for item in store.selection() for c in item.candidates)
+    queries = (f.scene_id for q in store.retrieval() for f in (q.target, *q.hard_negatives))
+    frames = (f.scene_id for name in DATABASES for f in store.database(name))
+    assert not {*candidates, *queries, *frames} & {*store.scene_ids("spare")}
+    assert {f.scene_id for f in store.database()} <= {*store.scene_ids("test")}
 
 
 def test_unknown_names_and_lengths_of_observations_are_refused() -> None:
