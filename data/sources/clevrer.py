@@ -118,8 +118,8 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     index = annotation.scene_index
     if scene_id("clevrer", number) != _scene_id(path) or index not in (None, int(number)):
         raise RecordError(
-            f"{path}: video_filename {annotation.video_filename!r} and scene_index {index}, expected "
-            "those of the file's number: a copy of another scene would occur twice",
+            f"{path}: video_filename {annotation.video_filename!r} and scene_index {index} are not "
+            "those of the file's number: as a copy of another scene, it would occur twice",
             "duplicate-scene",
         )
     appearances = {

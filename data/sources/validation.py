@@ -179,8 +179,8 @@ def reconcile_velocities(scene: Scene, path: Path) -> Scene:
             "expected 1"
         )
     factor, deviations = compare_velocities(scene)
-    worst = int(deviations.argmax())
-    if deviations[worst] > MAX_DEVIATION:
+    if deviations.max(initial=0.0) > MAX_DEVIATION:
+        worst = int(deviations.argmax())
         raise RecordError(
             f"{path}: velocities of object {worst} ({scene.objects[worst].noun_phrase}) do not "
             f"agree with its positions at {scene.fps:g} frames per second: they differ by "
@@ -192,15 +192,17 @@ def reconcile_velocities(scene: Scene, path: Path) -> Scene:
         factor = 1.0
     else:
         warnings.warn(RescaledVelocities(path, factor, scene.fps), stacklevel=2)
-    recorded = scene.velocities * np.float32(factor), scene.angular_velocities * np.float32(factor)
-    derived = scene.velocities, scene.angular_velocities
-    if not all(np.isfinite(array).all() for array in recorded):
-        derived = np.gradient(scene.positions, 1 / scene.fps, axis=0), _find_spins(scene)
     linear, angular = (
-        np.where(np.isfinite(own).all(axis=(0, 2))[:, None], own, other).astype(np.float32)
-        for own, other in zip(recorded, derived, strict=True)
+        np.where(np.isfinite(own).all(axis=(0, 2))[:, None], own * factor, derived)
+        for own, derived in zip(
+            (scene.velocities, scene.angular_velocities), _find_rates(scene), strict=True
+        )
     )
-    return replace(scene, velocities=linear, angular_velocities=angular)
+    return replace(
+        scene,
+        velocities=linear.astype(np.float32),
+        angular_velocities=angular.astype(np.float32),
+    )
 
 
 def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
@@ -210,10 +212,10 @@ def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
     Compared are central differences, in frames in which an object moves, hardly turns, and does not
     begin or end a contact. If there are few, the factor is 1; an object with few deviates by 0.
     """
-    moved = (scene.positions[2:] - scene.positions[:-2]).astype(float) * scene.fps / 2
-    velocities = scene.velocities[1:-1].astype(float)
+    moved, turned = (rates[1:-1] for rates in _find_rates(scene))
+    velocities = np.where(np.isfinite(scene.velocities), scene.velocities, np.nan)[1:-1]
     speed, own = (np.linalg.norm(each, axis=-1) for each in (moved, velocities))
-    turning = np.linalg.norm(_find_spins(scene)[1:-1], axis=-1) * scene.object_radii
+    turning = np.linalg.norm(turned, axis=-1) * scene.object_radii
     fast = np.maximum(speed, own)
     compared = (fast > MIN_SPEED) & (turning < MAX_TURN * fast) & np.isfinite(own)
     events = [(frame, c.objects) for c in scene.collisions for frame in (c.frame, c.end)]
@@ -225,24 +227,28 @@ def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
         return 1.0, deviations
     along = (moved * velocities).sum(axis=-1) / np.maximum(own, 1e-9) ** 2
     factor = float(np.median(along[compared]))
+    # Velocities of objects that do not move, or the reverse, have no factor.
+    factor = factor if factor > 1e-3 else 1.0
     rest = np.linalg.norm(moved - factor * velocities, axis=-1)
-    shares = rest / np.maximum(np.maximum(speed, abs(factor) * own), 1e-3 * fast + 1e-9)
+    shares = rest / np.maximum(np.maximum(speed, factor * own), 1e-9)
     for k, is_compared in enumerate(compared.T):
         if is_compared.sum() >= MIN_FRAMES:
             deviations[k] = np.median(shares[is_compared, k])
-    # Velocities of objects that do not move, or the reverse, have no factor.
-    return factor, deviations if factor > 1e-3 else np.ones_like(deviations)
+    return factor, deviations
 
 
-def _find_spins(scene: Scene) -> np.ndarray:
-    """Return angular velocities (F, N, 3) from the differences of orientations, radians per second:
-    central ones, and one-sided ones in the first and the last frame."""
+def _find_rates(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return linear and angular velocities (F, N, 3) from the differences of positions and of
+    orientations: central ones, and one-sided ones in the first and the last frame."""
     from scipy.spatial.transform import Rotation
 
     frames = np.arange(scene.frames)
     before, after = np.maximum(frames - 1, 0), np.minimum(frames + 1, scene.frames - 1)
-    shape = scene.positions.shape
-    turns = Rotation.from_quat(scene.quaternions[after].reshape(-1, 4).astype(float))
-    turns *= Rotation.from_quat(scene.quaternions[before].reshape(-1, 4).astype(float)).inv()
-    seconds = np.maximum(after - before, 1) / scene.fps
-    return turns.as_rotvec().reshape(shape) / seconds[:, None, None]
+    seconds = np.maximum(after - before, 1)[:, None, None] / scene.fps
+    first, last = (
+        Rotation.from_quat(scene.quaternions[k].reshape(-1, 4).astype(float))
+        for k in (before, after)
+    )
+    moved = scene.positions[after].astype(float) - scene.positions[before]
+    turned = (last * first.inv()).as_rotvec().reshape(moved.shape)
+    return moved / seconds, turned / seconds

@@ -115,7 +115,8 @@ def find_topic(statement: Relation, relations: Sequence[Relation]) -> Relation |
 class Places(NamedTuple):
     """The visible objects of a frame by name: their places in the image as shares of its width and
     height, their places on the ground in widths of an object of scale 1, their widths in the same
-    unit and visible fractions. Objects that look alike are left out, since words cannot tell them apart."""
+    unit, and their visible fractions. Objects that look alike are left out, since words cannot tell
+    them apart."""
 
     image: dict[str, tuple[float, float]]
     ground: dict[str, tuple[float, float]]
