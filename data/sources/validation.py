@@ -165,8 +165,9 @@ def reconcile_velocities(scene: Scene, path: Path) -> Scene:
     """Return a scene whose velocities agree with its positions and its frame rate.
 
     Velocities of another unit of time are multiplied by the factor that explains the difference,
-    with the warning `RescaledVelocities`. Non-finite velocities of an object are replaced by
-    central differences of its positions or of its orientations.
+    with the warning `RescaledVelocities`. Where an object lacks velocities, they are the central
+    differences of its positions or of its orientations: if some are non-finite, or if all are zero
+    although it moves, as a simulator records them for what it does not simulate as a rigid body.
 
     Raises:
         RecordError: No constant factor explains the difference, or a quaternion has no direction.
@@ -178,7 +179,9 @@ def reconcile_velocities(scene: Scene, path: Path) -> Scene:
             f"{path}: frame {frame}: the quaternion of object {k} has norm {norms[frame, k]:.3g}, "
             "expected 1"
         )
-    factor, deviations = compare_velocities(scene)
+    rates = _find_rates(scene)
+    linear, angular = map(_mask_missing, (scene.velocities, scene.angular_velocities), rates)
+    factor, deviations = compare_velocities(replace(scene, velocities=linear))
     if deviations.max(initial=0.0) > MAX_DEVIATION:
         worst = int(deviations.argmax())
         raise RecordError(
@@ -193,16 +196,17 @@ def reconcile_velocities(scene: Scene, path: Path) -> Scene:
     else:
         warnings.warn(RescaledVelocities(path, factor, scene.fps), stacklevel=2)
     linear, angular = (
-        np.where(np.isfinite(own).all(axis=(0, 2))[:, None], own * factor, derived)
-        for own, derived in zip(
-            (scene.velocities, scene.angular_velocities), _find_rates(scene), strict=True
-        )
+        np.where(np.isnan(own), derived, own * factor).astype(np.float32)
+        for own, derived in zip((linear, angular), rates, strict=True)
     )
-    return replace(
-        scene,
-        velocities=linear.astype(np.float32),
-        angular_velocities=angular.astype(np.float32),
-    )
+    return replace(scene, velocities=linear, angular_velocities=angular)
+
+
+def _mask_missing(recorded: np.ndarray, derived: np.ndarray) -> np.ndarray:
+    """Return velocities (F, N, 3) with NaN for objects that lack them (see above)."""
+    moves = (np.linalg.norm(derived, axis=-1) > MIN_SPEED).sum(axis=0) >= MIN_FRAMES
+    lacks = ~np.isfinite(recorded).all(axis=(0, 2)) | (~recorded.any(axis=(0, 2)) & moves)
+    return np.where(lacks[:, None], np.nan, recorded)
 
 
 def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
@@ -211,9 +215,10 @@ def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
 
     Compared are central differences, in frames in which an object moves, hardly turns, and does not
     begin or end a contact. If there are few, the factor is 1; an object with few deviates by 0.
+    Velocities that are NaN are left out.
     """
     moved, turned = (rates[1:-1] for rates in _find_rates(scene))
-    velocities = np.where(np.isfinite(scene.velocities), scene.velocities, np.nan)[1:-1]
+    velocities = scene.velocities[1:-1].astype(float)
     speed, own = (np.linalg.norm(each, axis=-1) for each in (moved, velocities))
     turning = np.linalg.norm(turned, axis=-1) * scene.object_radii
     fast = np.maximum(speed, own)

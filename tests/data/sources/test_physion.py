@@ -246,7 +246,6 @@ def test_a_motion_onset_is_the_first_frame_away_from_rest(tmp_path: Path, motion
     offset, onsets = ONSETS[motion]
     trial = physion_trial()
     trial["positions"][:, 1, 0] += offset(np.arange(60))
-    trial["velocities"] = None
     assert find_motion_onsets(read(tmp_path, trial)) == onsets
 
 
