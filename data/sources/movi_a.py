@@ -239,8 +239,11 @@ def _read_record(path: Path) -> Arrays:
     frames, count, width, height = (
         int(array(f"metadata/{key}")) for key in ("num_frames", "num_instances", "width", "height")
     )
-    if frames != FRAMES:
-        raise RecordError(f"{where} has {frames} frames, expected {FRAMES}")
+    if frames != FRAMES or min(count, width, height) < 0:
+        raise RecordError(
+            f"{where} has {frames} frames of {width} x {height} px with {count} objects, expected "
+            f"{FRAMES} frames"
+        )
     appearances = []
     for name, words in APPEARANCE.items():
         numbers = array(f"instances/{name}_label", count).astype(int)

@@ -98,7 +98,7 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
     with _open(path) as file:
         static, frames = _get_group(file, "static"), _list_frames(file)
         ids = _read_array(static, "object_ids", (-1,), np.int64).tolist()
-        models = [_decode(name) for name in np.ravel(_get_dataset(static, "model_names")[()])]
+        models = [_decode(name) for name in _read_values(static, "model_names").ravel()]
         if len(models) != len(ids):
             raise RecordError(f"{path} names {len(models)} models of {len(ids)} objects")
         if "framerate" in static:
@@ -116,7 +116,7 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
         centres = np.where(np.isfinite(centres), centres, positions)
         names = stimulus = _stimulus(path, folder)
         if "stimulus_name" in static:
-            names += f" {_decode(_get_dataset(static, 'stimulus_name')[()])}"
+            names += f" {_decode(_read_values(static, 'stimulus_name')[()])}"
         scenario = _find_scenario(names, path)
         is_swapped = scenario == "Roll" and models[2:3] == [SWAPPED_RAMP]
         order = [0, 2, 1, *range(3, len(ids))] if is_swapped else [*range(len(ids))]
@@ -201,7 +201,7 @@ def _find_scenario(names: str, path: Path) -> str:
 def _list_frames(file: h5py.File) -> list[h5py.Group]:
     """Return the groups of all frames, in order."""
     frames = _get_group(file, "frames")
-    names = sorted(frames)
+    names = sorted(map(str, frames))
     first = 1 if names[:1] == ["0001"] else 0
     for k, name in enumerate(names or [""], first):
         if name != f"{k:04d}":
@@ -253,7 +253,7 @@ def _read_pairs(frame: h5py.Group) -> list[tuple[list[int], bytes | None]]:
     pairs = _read_array(collisions, "object_ids", (-1, 2), np.int64).tolist()
     if "states" not in collisions:
         return [(pair, None) for pair in pairs]
-    states = [bytes(state) for state in _get_dataset(collisions, "states")[()].reshape(-1)]
+    states = _read_values(collisions, "states").astype("S").ravel().tolist()
     if len(states) != len(pairs):
         raise RecordError(f"{_locate(collisions)} has {len(states)} states of {len(pairs)} pairs")
     return list(zip(pairs, states, strict=True))
@@ -310,8 +310,8 @@ def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, 
 
 
 def _read_image(frame: h5py.Group, key: str) -> Image.Image:
-    dataset = _get_dataset(_get_group(frame, "images"), key)
-    return decode_image(dataset[()].tobytes(), _locate(dataset))
+    images = _get_group(frame, "images")
+    return decode_image(_read_values(images, key).tobytes(), _locate(images, key))
 
 
 def _decode(text: Any) -> str:
@@ -342,7 +342,7 @@ def _get_group(parent: h5py.Group, key: str) -> h5py.Group:
 
 
 def _get_dataset(parent: h5py.Group, key: str) -> h5py.Dataset:
-    return _get_child(parent, key, "dtype")
+    return _get_child(parent, key, "shape")
 
 
 def _get_child(parent: h5py.Group, key: str, attribute: str) -> Any:
@@ -350,13 +350,13 @@ def _get_child(parent: h5py.Group, key: str, attribute: str) -> Any:
 
     Raises:
         RecordError: The child is missing, damaged or of another kind, which is recognized by its
-            `attribute`: a dataset has a `dtype`, a group has `keys`.
+            `attribute`: a dataset has a `shape`, a group has `keys`.
     """
     names = _find_names(parent, key)
     for name in names:
         # `get` returns None if the child's header is damaged.
         child = parent.get(name)
-        if hasattr(child, attribute):
+        if getattr(child, attribute, None) is not None:
             return child
     if names:
         raise RecordError(f"{_locate(parent, key)} is damaged", "damaged-file")
@@ -365,6 +365,14 @@ def _get_child(parent: h5py.Group, key: str, attribute: str) -> Any:
 
 def _find_names(parent: h5py.Group, key: str) -> list[str]:
     return [name for name in (key, f"{key}_cam0") if name in parent]
+
+
+def _read_values(parent: h5py.Group, key: str) -> np.ndarray:
+    """Return a dataset's values. Raises RecordError if it is missing, or if its type is damaged."""
+    try:
+        return np.asarray(_get_dataset(parent, key)[()])
+    except (TypeError, ValueError) as error:
+        raise RecordError(f"{_locate(parent, key)} is damaged: {error}", "damaged-file") from error
 
 
 def _read_array(
@@ -385,4 +393,4 @@ def _read_array(
     # Other numbers of axes are reshaped: a matrix may be flat, and an empty list has one axis.
     if dataset.ndim == len(shape) and any(-1 != wanted != found for found, wanted in lengths):
         raise RecordError(f"{_locate(dataset)}: shape {dataset.shape}, expected {shape}")
-    return finite_array(dataset[()], shape, _locate(dataset), dtype, optional)
+    return finite_array(_read_values(parent, key), shape, _locate(dataset), dtype, optional)
