@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from data.sources.validation import (
     compare_velocities,
     reconcile_velocities,
 )
+from data.store import load_scene, save_scene
 from tests.data.sources.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.sources.movi_a_files import movi_example, write_movi_folder
 from tests.data.sources.physion_files import physion_trial, write_physion
@@ -189,6 +191,17 @@ def read_physion(folder: Path, factor: float) -> Scene:
     trial["velocities"][:, 0, 0] = factor
     path = write_physion(folder / "Drop" / "0.hdf5", trial)
     return physion.read_scene(path, folder, "test", fps=30)
+
+
+def test_a_stored_scene_keeps_its_sizes(tmp_path: Path) -> None:
+    """A scene of the standard sizes records none, so that its bytes do not depend on them."""
+    scene = read_clevrer(tmp_path, 1.0)
+    for given in (scene, replace(scene, radii=(), scales=())):
+        save_scene(given, path := tmp_path / "scene.npz")
+        assert load_scene(path).object_radii == given.object_radii
+        assert load_scene(path).object_scales == given.object_scales
+        with np.load(path) as file:
+            assert ("radii" in json.loads(str(file["header"]))) == bool(given.radii)
 
 
 @pytest.mark.parametrize("read", [read_clevrer, read_movi_a, read_physion])
