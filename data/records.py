@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from conf.schema.world import RADIUS
+
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
@@ -107,6 +109,8 @@ class Scene:
             of its release; None for a scene that is rendered from its oracle.
         scales: sizes of the objects as multiples of their shapes' standard size; empty if all are
             1, or if they are not known.
+        radii: half of each object's horizontal extent, simulator units; empty for the standard
+            radius times the scale.
         speed_bounds: upper bounds of the speeds that rationales call slow, steady and quick,
             simulator units per second; empty for the default bounds.
     """
@@ -128,6 +132,7 @@ class Scene:
     scenario: str = ""
     footage: str | None = None
     scales: tuple[float, ...] = ()
+    radii: tuple[float, ...] = ()
     speed_bounds: tuple[float, ...] = ()
 
     ARRAYS = (
@@ -143,6 +148,12 @@ class Scene:
     def object_scales(self) -> tuple[float, ...]:
         """The size of each object, as a multiple of the standard size of its shape."""
         return self.scales or (1.0,) * len(self.objects)
+
+    @property
+    def object_radii(self) -> tuple[float, ...]:
+        """Half of the horizontal extent of each object, simulator units. Two objects on the floor
+        touch where their distance is about the sum of their radii."""
+        return self.radii or tuple(RADIUS * scale for scale in self.object_scales)
 
     @property
     def object_keys(self) -> list[tuple[SceneObject, int]]:

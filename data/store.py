@@ -80,7 +80,7 @@ def part_path(folder: Path, inputs: Any) -> Path:
 def save_scene(scene: Scene, path: Path) -> None:
     """Write a scene's oracle as arrays and a JSON header."""
     header = {f.name: getattr(scene, f.name) for f in fields(scene) if f.name not in Scene.ARRAYS}
-    for name in ("scales", "speed_bounds"):
+    for name in ("scales", "radii", "speed_bounds"):
         if not header[name]:
             # Default values are left out: an added field does not change the bytes of scenes that
             # do not use it.
@@ -101,8 +101,7 @@ def load_scene(path: Path) -> Scene:
             "collisions": tuple(Collision(*c) for c in collisions),
             "image_size": tuple(header["image_size"]),
             "landings": tuple(Landing(**landing) for landing in header["landings"]),
-            "scales": tuple(header.get("scales", ())),
-            "speed_bounds": tuple(header.get("speed_bounds", ())),
+            **{key: tuple(header.get(key, ())) for key in ("scales", "radii", "speed_bounds")},
         }
         return Scene(**header, **{name: file[name] for name in Scene.ARRAYS})
 

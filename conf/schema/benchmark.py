@@ -119,7 +119,7 @@ class BenchmarkConfig(Settings):
     folder: str | None = None
     """Folder of the release, if `simulator` reads one."""
     fps: float = setting(30.0, above=0)
-    """Frame rate (frames per second) of Physion's trials, whose files do not record it."""
+    """Frame rate (frames per second) of Physion's trials, most of which do not record it."""
     seed: int = setting(0, least=0)
     """Seed of the scenes, the split and the items."""
     scenes: int = setting(10_000, least=4)

@@ -17,7 +17,6 @@ from PIL import Image
 from data.frames.frame_cache import render_frames
 from data.oracle.displacement import DIAGONAL, cross_scene_displacement, visible_positions
 from data.records import FrameRef, Scene, SelectionItem
-from data.sim.shapes import RADIUS
 
 SCORES = (
     "nearness", "pixel nearness", "oddness", "pixel oddness", "moment", "travel", "visible", "gap",
@@ -112,10 +111,10 @@ def _gap(scene: Scene, frame: int) -> float:
     """Return the smallest gap between two visible objects of a frame, simulator units. Gaps below
     `TOUCHING` count as equal."""
     seen = np.flatnonzero(visible_positions(scene)[1][frame])
-    scales = scene.object_scales
+    radii = scene.object_radii
     gaps = [
         np.linalg.norm(scene.positions[frame, a] - scene.positions[frame, b])
-        - RADIUS * (scales[a] + scales[b])
+        - (radii[a] + radii[b])
         for a, b in combinations(seen.tolist(), 2)
     ]
     return max(float(min(gaps, default=APART)), TOUCHING)

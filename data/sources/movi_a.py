@@ -10,6 +10,9 @@ that is certainly at or after the contact is simulated frame n + 1, which has in
 
 Every contact point is listed at every simulation step. An index that belongs to no object (-1, or
 65535 if unsigned) stands for the floor, or for an object that is never visible.
+
+Velocities, orientations and 3D boxes may be missing. Without the boxes, an object is 0.7 wide if it
+is small and 1.4 if it is large, the sizes of Kubric's CLEVR objects.
 """
 
 from __future__ import annotations
@@ -36,6 +39,7 @@ from data.sources.validation import (
     decode_image,
     finite_array,
     read_json,
+    reconcile_velocities,
     scene_id,
 )
 
@@ -57,8 +61,13 @@ STATES = {
     "angular_velocities": (FRAMES, 3),
     "image_positions": (FRAMES, 2),
     "visibility": (FRAMES,),
+    "bboxes_3d": (FRAMES, 8, 3),
 }
 """Shape of each array for one object."""
+OPTIONAL = ("quaternions", "velocities", "angular_velocities", "bboxes_3d")
+"""Arrays that may be missing; NaN stands for their values."""
+RADII = {"small": 0.35, "large": 0.7}
+"""Half of the width of objects without a recorded box, by size label."""
 CONTACTS = {"instances": (2,), "frame": (), "position": (3,), "contact_normal": (3,)}
 """Shape of each array for one contact point."""
 
@@ -76,11 +85,12 @@ class Instance(Layout):
     color: Literal[COLORS] = Field(alias="color_label")
     size: Literal[SIZES] = Field(alias="size_label")
     positions: list
-    quaternions: list
-    velocities: list
-    angular_velocities: list
     image_positions: list
     visibility: list
+    quaternions: list | None = None
+    velocities: list | None = None
+    angular_velocities: list | None = None
+    bboxes_3d: list | None = None
 
 
 class Video(Layout):
@@ -161,14 +171,19 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     for frame, pair in zip(frames[collides].tolist(), pairs[collides].tolist(), strict=True):
         touching[min(pair), max(pair)].append(frame)
     states = {key: array.swapaxes(0, 1) for key, array in record.states.items()}
-    return Scene(
+    upright = np.isnan(states["quaternions"]).any(axis=-1, keepdims=True)
+    # The corner that is nearest to the first one ends an edge of the same box.
+    corners = states["bboxes_3d"][0]
+    edges = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=-1).min(axis=-1, initial=np.inf)
+    sizes = zip(record.objects, (edges / 2).tolist(), strict=True)
+    scene = Scene(
         scene_id=_scene_id(path, folder),
         split=split,
         objects=record.objects,
         collisions=group_contacts(touching, FPS),
         positions=states["positions"],
         # From w x y z to x y z w.
-        quaternions=np.roll(states["quaternions"], -1, axis=-1),
+        quaternions=np.where(upright, [0, 0, 0, 1], np.roll(states["quaternions"], -1, axis=-1)),
         velocities=states["velocities"],
         angular_velocities=states["angular_velocities"],
         image_positions=states["image_positions"] * np.float32(record.image_size),
@@ -178,7 +193,9 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
         fps=FPS,
         landings=_find_landings(record.contacts, pairs, frames, is_object),
         footage=footage.relative_to(folder).as_posix(),
+        radii=tuple(radius if radius > 0 else RADII[each.size] for each, radius in sizes),
     )
+    return reconcile_velocities(scene, path)
 
 
 def _read_folder(folder: Path) -> Arrays:
@@ -187,8 +204,12 @@ def _read_folder(folder: Path) -> Arrays:
     events = read_json(folder / "events.json", Events)
 
     def array(rows: list[Instance] | list[Contact], key: str, *shape: int) -> np.ndarray:
+        name = "metadata.json: instances" if key in STATES else "events.json: collisions"
         values = [getattr(row, key) for row in rows]
-        return finite_array(values, (len(rows), *shape), f"{folder}: {key}")
+        if key in OPTIONAL:
+            values = [np.full(shape, np.nan) if value is None else value for value in values]
+        where = f"{folder}/{name}.{key}"
+        return finite_array(values, (len(rows), *shape), where, optional=key in OPTIONAL)
 
     contacts = {key: array(events.collisions, key, *shape) for key, shape in CONTACTS.items()}
     contacts["frame"] = np.maximum(np.ceil(contacts["frame"]) - 1, 0)
@@ -206,15 +227,23 @@ def _read_record(path: Path) -> Arrays:
     where = f"{path.parent}: record {int(path.name)}"
 
     def array(name: str, *shape: int) -> np.ndarray:
-        if name not in features:
+        is_optional = name.removeprefix("instances/") in OPTIONAL
+        if name in features:
+            values = feature_values(features[name])
+        elif is_optional:
+            values = np.full(shape, np.nan)
+        else:
             raise RecordError(f"{where} has no feature {name!r}, which the published layout has")
-        return finite_array(feature_values(features[name]), shape, f"{where}: {name}")
+        return finite_array(values, shape, f"{where}: {name}", optional=is_optional)
 
     frames, count, width, height = (
         int(array(f"metadata/{key}")) for key in ("num_frames", "num_instances", "width", "height")
     )
-    if frames != FRAMES:
-        raise RecordError(f"{where} has {frames} frames, expected {FRAMES}")
+    if frames != FRAMES or min(count, width, height) < 0:
+        raise RecordError(
+            f"{where} has {frames} frames of {width} x {height} px with {count} objects, expected "
+            f"{FRAMES} frames"
+        )
     appearances = []
     for name, words in APPEARANCE.items():
         numbers = array(f"instances/{name}_label", count).astype(int)

@@ -4,14 +4,21 @@ TDW has Unity's axes: y is up and the system is left-handed. Swapping y and z gi
 axes with z up. The swap is a reflection, so it also reverses rotations: the vector parts of
 quaternions and the angular velocities change their sign.
 
-Files do not record their frame rate, which was 30 fps in some versions and 100 in others: the
-caller gives it. Later versions add a suffix to the names of per-camera datasets (`_img_cam0`) and
-start at frame 0001.
+Most files do not record their frame rate, which is 30 fps in some versions and 100 in others: the
+caller gives it. Velocities are per second of a simulation with 0.01 s per frame. Later versions add
+a suffix to the names of per-camera datasets (`_img_cam0`) and start at frame 0001.
 
 Events are found from the contacts that each frame lists. Early files have no `states` of
 collisions, and `env_collisions` does not distinguish walls from the floor. The `labels` are not
 used, because they do not describe single frames: `target_on_ground` is set when the contacts with
 the floor change, and `target_delta_position` accumulates over frames.
+
+Early files have no velocities and no contacts, so that their scenes have no collisions and no
+landings. The objects of Flex trials (Drape) have no finite velocities; a cloth is one object, with
+the place and the orientation of its transform, however it folds.
+
+`positions` are those of transforms, whose pivot is at the base of most models. Image positions are
+those of the centres of the bounds, if a file records bounds.
 """
 
 from __future__ import annotations
@@ -36,6 +43,7 @@ from data.sources.validation import (
     check_unique_scenes,
     decode_image,
     finite_array,
+    reconcile_velocities,
     scene_id,
 )
 
@@ -63,8 +71,11 @@ START_FRAMES = 5
 """A pair that a file without `states` lists before this frame is in contact from the start."""
 AIR_FRAMES = 5
 """Minimum number of frames without contact before a landing."""
-VECTORS = {"positions": 3, "rotations": 4, "velocities": 3, "angular_velocities": 3}
-"""Number of components of each vector of an object."""
+SWAPPED_RAMP = "ramp_with_platform_30"
+"""If the third model of a Roll trial is this, the release has swapped the second and the third name
+and scale. The readers of the particle simulators trained on Physion swap them back, too."""
+SIDES = ("left", "right", "front", "back")
+"""Points on the sides of an object's bounds."""
 
 
 def list_scenes(folder: Path) -> list[Path]:
@@ -82,38 +93,48 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
     """Return the scene of a trial.
 
     An object's shape is the name of its model. Visible fractions are unknown (NaN); an object is in
-    view if the segmentation image contains its colour.
+    view if the segmentation image contains its colour. `fps` is for files without frame rate.
     """
     with _open(path) as file:
         static, frames = _get_group(file, "static"), _list_frames(file)
         ids = _read_array(static, "object_ids", (-1,), np.int64).tolist()
-        models = [_decode(name) for name in _get_dataset(static, "model_names")[()]]
+        models = [_decode(name) for name in _read_values(static, "model_names").ravel()]
         if len(models) != len(ids):
             raise RecordError(f"{path} names {len(models)} models of {len(ids)} objects")
+        if "framerate" in static:
+            fps = float(_read_array(static, "framerate", ()))
+            if fps <= 0:
+                raise RecordError(f"{_locate(static, 'framerate')} is {fps:g}, expected above 0")
         colors = _read_array(static, "object_segmentation_colors", (len(ids), 3))
         objects = [_get_group(frame, "objects") for frame in frames]
-        positions, rotations, velocities, angular_velocities = (
-            np.stack([_read_array(group, key, (len(ids), size)) for group in objects])
-            for key, size in VECTORS.items()
-        )
+        positions = np.stack([_read_array(group, "positions", (len(ids), 3)) for group in objects])
+        rotations = _read_vectors(objects, "rotations", np.tile([0, 0, 0, 1], (len(ids), 1)))
+        unknown = np.full((len(ids), 3), np.nan)
+        velocities = _read_vectors(objects, "velocities", unknown)
+        angular_velocities = _read_vectors(objects, "angular_velocities", unknown)
+        centres = _read_vectors(objects, "center", unknown)
+        centres = np.where(np.isfinite(centres), centres, positions)
         names = stimulus = _stimulus(path, folder)
         if "stimulus_name" in static:
-            names += f" {_decode(_get_dataset(static, 'stimulus_name')[()])}"
+            names += f" {_decode(_read_values(static, 'stimulus_name')[()])}"
         scenario = _find_scenario(names, path)
+        is_swapped = scenario == "Roll" and models[2:3] == [SWAPPED_RAMP]
+        order = [0, 2, 1, *range(3, len(ids))] if is_swapped else [*range(len(ids))]
+        collisions = _find_collisions(frames, ids, fps)
         size = _read_image(frames[0], "_img").size
         for frame in frames:
             _get_dataset(_get_group(frame, "images"), "_img")
-        return Scene(
+        scene = Scene(
             scene_id=scene_id("physion", scenario, stimulus),
             split=split,
-            objects=tuple(map(SceneObject, models)),
-            collisions=_find_collisions(frames, ids, fps),
+            objects=tuple(SceneObject(models[k]) for k in order),
+            collisions=collisions,
             positions=positions[..., AXES],
             quaternions=rotations[..., [*AXES, 3]] * np.float32([-1, -1, -1, 1]),
             velocities=velocities[..., AXES],
             angular_velocities=-angular_velocities[..., AXES],
             image_positions=np.stack(
-                [_project(*pair, size) for pair in zip(frames, positions, strict=True)]
+                [_project(*pair, size) for pair in zip(frames, centres, strict=True)]
             ),
             in_view=np.stack([_read_in_view(frame, colors) for frame in frames]),
             visible_fraction=np.full((len(frames), len(ids)), np.nan, np.float32),
@@ -122,7 +143,50 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
             landings=_find_landings(frames, ids, positions),
             scenario=scenario,
             footage=path.relative_to(folder).as_posix(),
+            radii=_find_radii(static, order, objects[0], collisions, positions),
         )
+    return reconcile_velocities(scene, path)
+
+
+def _read_vectors(objects: list[h5py.Group], key: str, absent: np.ndarray) -> np.ndarray:
+    """Return vectors of all objects (F, N, ...), which may be non-finite where `absent` is; this is
+    their value in each frame of a file that lacks them in the first frame."""
+    if not _find_names(objects[0], key):
+        return np.stack([absent.astype(np.float32)] * len(objects))
+    is_optional = bool(np.isnan(absent).any())
+    return np.stack(
+        [_read_array(group, key, absent.shape, optional=is_optional) for group in objects]
+    )
+
+
+def _find_radii(
+    static: h5py.Group,
+    order: list[int],
+    objects: h5py.Group,
+    collisions: tuple[Collision, ...],
+    positions: np.ndarray,
+) -> tuple[float, ...]:
+    """Return half of the horizontal extent of each object.
+
+    It is that of its bounds in the first frame. Without bounds, it is that of a model of width 1,
+    as TDW's primitives have it, at the object's scale; without scales, half of the distance on the
+    ground at the object's first contact, or the mean of the others.
+    """
+    count = positions.shape[1]
+    radii = np.full(count, np.nan)
+    for contact in reversed(collisions):
+        one, other = (positions[contact.frame, k][[0, 2]] for k in contact.objects)
+        radii[list(contact.objects)] = np.linalg.norm(one - other) / 2
+    if "scale" in static:
+        radii = _read_array(static, "scale", (count, 3))[order][:, [0, 2]].mean(axis=1) / 2
+    if all(_find_names(objects, side) for side in SIDES):
+        left, right, front, back = (
+            _read_array(objects, side, (count, 3), optional=True) for side in SIDES
+        )
+        widths = np.linalg.norm([right - left, front - back], axis=-1).mean(axis=0)
+        radii = np.where(widths > 0, widths / 2, radii)
+    known = radii[radii > 0]
+    return tuple(np.where(radii > 0, radii, known.mean()).tolist()) if len(known) else ()
 
 
 def _find_scenario(names: str, path: Path) -> str:
@@ -137,7 +201,7 @@ def _find_scenario(names: str, path: Path) -> str:
 def _list_frames(file: h5py.File) -> list[h5py.Group]:
     """Return the groups of all frames, in order."""
     frames = _get_group(file, "frames")
-    names = sorted(frames)
+    names = sorted(map(str, frames))
     first = 1 if names[:1] == ["0001"] else 0
     for k, name in enumerate(names or [""], first):
         if name != f"{k:04d}":
@@ -163,7 +227,8 @@ def _read_in_view(frame: h5py.Group, colors: np.ndarray) -> np.ndarray:
     """Return whether the segmentation image contains each object's colour, (N,) bool."""
     weights = [1 << 16, 1 << 8, 1]
     pixels = np.asarray(_read_image(frame, "_id")).astype(np.int32) @ weights
-    return np.isin(colors.astype(np.int32) @ weights, pixels)
+    # An object that is never drawn has the colour of the background, black.
+    return np.isin(colors.astype(np.int32) @ weights, pixels) & colors.any(axis=1)
 
 
 def _find_collisions(frames: list[h5py.Group], ids: list[int], fps: float) -> tuple[Collision, ...]:
@@ -182,11 +247,13 @@ def _find_collisions(frames: list[h5py.Group], ids: list[int], fps: float) -> tu
 
 def _read_pairs(frame: h5py.Group) -> list[tuple[list[int], bytes | None]]:
     """Return the pairs of object ids that a frame lists, and their states (None: not recorded)."""
+    if "collisions" not in frame:
+        return []
     collisions = _get_group(frame, "collisions")
     pairs = _read_array(collisions, "object_ids", (-1, 2), np.int64).tolist()
     if "states" not in collisions:
         return [(pair, None) for pair in pairs]
-    states = [bytes(state) for state in _get_dataset(collisions, "states")[()].reshape(-1)]
+    states = _read_values(collisions, "states").astype("S").ravel().tolist()
     if len(states) != len(pairs):
         raise RecordError(f"{_locate(collisions)} has {len(states)} states of {len(pairs)} pairs")
     return list(zip(pairs, states, strict=True))
@@ -202,12 +269,14 @@ def _find_landings(
     in_air = np.zeros(len(ids), int)
     landed: dict[int, int] = {}
     for k, frame in enumerate(frames):
-        environment = _get_group(frame, "env_collisions")
-        listed = _read_array(environment, "object_ids", (-1,), np.int64)
-        touching = [n for n, name in enumerate(ids) if name in listed]
-        for n in _find_on_floor(environment, touching, positions[k]):
-            if in_air[n] >= AIR_FRAMES:
-                landed.setdefault(n, k)
+        listed = np.empty(0, np.int64)
+        if "env_collisions" in frame:
+            environment = _get_group(frame, "env_collisions")
+            listed = _read_array(environment, "object_ids", (-1,), np.int64)
+            touching = [n for n, name in enumerate(ids) if name in listed]
+            for n in _find_on_floor(environment, touching, positions[k]):
+                if in_air[n] >= AIR_FRAMES:
+                    landed.setdefault(n, k)
         in_contact = [
             name for pair, state in _read_pairs(frame) if state != b"exit" for name in pair
         ]
@@ -241,12 +310,12 @@ def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, 
 
 
 def _read_image(frame: h5py.Group, key: str) -> Image.Image:
-    dataset = _get_dataset(_get_group(frame, "images"), key)
-    return decode_image(dataset[()].tobytes(), _locate(dataset))
+    images = _get_group(frame, "images")
+    return decode_image(_read_values(images, key).tobytes(), _locate(images, key))
 
 
 def _decode(text: Any) -> str:
-    return text.decode() if isinstance(text, bytes) else str(text)
+    return text.decode(errors="replace") if isinstance(text, bytes) else str(text)
 
 
 @contextmanager
@@ -273,7 +342,7 @@ def _get_group(parent: h5py.Group, key: str) -> h5py.Group:
 
 
 def _get_dataset(parent: h5py.Group, key: str) -> h5py.Dataset:
-    return _get_child(parent, key, "dtype")
+    return _get_child(parent, key, "shape")
 
 
 def _get_child(parent: h5py.Group, key: str, attribute: str) -> Any:
@@ -281,23 +350,40 @@ def _get_child(parent: h5py.Group, key: str, attribute: str) -> Any:
 
     Raises:
         RecordError: The child is missing, damaged or of another kind, which is recognized by its
-            `attribute`: a dataset has a `dtype`, a group has `keys`.
+            `attribute`: a dataset has a `shape`, a group has `keys`.
     """
-    names = [name for name in (key, f"{key}_cam0") if name in parent]
+    names = _find_names(parent, key)
     for name in names:
         # `get` returns None if the child's header is damaged.
         child = parent.get(name)
-        if hasattr(child, attribute):
+        if getattr(child, attribute, None) is not None:
             return child
     if names:
         raise RecordError(f"{_locate(parent, key)} is damaged", "damaged-file")
     raise RecordError(f"{_locate(parent, key)} is missing")
 
 
+def _find_names(parent: h5py.Group, key: str) -> list[str]:
+    return [name for name in (key, f"{key}_cam0") if name in parent]
+
+
+def _read_values(parent: h5py.Group, key: str) -> np.ndarray:
+    """Return a dataset's values. Raises RecordError if it is missing, or if its type is damaged."""
+    try:
+        return np.asarray(_get_dataset(parent, key)[()])
+    except (TypeError, ValueError) as error:
+        raise RecordError(f"{_locate(parent, key)} is damaged: {error}", "damaged-file") from error
+
+
 def _read_array(
-    parent: h5py.Group, key: str, shape: tuple[int, ...], dtype: type = np.float32
+    parent: h5py.Group,
+    key: str,
+    shape: tuple[int, ...],
+    dtype: type = np.float32,
+    optional: bool = False,
 ) -> np.ndarray:
-    """Return a dataset as an array of `shape`, in which -1 stands for any length.
+    """Return a dataset as an array of `shape`, in which -1 stands for any length; with `optional`,
+    non-finite values stay.
 
     Raises:
         RecordError: The dataset is missing, does not fit the shape, or has non-finite values.
@@ -307,4 +393,4 @@ def _read_array(
     # Other numbers of axes are reshaped: a matrix may be flat, and an empty list has one axis.
     if dataset.ndim == len(shape) and any(-1 != wanted != found for found, wanted in lengths):
         raise RecordError(f"{_locate(dataset)}: shape {dataset.shape}, expected {shape}")
-    return finite_array(dataset[()], shape, _locate(dataset), dtype)
+    return finite_array(_read_values(parent, key), shape, _locate(dataset), dtype, optional)

@@ -10,14 +10,16 @@ There is one reader per simulator, a module with three functions:
 for a folder without scenes, and for a scene that occurs twice. `read_scene` reads only the scene's
 own files and checks that its frames exist, so scenes can be read in any order and in separate
 processes. `read_scene` and `load_images` raise `RecordError` for a record that is damaged or does
-not have the published layout. `physion.read_scene` also has the argument `fps`, because Physion's
-trials do not record their frame rate.
+not have the published layout. `read_scene` returns what `reconcile_velocities` makes of the scene.
+`physion.read_scene` also has the argument `fps`, because most of Physion's trials do not record
+their frame rate.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import warnings
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -28,7 +30,7 @@ from conf.schema import BenchmarkConfig
 from data.parallel import Workers
 from data.records import SPLITS
 from data.sources import clevrer, movi_a, physion
-from data.sources.validation import RecordError
+from data.sources.validation import RecordError, RescaledVelocities
 from data.store import part_path, save_scene, scene_path
 
 log = logging.getLogger(__name__)
@@ -75,12 +77,24 @@ def read_release(
             split_of[part] = split
     workers.write_files(jobs, f"reading {cfg.simulator}", "scene")
     scene_ids: dict[str, list[str]] = {split: [] for split in SPLITS}
-    problems = []
+    problems, factors = [], []
     for part, split in split_of.items():
         if problem := _problem_of(part):
             problems.append(problem)
         else:
-            scene_ids[split].append(json.loads(part.read_bytes())["scene_id"])
+            outcome = json.loads(part.read_bytes())
+            scene_ids[split].append(outcome["scene_id"])
+            factors += outcome["factors"]
+    if factors:
+        low, high = (f"{bound:.3g}" for bound in (min(factors), max(factors)))
+        log.warning(
+            "velocities of %d scenes of %d were multiplied by %s, so that they agree with the "
+            "positions: the release has another unit of time%s",
+            len(factors),
+            len(split_of),
+            low if low == high else f"{low} to {high}",
+            f", or benchmark.fps={cfg.fps:g} is wrong" if cfg.simulator == "physion" else "",
+        )
     if problems and strict:
         raise UserError(
             f"{problems[0]} (strict=false leaves such records out)", code="invalid-record"
@@ -102,7 +116,9 @@ def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: 
     reader, source = READERS[cfg.simulator], Path(cfg.folder)
     rate = {"fps": cfg.fps} if cfg.simulator == "physion" else {}
     try:
-        scene = reader.read_scene(path, source, split, **rate)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", RescaledVelocities)
+            scene = reader.read_scene(path, source, split, **rate)
     except RecordError as error:
         outcome = {"problem": str(error)}
     except PermissionError as error:
@@ -116,5 +132,6 @@ def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: 
         outcome = {"problem": f"{getattr(error, 'filename', None) or path}: {error}"}
     else:
         save_scene(scene, scene_path(folder, scene.scene_id))
-        outcome = {"scene_id": scene.scene_id}
+        rescaled = [w.message for w in caught if isinstance(w.message, RescaledVelocities)]
+        outcome = {"scene_id": scene.scene_id, "factors": [each.factor for each in rescaled]}
     write_bytes(part, json.dumps(outcome).encode())

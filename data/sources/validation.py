@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,11 +15,24 @@ from PIL import Image
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from conf.errors import UserError
+from data.records import Scene
 
 FLOOR_TOLERANCE = 0.05
 """Maximum distance from the floor's plane of a contact with the floor, simulator units."""
 MIN_VERTICAL = 0.7
 """Minimum vertical component of the unit normal of a contact with the floor."""
+MIN_SPEED = 0.1
+"""Speed (simulator units per second) from which velocities are compared with displacements."""
+MIN_FRAMES = 10
+"""Minimum number of frames in which an object's velocities are compared."""
+CONTACT_MARGIN = 2
+"""Number of frames around the start and the end of a contact in which they are not compared."""
+MAX_TURN = 0.2
+"""Highest speed of an object's surface by its rotation, as a share of the object's own speed, in
+frames that are compared: what is recorded as position may be off the centre of mass."""
+AGREEMENT, MAX_DEVIATION = 0.1, 0.25
+"""Relative difference up to which velocities agree with displacements, and the median deviation of
+an object's velocities up to which a factor explains the difference."""
 
 
 class RecordError(UserError):
@@ -29,6 +44,17 @@ class RecordError(UserError):
 
     def __init__(self, message: str, code: str = "invalid-record") -> None:
         super().__init__(message, code)
+
+
+class RescaledVelocities(UserWarning):
+    """A scene's velocities were multiplied by `factor`, so that they agree with its positions."""
+
+    def __init__(self, path: Path, factor: float, fps: float) -> None:
+        super().__init__(
+            f"{path}: velocities were multiplied by {factor:.3g}, so that they agree with the "
+            f"positions at {fps:g} frames per second"
+        )
+        self.factor = factor
 
 
 class Layout(BaseModel):
@@ -97,9 +123,16 @@ def check_unique_scenes(
 
 
 def finite_array(
-    values: Any, shape: tuple[int, ...], where: str, dtype: type = np.float32
+    values: Any,
+    shape: tuple[int, ...],
+    where: str,
+    dtype: type = np.float32,
+    optional: bool = False,
 ) -> np.ndarray:
     """Return numbers as an array of `shape`, in which -1 stands for any length.
+
+    Args:
+        optional: Let non-finite numbers pass: they stand for what is not recorded.
 
     Raises:
         RecordError: The values do not fit the shape, or not all of them are finite numbers.
@@ -108,8 +141,9 @@ def finite_array(
         array = np.asarray(values, np.float64).reshape(shape)
     except (TypeError, ValueError) as error:
         raise RecordError(f"{where}: expected numbers of shape {shape}: {error}") from error
-    if not np.isfinite(array).all():
-        raise RecordError(f"{where}: non-finite values (NaN or Inf)")
+    if not optional and not np.isfinite(array).all():
+        first = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+        raise RecordError(f"{where}: non-finite values (NaN or Inf), the first at index {first}")
     return array.astype(dtype)
 
 
@@ -125,3 +159,101 @@ def decode_image(image: bytes | Path, where: str) -> Image.Image:
         raise RecordError(
             f"{where} cannot be decoded as an image: {error}", "damaged-file"
         ) from error
+
+
+def reconcile_velocities(scene: Scene, path: Path) -> Scene:
+    """Return a scene whose velocities agree with its positions and its frame rate.
+
+    Velocities of another unit of time are multiplied by the factor that explains the difference,
+    with the warning `RescaledVelocities`. Where an object lacks velocities, they are the central
+    differences of its positions or of its orientations: if some are non-finite, or if all are zero
+    although it moves, as a simulator records them for what it does not simulate as a rigid body.
+
+    Raises:
+        RecordError: No constant factor explains the difference, or a quaternion has no direction.
+    """
+    norms = np.linalg.norm(scene.quaternions, axis=-1)
+    if (wrong := np.argwhere(np.abs(norms - 1) > 0.01)).size:
+        frame, k = wrong[0].tolist()
+        raise RecordError(
+            f"{path}: frame {frame}: the quaternion of object {k} has norm {norms[frame, k]:.3g}, "
+            "expected 1"
+        )
+    rates = _find_rates(scene)
+    linear, angular = map(_mask_missing, (scene.velocities, scene.angular_velocities), rates)
+    factor, deviations = compare_velocities(replace(scene, velocities=linear))
+    if deviations.max(initial=0.0) > MAX_DEVIATION:
+        worst = int(deviations.argmax())
+        raise RecordError(
+            f"{path}: velocities of object {worst} ({scene.objects[worst].noun_phrase}) do not "
+            f"agree with its positions at {scene.fps:g} frames per second: they differ by "
+            f"{100 * deviations[worst]:.0f}% (median), also if all velocities of the scene are "
+            f"multiplied by {factor:.3g}; check the file, and benchmark.fps for Physion",
+            "inconsistent-velocities",
+        )
+    if abs(factor - 1) <= AGREEMENT:
+        factor = 1.0
+    else:
+        warnings.warn(RescaledVelocities(path, factor, scene.fps), stacklevel=2)
+    linear, angular = (
+        np.where(np.isnan(own), derived, own * factor).astype(np.float32)
+        for own, derived in zip((linear, angular), rates, strict=True)
+    )
+    return replace(scene, velocities=linear, angular_velocities=angular)
+
+
+def _mask_missing(recorded: np.ndarray, derived: np.ndarray) -> np.ndarray:
+    """Return velocities (F, N, 3) with NaN for objects that lack them (see above)."""
+    moves = (np.linalg.norm(derived, axis=-1) > MIN_SPEED).sum(axis=0) >= MIN_FRAMES
+    lacks = ~np.isfinite(recorded).all(axis=(0, 2)) | (~recorded.any(axis=(0, 2)) & moves)
+    return np.where(lacks[:, None], np.nan, recorded)
+
+
+def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
+    """Return the factor by which velocities are to be multiplied to agree with the displacements
+    between frames, and how much those of each object still deviate (N,), as a share.
+
+    Compared are central differences, in frames in which an object moves, hardly turns, and does not
+    begin or end a contact. If there are few, the factor is 1; an object with few deviates by 0.
+    Velocities that are NaN are left out.
+    """
+    moved, turned = (rates[1:-1] for rates in _find_rates(scene))
+    velocities = scene.velocities[1:-1].astype(float)
+    speed, own = (np.linalg.norm(each, axis=-1) for each in (moved, velocities))
+    turning = np.linalg.norm(turned, axis=-1) * scene.object_radii
+    fast = np.maximum(speed, own)
+    compared = (fast > MIN_SPEED) & (turning < MAX_TURN * fast) & np.isfinite(own)
+    events = [(frame, c.objects) for c in scene.collisions for frame in (c.frame, c.end)]
+    for frame, objects in [*events, *((event.frame, event.object) for event in scene.landings)]:
+        # Index i of these arrays is frame i + 1.
+        compared[max(frame - CONTACT_MARGIN - 1, 0) : frame + CONTACT_MARGIN, objects] = False
+    deviations = np.zeros(len(scene.objects))
+    if compared.sum() < MIN_FRAMES:
+        return 1.0, deviations
+    along = (moved * velocities).sum(axis=-1) / np.maximum(own, 1e-9) ** 2
+    factor = float(np.median(along[compared]))
+    # Velocities of objects that do not move, or the reverse, have no factor.
+    factor = factor if factor > 1e-3 else 1.0
+    rest = np.linalg.norm(moved - factor * velocities, axis=-1)
+    shares = rest / np.maximum(np.maximum(speed, factor * own), 1e-9)
+    for k, is_compared in enumerate(compared.T):
+        if is_compared.sum() >= MIN_FRAMES:
+            deviations[k] = np.median(shares[is_compared, k])
+    return factor, deviations
+
+
+def _find_rates(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return linear and angular velocities (F, N, 3) from the differences of positions and of
+    orientations: central ones, and one-sided ones in the first and the last frame."""
+    from scipy.spatial.transform import Rotation
+
+    frames = np.arange(scene.frames)
+    before, after = np.maximum(frames - 1, 0), np.minimum(frames + 1, scene.frames - 1)
+    seconds = np.maximum(after - before, 1)[:, None, None] / scene.fps
+    first, last = (
+        Rotation.from_quat(scene.quaternions[k].reshape(-1, 4).astype(float))
+        for k in (before, after)
+    )
+    moved = scene.positions[after].astype(float) - scene.positions[before]
+    turned = (last * first.inv()).as_rotvec().reshape(moved.shape)
+    return moved / seconds, turned / seconds

@@ -49,6 +49,8 @@ from teacher.predicates.relations import (
 STAYS, SHIFTS = 8.0, 60.0
 """Upper bounds of the displacement (px of the square image) of an object that "stays", and of one
 that "shifts slightly". An object that moves further "moves across"."""
+EVENT_MOMENTS = {"A2_motion": "when an object starts to move", "A3_landing": "at the landing"}
+"""The target of an event item in words, by subtype; of other subtypes, it is a collision."""
 BORDER = 6.0
 """Displacement (px of the square image) below which a change of region is ignored."""
 
@@ -90,10 +92,9 @@ def extract_predicates(
         scene_of: Returns a scene by its id; it is called for candidates from other scenes.
         bounds: Bounds of relations; without them, the result is not `RelationalPredicates`.
     """
-    moment = {"future": "at the collision", "contact": "just after the collision"}.get(
-        item.framing or "", "at the target moment"
+    facts = extract_facts(
+        scene, item.prefix_start, item.prefix_stop, item.target_frame, name_moment(item)
     )
-    facts = extract_facts(scene, item.prefix_start, item.prefix_stop, item.target_frame, moment)
     if facts is None:
         return None
     candidates = tuple(
@@ -115,6 +116,15 @@ def extract_predicates(
         observed=observed,
         views=views,
         bounds=bounds,
+    )
+
+
+def name_moment(item: SelectionItem) -> str:
+    """Return an item's target in words. The events of some subtypes are no collisions."""
+    if item.framing == "future" and item.subtype in EVENT_MOMENTS:
+        return EVENT_MOMENTS[item.subtype]
+    return {"future": "at the collision", "contact": "just after the collision"}.get(
+        item.framing or "", "at the target moment"
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from data.oracle.contacts import collisions_in, next_collision, touching_pairs
 from data.records import SPEED_BOUNDS, Scene
 from teacher.predicates.facts import SPEEDS, VERY_FAST, Meeting
-from teacher.predicates.places import CONTACT, compass_direction, mean_scale, square_displacement
+from teacher.predicates.places import compass_direction, contact_distance, square_displacement
 
 CUT_MARGIN = 12
 """Minimum number of frames from the cut to the next collision (paper, Rationale construction)."""
@@ -22,8 +22,9 @@ STATIONARY = 0.05
 IMMINENT, SOON = 15, 40
 """Maximum numbers of frames from the cut to a collision that is "imminent", and to a collision that
 comes "soon" (paper, Rationale construction)."""
-COURSE_MARGIN = 0.1
-"""Maximum gap (simulator units) between two objects on a collision course when they would pass."""
+COURSE_MARGIN = 0.25
+"""Maximum gap between two objects on a collision course when they would pass, in units of their
+contact distance: 0.1 simulator units for two objects of scale 1."""
 COURSE_HORIZON = 60
 """Number of frames over which straight paths are extrapolated."""
 
@@ -61,8 +62,8 @@ def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
         if speed * scene.fps < STATIONARY or np.dot(gap, closing) >= 0:
             continue
         time = min(-float(np.dot(gap, closing)) / speed**2, COURSE_HORIZON)
-        contact = CONTACT * mean_scale(scene, i, j)
-        if np.linalg.norm(gap + time * closing) < contact + COURSE_MARGIN:
+        nearest = np.linalg.norm(gap + time * closing)
+        if nearest < (1 + COURSE_MARGIN) * contact_distance(scene, i, j):
             pairs.append((i, j))
     return pairs
 

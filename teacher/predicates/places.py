@@ -11,17 +11,14 @@ from data.oracle.visibility import MIN_VISIBLE
 from data.records import Scene
 from teacher.predicates.facts import COMPASS, OUT_OF_VIEW, REGIONS, Closeness
 
-CONTACT = 0.4
-"""Ground-plane distance (simulator units) at which two objects of scale 1 touch; it grows with the
-mean scale of the objects."""
-VERY_CLOSE = 0.6
-"""Ground-plane distance (simulator units) below which two objects of scale 1 are very close; it
-grows with their mean scale."""
+VERY_CLOSE = 1.5
+"""Ground-plane distance below which two objects are very close, in units of their contact
+distance: 0.6 simulator units for two objects of scale 1."""
 
 
-def mean_scale(scene: Scene, i: int, j: int) -> float:
-    """Return the mean scale of two objects."""
-    return (scene.object_scales[i] + scene.object_scales[j]) / 2
+def contact_distance(scene: Scene, i: int, j: int) -> float:
+    """Return the ground-plane distance (simulator units) at which two objects touch."""
+    return scene.object_radii[i] + scene.object_radii[j]
 
 
 # Scenes have a few objects, and an item has four candidates. On so few numbers, Python's floats are
@@ -85,5 +82,5 @@ def close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
             region_at([(a + b) / 2 for a, b in zip(places[i], places[j], strict=True)]),
         )
         for i, j in combinations(seen, 2)
-        if dist(ground[i], ground[j]) < VERY_CLOSE * mean_scale(scene, i, j)
+        if dist(ground[i], ground[j]) < VERY_CLOSE * contact_distance(scene, i, j)
     )

@@ -27,9 +27,10 @@ from math import hypot, inf
 from typing import NamedTuple
 
 from conf.schema import RelationBounds
+from conf.schema.world import RADIUS
 from data.records import Scene
 from teacher.predicates.facts import Relation
-from teacher.predicates.places import CONTACT, object_sight
+from teacher.predicates.places import object_sight
 
 OPPOSITES = {
     "left of": "right of", "above": "below", "in front of": "behind",
@@ -113,8 +114,9 @@ def find_topic(statement: Relation, relations: Sequence[Relation]) -> Relation |
 
 class Places(NamedTuple):
     """The visible objects of a frame by name: their places in the image as shares of its width and
-    height, their places on the ground in widths of an object of scale 1, their scales and visible
-    fractions. Objects that look alike are left out, since words cannot tell them apart."""
+    height, their places on the ground in widths of an object of scale 1, their widths in the same
+    unit, and their visible fractions. Objects that look alike are left out, since words cannot tell
+    them apart."""
 
     image: dict[str, tuple[float, float]]
     ground: dict[str, tuple[float, float]]
@@ -125,7 +127,7 @@ class Places(NamedTuple):
     def from_frame(cls, scene: Scene, frame: int) -> Places:
         """Return the places of the visible objects of a frame."""
         image = (scene.image_positions[frame] / scene.image_size).tolist()
-        ground = (scene.positions[frame, :, :2] / CONTACT).tolist()
+        ground = (scene.positions[frame, :, :2] / (2 * RADIUS)).tolist()
         fraction = scene.visible_fraction[frame].tolist()
         names = [each.noun_phrase for each in scene.objects]
         seen = {
@@ -136,7 +138,7 @@ class Places(NamedTuple):
         return cls(
             {name: tuple(image[k]) for name, k in seen.items()},
             {name: tuple(ground[k]) for name, k in seen.items()},
-            {name: scene.object_scales[k] for name, k in seen.items()},
+            {name: scene.object_radii[k] / RADIUS for name, k in seen.items()},
             {name: fraction[k] for name, k in seen.items()},
         )
 

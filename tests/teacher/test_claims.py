@@ -25,6 +25,8 @@ from benchmarks.experiments.mutations import (
 )
 from conf.schema import RelationBounds, TeacherConfig
 from teacher.narrator import write_rationale
+from teacher.predicates.extraction import EVENT_MOMENTS
+from teacher.predicates.facts import REGIONS
 from teacher.predicates.relations import describe_distance
 from teacher.reading.phrases import PHRASES_BY_FIRST_WORD
 from teacher.sections import SECTIONS
@@ -56,6 +58,18 @@ def verdicts(section, sentence):
 def test_only_false_sentences_are_contradicted(truth, section, sentence):
     detected = contradicted(f"{SECTION[section]}: {sentence}", FACTS)
     assert bool(detected) == (truth == "false"), detected
+
+
+@pytest.mark.parametrize("moment", EVENT_MOMENTS.values())
+def test_the_moment_of_an_event_does_not_change_what_is_claimed(moment):
+    """Although "when" often begins a condition, and "starts" a clause about the past."""
+    for section, sentence in (("P", f"the {RED} will be {region}.") for region in REGIONS[0]):
+        collision, event = (
+            list(verdicts(section, f"{words}, {sentence}".capitalize()).values())
+            for words in ("at the collision", moment)
+        )
+        assert event == collision
+        assert event
 
 
 def test_claims_about_a_name_that_two_objects_share_are_unknown():

@@ -8,12 +8,16 @@ from itertools import combinations
 
 import numpy as np
 
+from conf.schema import RelationBounds
 from teacher.numbers.detection import find_numbers
 from teacher.predicates.extraction import extract_facts, extract_predicates
 from teacher.predicates.facts import COMPASS, REGIONS
 from teacher.predicates.motion import find_collision_courses, find_cut
-from teacher.predicates.places import compass_direction
+from teacher.predicates.places import close_pairs, compass_direction
+from teacher.predicates.relations import Places, find_relations
 from tests.teacher import synthetic
+
+BOUNDS = RelationBounds()
 
 
 def toward(start, pixel, frames):
@@ -47,6 +51,45 @@ def test_pair_on_a_collision_course_meets():
         assert facts.contacts == facts.courses
         assert facts.courses[0].when == when
         assert facts.close[0].objects == names
+
+
+def test_contact_distances_are_those_of_the_radii():
+    """A scene in other units of length, with its radii, has the same predicates; the standard radii
+    are those of a scene that records none. Two objects touch at the sum of their radii."""
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        scene = synthetic.random_scene(rng)
+        count = len(scene.objects)
+        larger = replace(
+            scene,
+            positions=3.5 * scene.positions,
+            velocities=3.5 * scene.velocities,
+            radii=(0.7,) * count,
+        )
+        standard = replace(scene, radii=(0.2,) * count)
+        assert extract_facts(standard, 0, 30, 60) == (facts := extract_facts(scene, 0, 30, 60))
+        other = extract_facts(larger, 0, 30, 60)
+        assert (facts and facts.close) == (other and other.close)
+        assert find_collision_courses(larger, 30) == find_collision_courses(scene, 30)
+        places, wide = (Places.from_frame(s, 60) for s in (scene, larger))
+        assert find_relations(wide, BOUNDS) == find_relations(places, BOUNDS)
+    pair = synthetic.scene([(0, 0), (0.8, 0)], [(0, 0), (0, 0)])
+    assert not close_pairs(pair, 0)
+    assert close_pairs(replace(pair, radii=(0.2, 0.4)), 0)
+
+
+def test_motion_onsets_and_landings_are_not_called_collisions():
+    scene = synthetic.scene([(0, 0), (1, 0)], [(0.5, 0), (0, 0.5)])
+    for framing, subtype, moment in (
+        ("future", "contact", "at the collision"),
+        ("future", "A1_contact", "at the collision"),
+        ("future", "A2_motion", "when an object starts to move"),
+        ("future", "A3_landing", "at the landing"),
+        ("contact", "contact_gap5", "just after the collision"),
+        (None, "in_1s", "at the target moment"),
+    ):
+        item = replace(synthetic.item((40, 50, 60, 70), framing=framing), subtype=subtype)
+        assert extract_predicates(item, scene, lambda _: scene).moment == moment
 
 
 def test_pair_that_has_just_met_is_not_on_a_course():

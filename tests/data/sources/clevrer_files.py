@@ -13,14 +13,18 @@ from tests.data.sources.pictures import picture
 
 
 def clevrer_annotation(index: int = 0, frames: int = 128) -> dict[str, Any]:
-    """An annotation: a cube rests at the origin, and a sphere rolls along y and out of view."""
+    """An annotation: a cube rests at the origin, and a sphere rolls along y and out of view.
+
+    As in the release, velocities are per second of the simulation, of which a frame lasts 0.028 s.
+    """
 
     def states(f: int) -> list[dict[str, Any]]:
         zero = [0.0, 0.0, 0.0]
-        still = {"location": zero, "orientation": [0.3, -0.5, 1.1]}
+        still = {"location": [0.0, 0.0, 0.0], "orientation": [0.3, -0.5, 1.1]}
         rolling = {"location": [0.5, 0.05 * f - 1, 0.2], "orientation": [-0.25 * f, 0.0, 0.0]}
         still |= {"velocity": zero, "angular_velocity": zero}
-        rolling |= {"velocity": [0.0, 1.25, 0.0], "angular_velocity": [-6.25, 0.0, 0.0]}
+        rates = {"velocity": [0.0, 0.05, 0.0], "angular_velocity": [-0.25, 0.0, 0.0]}
+        rolling |= {key: [x / 0.028 for x in rate] for key, rate in rates.items()}
         return [
             {"object_id": 0, "inside_camera_view": True, **still},
             {"object_id": 1, "inside_camera_view": f < 90, **rolling},

@@ -14,6 +14,7 @@ from tests.data.sources.pictures import picture, png
 MOVI_COLORS = ["blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow"]
 ARRAYS = (
     "positions", "quaternions", "velocities", "angular_velocities", "image_positions", "visibility",
+    "bboxes_3d",
 )  # fmt: skip
 
 
@@ -35,7 +36,7 @@ def movi_example(contacts: list[tuple[float, int, int, float, float]] | None = N
         ],
         "positions": np.stack([x, 0 * x, z], -1),
         "quaternions": np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], -1),
-        "velocities": np.stack([0 * x, 0 * x, np.stack([-9.81 * s] * 3)], -1),
+        "velocities": np.stack([np.sign(x), 0 * x, np.stack([-9.81 * s] * 3)], -1),
         "angular_velocities": np.stack([0 * x, 0 * x, 0 * x + 1], -1),
         "image_positions": np.stack([0.5 + x / 20, 0.9 - z / 10], -1),
         "visibility": np.stack([np.full(24, 90), np.full(24, 30), np.arange(24) * 0]),
@@ -49,7 +50,7 @@ def write_movi_folder(folder: Path, example: dict) -> Path:
         {
             "size": 1.4, "color": [0.5, 0.1, 0.1],
             "shape": shape, "size_label": size, "material": material, "color_label": color,
-            **{key: example[key][k].tolist() for key in ARRAYS},
+            **{key: example[key][k].tolist() for key in ARRAYS if key in example},
         }
         for k, (shape, size, material, color) in enumerate(example["appearances"])
     ]  # fmt: skip
@@ -83,7 +84,7 @@ def movi_features(example: dict) -> dict[str, Any]:
         "metadata/height": [256],
         "metadata/num_frames": [24],
         "metadata/num_instances": [len(example["appearances"])],
-        **{f"instances/{key}": example[key].ravel().tolist() for key in ARRAYS},
+        **{f"instances/{key}": example[key].ravel().tolist() for key in ARRAYS if key in example},
         "instances/shape_label": [["cube", "cylinder", "sphere"].index(s) for s in shapes],
         "instances/size_label": [["small", "large"].index(s) for s in sizes],
         "instances/material_label": [["metal", "rubber"].index(m) for m in materials],

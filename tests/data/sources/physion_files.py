@@ -17,6 +17,10 @@ COLORS = np.array([[200, 10, 30], [20, 220, 90], [1, 2, 3]], np.uint8)
 """Colours of the objects in the segmentation images."""
 
 
+BOUNDS = ("center", "left", "right", "front", "back")
+"""Points of the objects' bounds, which some versions of the release have."""
+
+
 def physion_trial(frames: int = 60) -> dict[str, Any]:
     """Three objects at rest on the floor; the y axis points up.
 
@@ -60,7 +64,10 @@ def write_physion(
         static["stimulus_name"] = trial["stimulus_name"]
         static["object_ids"] = np.array(IDS)
         static["model_names"] = trial["models"]
-        static["object_segmentation_colors"] = COLORS
+        static["object_segmentation_colors"] = trial.get("colors", COLORS)
+        for key in ("scale", "framerate"):
+            if key in trial:
+                static[key] = trial[key]
         groups = file.create_group("frames")
         for k in range(len(trial["positions"])):
             _write_frame(groups.create_group(f"{k + first:04d}"), trial, k, states, suffix)
@@ -78,8 +85,9 @@ def _write_frame(group: h5py.Group, trial: dict, k: int, states: bool, suffix: s
     objects = group.create_group("objects")
     for key in ("positions", "rotations"):
         objects[key + suffix] = trial[key][k]
-    for key in ("velocities", "angular_velocities"):
-        objects[key] = trial[key][k]
+    for key in ("velocities", "angular_velocities", *BOUNDS):
+        if trial.get(key) is not None:
+            objects[key] = trial[key][k]
     collisions = group.create_group("collisions")
     collisions["object_ids"] = np.array(trial["pairs"][k], np.int32).reshape(-1, 2)
     if states:

@@ -72,6 +72,16 @@ def test_an_invalid_record_stops_a_strict_build(movi, tmp_path) -> None:
     assert not (tmp_path / "movi").exists()
 
 
+def test_scaled_velocities_are_logged_once(tmp_path, caplog) -> None:
+    release = tmp_path / "release"
+    for k in range(4):
+        example = movi_example()
+        write_movi_folder(release / f"{k:05d}", example | {"velocities": 2 * example["velocities"]})
+    make_scenes(config(release), tmp_path / "store", Workers(2), True)
+    (line,) = [r.getMessage() for r in caplog.records if "velocities" in r.getMessage()]
+    assert "4 scenes of 4 were multiplied by 0.5," in line
+
+
 def test_a_mended_record_is_read_by_the_next_build(movi, tmp_path) -> None:
     """Also if the file that was mended is not the one whose size and time identify the record."""
     release = shutil.copytree(movi, tmp_path / "release" / "movi_a")

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from data.records import Collision
-from data.sim.shapes import rotation_matrix
+from data.sim.shapes import half_height, rotation_matrix
 from data.sources import clevrer
 from data.sources.validation import RecordError
 from tests.data.sources.clevrer_files import clevrer_annotation, write_clevrer_scene
@@ -33,6 +33,28 @@ def test_a_scene_has_the_values_of_its_annotation(tmp_path: Path) -> None:
     # in_view is read from the annotation instead of being computed from the camera.
     assert scene.in_view[:, 1].tolist() == [f < 90 for f in range(128)]
     assert (scene.visible_fraction[:, 0] == 1).sum() < 128
+
+
+def test_an_upright_cylinder_of_the_release_has_the_axis_z(tmp_path: Path) -> None:
+    """The release's cylinders have the axis y: [pi/2, 0, a] is upright, whatever the angle a."""
+    for k, (angles, axis) in enumerate(
+        {(np.pi / 2, 0, 0): (0, 0, 1), (np.pi / 2, 0, 0.8): (0, 0, 1), (0, 0, 0): (0, 1, 0)}.items()
+    ):
+        record = clevrer_annotation(k)
+        record["object_property"][0]["shape"] = "cylinder"
+        for moment in record["motion_trajectory"]:
+            moment["objects"][0]["orientation"] = list(map(float, angles))
+        path, _ = write_clevrer_scene(tmp_path, record, k)
+        turn = rotation_matrix(clevrer.read_scene(path, tmp_path, "test").quaternions[0, 0])
+        np.testing.assert_allclose(turn[:, 2], axis, atol=1e-6)
+
+
+def test_objects_have_the_sizes_of_the_release(tmp_path: Path) -> None:
+    path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
+    scene = clevrer.read_scene(path, tmp_path, "test")
+    assert scene.object_radii == (0.2, 0.2)
+    sizes = zip(scene.objects, scene.object_scales, strict=True)
+    assert [half_height(each.shape, scale) for each, scale in sizes] == pytest.approx([0.2, 0.2])
 
 
 def test_orientation_is_read_as_extrinsic_xyz_angles(tmp_path: Path) -> None:
@@ -63,6 +85,13 @@ DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
     ),
     "one frame too few": (lambda r: r["motion_trajectory"].pop(), "127"),
     "an unknown shape": (lambda r: r["object_property"][0].update(shape="cone"), "0.shape"),
+    "a collision of an object with itself": (
+        lambda r: r["collision"][0].update(object_ids=[1, 1]), "[1, 1]"
+    ),
+    "a video in another folder": (
+        lambda r: r.update(video_filename="../video_00000.mp4"), "video_filename"
+    ),
+    "a video without a name": (lambda r: r.update(video_filename=""), "video_filename"),
     "a collision with an unknown object": (
         lambda r: r["collision"][0].update(object_ids=[0, 5]), "[0, 5]"
     ),
@@ -112,3 +141,16 @@ def test_scenes_are_listed_in_order_and_duplicates_are_refused(tmp_path: Path) -
     write_clevrer_scene(tmp_path / "copy", clevrer_annotation(3), 3, 1)
     with raises_user_error("duplicate-scene", contains="clevrer-00003"):
         clevrer.list_scenes(tmp_path)
+
+
+def test_copies_of_a_scene_are_refused(tmp_path: Path) -> None:
+    path, _ = write_clevrer_scene(tmp_path, clevrer_annotation())
+    copy = path.with_name("annotation_00000 (1).json")
+    copy.write_bytes(path.read_bytes())
+    with raises_user_error("duplicate-scene", contains="clevrer-00000"):
+        clevrer.list_scenes(tmp_path)
+    for key, value in (("video_filename", "video_00000.mp4"), ("scene_index", 0)):
+        record = clevrer_annotation(5) | {key: value}
+        path, _ = write_clevrer_scene(tmp_path / key, record, 5)
+        with raises_user_error("duplicate-scene", contains=(str(path), key)):
+            clevrer.read_scene(path, tmp_path / key, "test")

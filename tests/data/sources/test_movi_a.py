@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from data.records import Collision, Landing, Scene
 from data.sim.shapes import rotation_matrix
@@ -57,6 +59,43 @@ def test_a_scene_has_the_published_values(read_format, tmp_path: Path) -> None:
     assert scene.image_positions[11, 1, 0] == pytest.approx(256 * (0.5 + 2 / 20))
     assert np.isnan(scene.visible_fraction).all()
     assert scene.in_view.all(axis=0).tolist() == [True, True, False]
+
+
+def write_example(read: Callable, folder: Path, example: dict) -> Scene:
+    """Write an example in the format that `read` reads, and read it."""
+    if read is from_folder:
+        write_movi_folder(folder / "00012", example)
+    else:
+        write_tfrecord(folder / SHARD, [movi_features(example)])
+    (path,) = movi_a.list_scenes(folder)
+    return movi_a.read_scene(path, folder, "test")
+
+
+def test_velocities_and_orientations_are_optional(read_format, tmp_path: Path) -> None:
+    """Velocities are derived from positions and orientations, without orientations they are 0."""
+    expected = read_format(tmp_path / "all", [])
+    example = movi_example()
+    for keys in (("velocities", "angular_velocities"), ("quaternions",)):
+        example = {key: value for key, value in example.items() if key not in keys}
+        scene = write_example(read_format, tmp_path / keys[0], example)
+        inside = slice(1, -1)  # where differences of a parabola are exact
+        np.testing.assert_allclose(scene.velocities[inside], expected.velocities[inside], atol=1e-3)
+        turns = expected.angular_velocities if "quaternions" in example else 0.0
+        np.testing.assert_allclose(
+            scene.angular_velocities, turns + np.zeros((24, 3, 3)), atol=1e-3
+        )
+    assert (scene.quaternions == [0, 0, 0, 1]).all()
+
+
+def test_radii_are_those_of_the_boxes_or_of_the_size_labels(read_format, tmp_path: Path) -> None:
+    assert read_format(tmp_path / "labels", []).object_radii == (0.7, 0.35, 0.35)
+    corners = np.array([*product((-0.5, 0.5), repeat=3)])
+    turned = Rotation.from_rotvec([0.4, -0.3, 0.8]).apply(corners)
+    example = movi_example()
+    boxes = np.array([1.4, 0.6, 1.0])[:, None, None, None] * turned
+    example["bboxes_3d"] = example["positions"][:, :, None] + boxes
+    scene = write_example(read_format, tmp_path / "boxes", example)
+    assert scene.object_radii == pytest.approx((0.7, 0.3, 0.5), abs=1e-5)
 
 
 def test_images_are_the_requested_frames_without_transparency(read_format, tmp_path: Path) -> None:
@@ -128,8 +167,8 @@ def test_scenes_of_both_formats_are_listed_in_order(tmp_path: Path) -> None:
 
 
 FOLDER_DEFECTS: dict[str, tuple[str, Callable[[dict], object], str]] = {
-    "no velocities": (
-        "metadata.json", lambda r: r["instances"][1].pop("velocities"), "instances.1.velocities"
+    "no positions": (
+        "metadata.json", lambda r: r["instances"][1].pop("positions"), "instances.1.positions"
     ),
     "fewer frames": ("metadata.json", lambda r: r["metadata"].update(num_frames=12), "num_frames"),
     "an array of 23 frames": (

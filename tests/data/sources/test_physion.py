@@ -14,15 +14,17 @@ from data.oracle.contacts import collision_frames, first_collisions
 from data.oracle.events import find_motion_onsets
 from data.records import Collision, Landing, Scene
 from data.sources import physion
-from tests.data.sources.physion_files import IDS, physion_trial, write_physion
+from tests.data.sources.physion_files import COLORS, IDS, physion_trial, write_physion
 from tests.user_errors import raises_user_error
 
 A, B, C = IDS
 
 
-def read(folder: Path, trial: dict, **version: object) -> Scene:
-    path = write_physion(folder / "Collide" / "box" / "0003.hdf5", trial, **version)
-    return physion.read_scene(path, folder, "test", fps=100)
+def read(
+    folder: Path, trial: dict, fps: float = 100, scenario: str = "Collide", **version: object
+) -> Scene:
+    path = write_physion(folder / scenario / "box" / "0003.hdf5", trial, **version)
+    return physion.read_scene(path, folder, "test", fps=fps)
 
 
 def test_a_scene_has_the_values_of_its_trial(tmp_path: Path) -> None:
@@ -41,7 +43,7 @@ def test_up_is_z_and_a_fall_is_down(tmp_path: Path) -> None:
     t = np.arange(60) / 30
     trial["positions"][:, 0] = np.stack([t, 9 - 9.81 / 2 * t**2, 2 + 0 * t], -1)
     trial["velocities"][:, 0] = np.stack([1 + 0 * t, -9.81 * t, 0 * t], -1)
-    scene = read(tmp_path, trial)
+    scene = read(tmp_path, trial, fps=30)
     np.testing.assert_allclose(scene.positions[:, 0, 2], 9 - 9.81 / 2 * t**2, rtol=1e-5)
     np.testing.assert_allclose(scene.positions[:, 0, 1], 2)
     moved = np.gradient(scene.positions[:, 0], 1 / 30, axis=0)[1:-1]
@@ -97,6 +99,76 @@ def test_camera_suffixes_and_first_frames_of_later_versions_are_read(tmp_path: P
         np.testing.assert_array_equal(getattr(late, name), getattr(early, name))
     images = physion.load_images(late, tmp_path / "late", [0])
     assert images[0].getpixel((1, 1)) == (60, 60, 60)
+
+
+def test_a_file_without_velocities_contacts_and_labels_is_read(tmp_path: Path) -> None:
+    """Early files lack them, and the objects of Flex trials have no finite velocities."""
+    trial = physion_trial()
+    trial["positions"][:, 1] += np.outer(np.arange(60), [0.02, 0, 0]).astype(np.float32)
+    trial["velocities"] = trial["angular_velocities"] = None
+    folder = tmp_path / "early" / "Drape" / "0.hdf5"
+    write_physion(folder, trial)
+    with h5py.File(folder, "r+") as file:
+        for frame in file["frames"].values():
+            del frame["collisions"], frame["env_collisions"]
+    early = physion.read_scene(folder, folder.parents[1], "test", fps=50)
+    trial["velocities"] = np.tile(np.float32([np.nan, 0, 0]), (60, 3, 1))
+    flex = read(tmp_path / "flex", trial, fps=50, scenario="Drape")
+    for scene in (early, flex):
+        np.testing.assert_allclose(scene.velocities[:, 1], np.tile([1, 0, 0], (60, 1)), atol=1e-4)
+        assert not scene.velocities[:, [0, 2]].any()
+        assert not scene.angular_velocities.any()
+        assert (scene.collisions, scene.landings) == ((), ())
+
+
+def test_the_ramp_of_a_roll_trial_has_its_own_name_and_scale(tmp_path: Path) -> None:
+    trial = physion_trial() | {"models": [b"cube", b"sphere", b"ramp_with_platform_30"]}
+    trial["scale"] = np.float32([[0.2, 0.2, 0.2], [0.3, 0.3, 0.3], [0.2, 1, 0.5]])
+    roll = read(tmp_path / "a", trial, scenario="Roll")
+    assert [o.shape for o in roll.objects] == ["cube", "ramp_with_platform_30", "sphere"]
+    assert roll.object_radii == pytest.approx((0.1, 0.175, 0.15))
+    other = read(tmp_path / "b", trial, scenario="Drop")
+    assert [o.shape for o in other.objects] == ["cube", "sphere", "ramp_with_platform_30"]
+
+
+def test_an_object_that_is_never_drawn_is_never_in_view(tmp_path: Path) -> None:
+    trial = physion_trial()
+    trial["colors"] = COLORS * np.uint8([[1], [1], [0]])
+    assert read(tmp_path, trial).in_view[:].all(axis=0).tolist() == [True, True, False]
+    assert not read(tmp_path, trial).in_view[:, 2].any()
+
+
+def test_a_recorded_frame_rate_takes_precedence(tmp_path: Path) -> None:
+    assert read(tmp_path, physion_trial() | {"framerate": 100}, fps=30).fps == 100
+
+
+def test_image_positions_are_those_of_the_centres_of_bounds(tmp_path: Path) -> None:
+    """Positions are those of the pivots, at the base. An object without bounds keeps its own."""
+    trial = physion_trial()
+    looking = np.diag([1.0, 1.0, -1.0, 1.0])
+    looking[2, 3] = -4
+    trial["camera"] = (looking, trial["camera"][1])
+    base = read(tmp_path / "base", trial)
+    trial["center"] = trial["positions"] + np.float32([0, 0.3, 0])
+    trial["center"][:, 2] = np.nan
+    centred = read(tmp_path / "centred", trial)
+    np.testing.assert_array_equal(centred.positions, base.positions)
+    moved = centred.image_positions - base.image_positions
+    assert (moved[:, :2, 1] < -1).all()
+    assert not moved[:, 2].any()
+
+
+def test_radii_are_those_of_bounds_scales_or_contacts(tmp_path: Path) -> None:
+    trial = physion_trial()
+    trial["pairs"][30], trial["states"][30] = [[A, B]], [b"enter"]
+    contact = float(np.hypot(1, 1)) / 2  # on the ground, A and B are 1 apart along both axes
+    assert read(tmp_path / "contacts", trial).object_radii == pytest.approx((contact,) * 3)
+    trial["scale"] = np.float32([[0.2, 9, 0.4], [0.5, 9, 0.5], [1, 9, 1]])
+    assert read(tmp_path / "scales", trial).object_radii == pytest.approx((0.15, 0.25, 0.5))
+    for key, axis, sign in (("left", 0, -1), ("right", 0, 1), ("front", 2, 1), ("back", 2, -1)):
+        trial[key] = trial["positions"].copy()
+        trial[key][:, :2, axis] += np.float32(sign * np.array([0.6, 0.7]))
+    assert read(tmp_path / "bounds", trial).object_radii == pytest.approx((0.6, 0.7, 0.5))
 
 
 # Subtype A1: two objects come into contact.
@@ -238,7 +310,19 @@ def replace_dataset(path: str, data: object) -> Callable[[h5py.File], None]:
 
 
 DEFECTS: dict[str, tuple[Callable[[h5py.File], None], str]] = {
-    "no velocities": (delete("frames/0007/objects/velocities"), "frames/0007/objects/velocities"),
+    "a frame without velocities": (
+        delete("frames/0007/objects/velocities"),
+        "frames/0007/objects/velocities",
+    ),
+    "a frame rate of zero": (
+        lambda file: file["static"].create_dataset("framerate", data=0),
+        "static/framerate",
+    ),
+    "a rotation without a direction": (
+        replace_dataset("frames/0007/objects/rotations", np.zeros((3, 4))),
+        "frame 7: the quaternion of object 0",
+    ),
+    "one model name": (replace_dataset("static/model_names", b"bowl"), "1 models"),
     "no image": (delete("frames/0007/images/_img"), "/frames/0007/images/_img"),
     "a missing frame": (delete("frames/0007"), "0007"),
     "no frames": (delete("frames"), "/frames"),
