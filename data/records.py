@@ -109,6 +109,8 @@ class Scene:
             1, or if they are not known.
         speed_bounds: upper bounds of the speeds that rationales call slow, steady and quick,
             simulator units per second; empty for the default bounds.
+        records_contacts: whether `collisions` has the contacts of the objects. Otherwise, nothing
+            is known of contacts, collision courses and gaps.
     """
 
     scene_id: str
@@ -129,6 +131,7 @@ class Scene:
     footage: str | None = None
     scales: tuple[float, ...] = ()
     speed_bounds: tuple[float, ...] = ()
+    records_contacts: bool = True
 
     ARRAYS = (
         "positions", "quaternions", "velocities", "angular_velocities", "image_positions",

@@ -60,9 +60,9 @@ def read_json(path: Path, layout: type[AnyLayout]) -> AnyLayout:
         ) from error
 
 
-def scene_id(suite: str, *parts: str) -> str:
+def scene_id(*parts: str) -> str:
     """Return a scene's id, in which characters that are unsafe in file names are replaced."""
-    return "-".join([suite, *(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)])
+    return "-".join(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)
 
 
 def check_unique_scenes(
