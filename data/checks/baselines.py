@@ -38,7 +38,7 @@ def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: St
     releases of simulators whose cameras the scenes do not record.
     """
     config = store.manifest["config"]
-    if config["simulator"] in ("movi_a", "physion"):
+    if config["simulator"] in ("movi_a", "physion", "tracks"):
         return np.nan
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
     seconds = (item.target_frame - item.prefix_stop) / scene.fps
