@@ -8,7 +8,7 @@ one file of names.
 The text file has one of two layouts of MOTChallenge; the number of its columns decides (see
 `data.sources.motchallenge`). Its frames are those that the video shows, in order and without regard
 to a rotation that the container asks for. tracks.yaml names each object by its video and its
-id, or the objects of a class together; words contain no digits:
+id, or the objects of a class together, in lower-case words without digits:
 
     classes: {1: pedestrian}
     videos:
@@ -54,7 +54,7 @@ height of the image in more than five seconds, more than two, and more than one.
 SPAN = 2
 """Number of frames before and after a frame from whose centres its velocity is computed. The noise
 of boxes would exceed slow speeds between neighbouring frames."""
-Word = Annotated[str, Field(pattern=r"^[^\W\d_]+([ -][^\W\d_]+)*$")]
+Word = Annotated[str, Field(pattern=r"^[a-z]+( [a-z]+)*$")]
 
 
 # The layout of tracks.yaml.

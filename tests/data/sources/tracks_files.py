@@ -27,13 +27,14 @@ def write_video(path: Path, frames: int, fps: int = 25) -> None:
         container.mux(stream.encode())
 
 
-def box_lines(frames: int) -> list[str]:
+def box_lines(frames: int, ahead: int = 0) -> list[str]:
     """Boxes of two objects in each frame, in the layout of MOTChallenge's ground truth: object 1
-    goes right and back by 0.5 px per frame, and object 2 down by 0.3 px per frame and up again."""
+    goes right and back by 0.5 px per frame, and object 2 down by 0.3 px per frame and up
+    again. They are `ahead` frames further."""
     lines = []
     for f in range(frames):
-        x = 4 + 0.5 * abs((f + 80) % 160 - 80)
-        y = 4 + 0.3 * abs((f + 150) % 300 - 150)
+        x = 4 + 0.5 * abs((f + ahead + 80) % 160 - 80)
+        y = 4 + 0.3 * abs((f + ahead + 150) % 300 - 150)
         lines += [f"{f + 1},1,{x:.2f},20,8,6,1,1,1", f"{f + 1},2,60,{y:.2f},12,10,1,3,0.75"]
     return lines
 
