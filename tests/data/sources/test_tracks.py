@@ -13,6 +13,7 @@ import yaml
 
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig, TeacherConfig
 from data.build import ensure_benchmark
+from data.checks.baselines import constant_velocity_error
 from data.frames.frame_cache import FrameReader
 from data.items.queries import BUILDERS
 from data.items.recipes import CELLS_WITHOUT_CONTACTS
@@ -369,3 +370,11 @@ def test_problems_are_record_errors(tmp_path: Path) -> None:
     write_tracked_video(tmp_path, "street", 40, 25, "1,1,2")
     with pytest.raises(RecordError):
         read(tmp_path)
+
+
+@pytest.mark.slow
+def test_objects_that_keep_their_velocity_are_extrapolated_to_their_place(store: Store) -> None:
+    """The baseline of constant velocity needs no camera in the image plane."""
+    items = [i for i in store.selection() if i.horizon == 8]
+    errors = [constant_velocity_error(i, i.candidates[i.answer], store) for i in items]
+    assert np.median(errors) < 1
