@@ -7,7 +7,7 @@ the same on all lines of a file:
     frame, id, bb_left, bb_top, bb_width, bb_height, conf, x, y, z
 
 Frames count from 1, and boxes are in px. A box with conf 0 is ignored; in the layout of results, -1
-states no confidence. x, y and z are not used.
+states no confidence. A visibility of -1 is unknown. x, y and z are not used.
 """
 
 from __future__ import annotations
@@ -90,6 +90,7 @@ def _parse(path: Path, modified: int) -> dict[int, Track]:
             name: _parse_number(name, cell, where)
             for name, cell in zip(LAYOUTS[columns], cells, strict=True)
         }
+        # In the layout of results, the last two are x and y.
         frame, key, left, top, width, height, confidence, category, visibility, *_ = row.values()
         if (other := first_lines.setdefault((key, frame), number)) != number:
             raise RecordError(
@@ -97,7 +98,8 @@ def _parse(path: Path, modified: int) -> dict[int, Track]:
             )
         is_result = columns == RESULTS_COLUMNS
         if confidence > 0 or (is_result and confidence == -1):
-            category, visibility = (-1, np.nan) if is_result else (category, visibility)
+            if is_result or visibility < 0:
+                visibility = np.nan
             centre = left + width / 2, top + height / 2
             rows.append((key, frame - 1, *centre, width, height, visibility, category, number))
     if not rows:

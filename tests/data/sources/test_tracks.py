@@ -59,6 +59,10 @@ def test_the_layout_of_results_has_no_visibility_and_may_lack_confidences(tmp_pa
     lines = [",".join([*line.split(",")[:6], "-1", "-1", "-1", "-1"]) for line in box_lines(40)]
     write_tracked_video(tmp_path, "street", 40, 25, *lines)
     scene = read(tmp_path)
+    assert np.isnan(scene.visible_fraction).all()
+    unknown = [line.rpartition(",")[0] + ",-1" for line in box_lines(40)]
+    write_tracked_video(tmp_path, "street", 40, 25, *unknown)
+    scene = read(tmp_path)
     assert scene.in_view.all()
     assert np.isnan(scene.visible_fraction).all()
 
