@@ -113,6 +113,8 @@ class Scene:
             radius times the scale.
         speed_bounds: upper bounds of the speeds that rationales call slow, steady and quick,
             simulator units per second; empty for the default bounds.
+        records_contacts: whether `collisions` has the contacts of the objects. Otherwise, nothing
+            is known of contacts, collision courses and gaps.
     """
 
     scene_id: str
@@ -134,6 +136,7 @@ class Scene:
     scales: tuple[float, ...] = ()
     radii: tuple[float, ...] = ()
     speed_bounds: tuple[float, ...] = ()
+    records_contacts: bool = True
 
     ARRAYS = (
         "positions", "quaternions", "velocities", "angular_velocities", "image_positions",

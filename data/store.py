@@ -80,8 +80,9 @@ def part_path(folder: Path, inputs: Any) -> Path:
 def save_scene(scene: Scene, path: Path) -> None:
     """Write a scene's oracle as arrays and a JSON header."""
     header = {f.name: getattr(scene, f.name) for f in fields(scene) if f.name not in Scene.ARRAYS}
-    for name in ("scales", "radii", "speed_bounds"):
-        if not header[name]:
+    defaults = {"scales": (), "radii": (), "speed_bounds": (), "records_contacts": True}
+    for name, default in defaults.items():
+        if header[name] == default:
             # Default values are left out: an added field does not change the bytes of scenes that
             # do not use it.
             del header[name]

@@ -65,9 +65,14 @@ def format_facts(predicates: Predicates) -> dict[str, Any]:
     Of relational predicates, they have the statements that decide the item, with their values now
     and in each candidate, and the other relations at the target between the same objects.
     """
-    if not isinstance(predicates, RelationalPredicates):
-        return asdict(predicates)
-    facts = asdict(predicates.without_relations())
+    is_relational = isinstance(predicates, RelationalPredicates)
+    facts = asdict(predicates.without_relations() if is_relational else predicates)
+    if not facts.pop("records_contacts"):
+        # Empty lists would say that there are none.
+        for unknown in ("courses", "contacts", "close"):
+            del facts[unknown]
+    if not is_relational:
+        return facts
     decision = choose_statements(predicates)
     named = {name for statement in decision.statements for name in statement.objects}
     facts["deciding"] = [

@@ -15,12 +15,11 @@ from conf.schema.settings import MISSING, Settings, setting
 from conf.schema.world import WorldConfig
 
 RENDERERS = ("bullet", "blender")
-SIMULATORS = ("bullet", "clevrer", "movi_a", "physion")
+SIMULATORS = ("bullet", "clevrer", "movi_a", "physion", "tracks")
 DISTRACTORS = ("paper", "balanced")
-RECIPES = ("dynapix", "movi_a", "physion")
+RECIPES = ("dynapix", "movi_a", "physion", "tracks")
 WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
-"""Window families of each group (see `data.items.recipes`). B needs a later
-collision."""
+"""Window families of each group (see `data.items.recipes`). B and G2 need a later collision."""
 WINDOW_HORIZONS = (8, 16, 24)
 """Number of frames from the last frame of a window item's prefix to its target."""
 WINDOW_DIFFICULTIES = ("easy", "hard")
@@ -112,12 +111,13 @@ class BenchmarkConfig(Settings):
     """World of simulated scenes."""
     recipe: str | None = setting(None, (*RECIPES, None))
     """How items are made: as the paper does it for CLEVRER (dynapix), for MoVi-A (movi_a) or for
-    Physion (physion). null takes the recipe of `simulator`; that of bullet is dynapix."""
+    Physion (physion), or without contacts (tracks). null takes the recipe of `simulator`; that of
+    bullet is dynapix."""
     distractors: str = setting("paper", DISTRACTORS)
     """Distractors of selection items: as in the paper (paper), or frames of other futures of the
     scene, chosen so that only a prediction of its motion reveals the target (balanced)."""
     folder: str | None = None
-    """Folder of the release, if `simulator` reads one."""
+    """Folder of the release or of the tracked videos, if `simulator` reads one."""
     fps: float = setting(30.0, above=0)
     """Frame rate (frames per second) of Physion's trials, most of which do not record it."""
     seed: int = setting(0, least=0)
@@ -125,7 +125,7 @@ class BenchmarkConfig(Settings):
     scenes: int = setting(10_000, least=4)
     """Number of scenes to simulate, or maximum number of scenes to read from a release."""
     test_share: float = setting(0.2, above=0, most=1)
-    """Share of the scenes in the test split."""
+    """Share of the scenes in the test split; of the videos, if `simulator` is tracks."""
     test_scenes: int | None = setting(None, least=1)
     """Number of scenes of the test split that the test items, the test queries and the frames of
     their database come from; the other test scenes are used by nothing. null takes all."""
@@ -190,7 +190,9 @@ class BenchmarkConfig(Settings):
                 "balanced distractors are frames of simulated futures; set "
                 f"{group}simulator=bullet and {group}recipe=dynapix, or {group}distractors=paper"
             )
-        if recipe != "dynapix":
+        if recipe == "tracks":
+            yield from self._find_contact_quotas(group)
+        elif recipe != "dynapix":
             if self.selection.observation:
                 yield (
                     f"{group}selection.observation with {group}recipe={recipe}: this recipe has "
@@ -222,6 +224,30 @@ class BenchmarkConfig(Settings):
                 "must be 3:2 and the size at least 48 x 32 px, such as 480 x 320"
             )
 
+    def _find_contact_quotas(self, group: str) -> Iterator[str]:
+        """Describe what the recipe tracks cannot make."""
+        if self.simulator != "tracks":
+            yield (
+                f"{group}recipe=tracks with {group}simulator={self.simulator}: this recipe is for "
+                f"tracked videos; set {group}simulator=tracks"
+            )
+        track, builders = self.selection, self.retrieval.builders
+        quotas = {
+            **{f"selection.event.{cell}": quota for cell, quota in track.event.items()},
+            **{
+                f"selection.window.{cell[:4]}": quota
+                for cell, quota in track.window.items()
+                if needs_contacts(cell) and quota.train + quota.test
+            },
+            "selection.matched": track.matched,
+            **{f"retrieval.builders.{b}": q for b, q in builders.items() if b in "3456"},
+        }
+        if refused := [name for name, quota in quotas.items() if quota.train + quota.test]:
+            yield (
+                f"{group}{', '.join(refused)} with {group}recipe=tracks: object tracks record no "
+                "contacts, to which these questions refer; set both quotas to 0"
+            )
+
     def _find_unmet_quotas(self, group: str) -> Iterator[str]:
         """Describe each test quota that `test_scenes` scenes cannot meet."""
         if self.test_scenes is None:
@@ -241,6 +267,12 @@ class BenchmarkConfig(Settings):
                     f"{group}test_scenes={self.test_scenes} cannot carry {group}{name}.test="
                     f"{quota}: a scene gives at most {most}; raise the former or lower the latter"
                 )
+
+
+def needs_contacts(window_cell: str) -> bool:
+    """Return whether the items of a window cell, such as G2_B_h8_easy, are about a collision."""
+    group, _, rest = window_cell.partition("_")
+    return group == "G2" or rest.startswith("B")
 
 
 def _unusual_look(world: WorldConfig) -> str | None:

@@ -47,7 +47,11 @@ def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: St
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
     seconds = (item.target_frame - item.prefix_stop) / scene.fps
     positions = scene.positions[item.prefix_stop] + seconds * scene.velocities[item.prefix_stop]
-    expected, _ = Camera.from_settings(config["world"]["camera"]).project(positions)
+    if config["simulator"] == "tracks":
+        # Positions are those of the image plane, in heights of the image with y up.
+        expected = (positions[:, :2] * [1, -1] + [0, 1]) * scene.image_size[1]
+    else:
+        expected, _ = Camera.from_settings(config["world"]["camera"]).project(positions)
     actual = dict(zip(other.object_keys, other.image_positions[candidate.frame], strict=True))
     scale = MODEL_SIZE / np.array(scene.image_size)
     distances = [

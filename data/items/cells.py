@@ -12,7 +12,7 @@ import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, replace
 from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
@@ -135,14 +135,19 @@ def _balanced_picker(
 
 def cell_recipe(cfg: BenchmarkConfig, family: str, subtype: str) -> Recipe:
     """Return the recipe of a cell of a benchmark's suite."""
+    observation = cfg.selection.observation
     if cfg.item_recipe == "dynapix":
-        return recipes.make_recipe(family, subtype, cfg.selection.observation)
+        return recipes.make_recipe(family, subtype, observation)
+    if cfg.item_recipe == "tracks":
+        recipe = recipes.make_recipe(family, subtype, observation, second=None)
+        return replace(recipe, suite=cfg.suite)
     return transfer.make_transfer_recipe(cfg.item_recipe, cfg.suite, family, subtype)
 
 
 def list_subtypes(cfg: BenchmarkConfig) -> Mapping[str, tuple[str, ...]]:
     """Return the subtypes of each family of a benchmark's suite."""
-    return recipes.CELLS if cfg.item_recipe == "dynapix" else transfer.CELLS[cfg.item_recipe]
+    own = {"dynapix": recipes.CELLS, "tracks": recipes.CELLS_WITHOUT_CONTACTS}
+    return (own | transfer.CELLS)[cfg.item_recipe]
 
 
 def _choose_balanced(

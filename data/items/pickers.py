@@ -71,6 +71,7 @@ class Recipe:
         subjects: Function that returns the indices of the objects whose positions count in frames
             of the item's scene. Without any, there is no item at this timing. In frames of other
             scenes, all objects count.
+        suite: Name of the suite of the items.
     """
 
     family: str
@@ -80,6 +81,7 @@ class Recipe:
         [Scene, Timing, tuple[int, ...], np.random.Generator, DistractorPicker], Sequence[Pool]
     ]
     subjects: Callable[[Scene, Timing], tuple[int, ...]] = visible_objects
+    suite: str = "dynapix"
 
 
 class Picker(Protocol):
@@ -155,7 +157,7 @@ def new_item(
     **fields: Any,
 ) -> SelectionItem:
     """Return an item whose first candidate is the target. `fields` replace those of the recipe."""
-    values = {"suite": "dynapix", **recipe.fields(timing), **fields}
+    values = {"suite": recipe.suite, **recipe.fields(timing), **fields}
     return SelectionItem(
         item_id=f"{recipe.family}-{values['subtype']}-{scene.scene_id}-{timing.target}",
         split=scene.split,

@@ -1,5 +1,7 @@
 """The recipes of the suite `dynapix`: one for each cell of the three families, and matched pairs.
 
+The suite `tracks` has those that need no contacts; its seconds are as long as the scenes' own.
+
 *event*: the target shows the scene at, or just after, a collision. Framing *future*: the prefix
 ends `gap` frames before the next collision, whose frame is the target. Framing *contact*: the
 prefix ends at the collision, and the target is `gap` frames later.
@@ -26,7 +28,12 @@ from typing import Any
 
 import numpy as np
 
-from conf.schema.benchmark import WINDOW_DIFFICULTIES, WINDOW_FAMILIES, WINDOW_HORIZONS
+from conf.schema.benchmark import (
+    WINDOW_DIFFICULTIES,
+    WINDOW_FAMILIES,
+    WINDOW_HORIZONS,
+    needs_contacts,
+)
 from data.items.pickers import DistractorPicker, Pool, Recipe, Timing, visible_objects
 from data.oracle.contacts import collision_frames, next_collision
 from data.oracle.displacement import object_match_scores, visible_positions
@@ -73,14 +80,24 @@ WINDOW_CELLS = {
 """Group, window family, horizon and difficulty by subtype."""
 CELLS = {"event": tuple(EVENT_CELLS), "time": tuple(TIME_CELLS), "window": tuple(WINDOW_CELLS)}
 """The subtypes of each family."""
+CELLS_WITHOUT_CONTACTS = {
+    "event": (),
+    "time": CELLS["time"],
+    "window": tuple(name for name in WINDOW_CELLS if not needs_contacts(name)),
+}
+"""The subtypes of each family of the suite `tracks`, whose scenes do not record contacts."""
 OBSERVATIONS = ("event", "window")
 """Families whose number of observed frames is a setting."""
 
 
-def make_recipe(family: str, subtype: str, observation: Mapping[str, int]) -> Recipe:
+def make_recipe(
+    family: str, subtype: str, observation: Mapping[str, int], second: int | None = SELECTION_SECOND
+) -> Recipe:
     """Return the recipe of a cell.
 
     Args:
+        second: Number of frames that time items count as a second; None for the frame rate of each
+            scene.
         observation: Numbers of observed frames by subtype or family, where they are not the
             defaults.
     """
@@ -88,9 +105,8 @@ def make_recipe(family: str, subtype: str, observation: Mapping[str, int]) -> Re
     if family == "event":
         return event_recipe(subtype, observed or EVENT_OBSERVED)
     if family == "time":
-        return Recipe(
-            "time", partial(time_timings, TIME_CELLS[subtype]), time_fields, frames_after_prefix
-        )
+        timings = partial(time_timings, TIME_CELLS[subtype], second)
+        return Recipe("time", timings, time_fields, frames_after_prefix)
     return window_recipe(subtype, observed or WINDOW_OBSERVED)
 
 
@@ -136,16 +152,18 @@ def is_next(scene: Scene, timing: Timing) -> bool:
     return collision is not None and collision.frame == timing.event
 
 
-def time_timings(seconds: int, scene: Scene) -> list[Timing]:
-    """Return the single timing of a scene, whose prefix is the first second. The target is the
-    first frame after the stated seconds."""
-    target = SELECTION_SECOND * (1 + seconds)
-    return [Timing(0, SELECTION_SECOND - 1, target)] if target < scene.frames else []
+def time_timings(seconds: int, second: int | None, scene: Scene) -> list[Timing]:
+    """Return the single timing of a scene, whose prefix is the first second (see `make_recipe`).
+    The target is the first frame after the stated seconds."""
+    second = second or round(scene.fps)
+    target = second * (1 + seconds)
+    return [Timing(0, second - 1, target)] if target < scene.frames else []
 
 
 def time_fields(timing: Timing) -> dict[str, Any]:
     horizon = timing.target - timing.stop
-    seconds = horizon // SELECTION_SECOND
+    # The prefix is a second.
+    seconds = horizon // timing.observed
     return {
         "subtype": f"in_{seconds}s",
         "question": TIME_QUESTION.format(spell_seconds(seconds)),
@@ -219,7 +237,7 @@ def window_subjects(window_family: str, scene: Scene, timing: Timing) -> tuple[i
     positions, visible = visible_positions(scene)
     moved = np.linalg.norm(positions[target] - positions[stop], axis=-1)
     moved[~(visible[target] & visible[stop])] = 0
-    return (int(moved.argmax()),) if moved.max() > 0 else ()
+    return (int(moved.argmax()),) if moved.max(initial=0) > 0 else ()
 
 
 def matched_timings(scene: Scene) -> list[Timing]:

@@ -66,6 +66,11 @@ ORIGINS: dict[str, dict[str, str]] = {
         "terms": "see the link",
         "link": "https://github.com/google-research/kubric/tree/main/challenges/movi",
     },
+    "tracks": {
+        "title": "videos with tracks that the builder of this benchmark owns",
+        "license": "unknown",
+        "terms": "ask the builder",
+    },
     "physion": {
         "title": "Physion",
         "license": "other",

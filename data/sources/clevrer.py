@@ -19,10 +19,9 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from PIL import Image
@@ -41,9 +40,7 @@ from data.sources.validation import (
     reconcile_velocities,
     scene_id,
 )
-
-if TYPE_CHECKING:
-    from av.container import InputContainer
+from data.sources.videos import describe_video, load_frames
 
 FOLDER_CONTENTS = (
     "annotation_train/annotation_00000-01000/annotation_00000.json and so on beside "
@@ -147,9 +144,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
 
     footage = Path(str(path.relative_to(folder)).replace("annotation", "video"))
     footage = footage.with_name(annotation.video_filename)
-    with _open_video(folder / footage) as video:
-        # Counting packets is faster than decoding the frames.
-        count = sum(packet.size > 0 for packet in video.demux(video=0))
+    count = len(describe_video(folder / footage).times)
     if count != FRAMES:
         raise RecordError(f"{folder / footage} has {count} frames, expected {FRAMES}")
     angles = array("orientation").astype(np.float64).reshape(-1, 3)
@@ -187,29 +182,4 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
 
 def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
     """Return frames of a scene's video as RGB images, by frame index."""
-    missing = set(frames)
-    images: dict[int, Image.Image] = {}
-    path = folder / str(scene.footage)
-    with _open_video(path) as video:
-        for index, frame in enumerate(video.decode(video=0)):
-            if index in missing:
-                images[index] = frame.to_image()
-                missing.remove(index)
-            if not missing:
-                return images
-    raise RecordError(f"{path} ends before frame {min(missing)}", "damaged-file")
-
-
-@contextmanager
-def _open_video(path: Path) -> Iterator[InputContainer]:
-    import av
-
-    if not path.is_file():
-        raise RecordError(f"{path}, the video of an annotation, is missing", "missing-file")
-    try:
-        with av.open(str(path)) as video:
-            if not video.streams.video:
-                raise RecordError(f"{path} contains no video")
-            yield video
-    except av.FFmpegError as error:
-        raise RecordError(f"{path} cannot be decoded: {error.strerror}", "damaged-file") from error
+    return load_frames(folder / str(scene.footage), frames)

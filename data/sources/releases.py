@@ -21,6 +21,7 @@ import json
 import logging
 import warnings
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from types import ModuleType
 
@@ -29,27 +30,33 @@ from conf.files import write_bytes
 from conf.schema import BenchmarkConfig
 from data.parallel import Workers
 from data.records import SPLITS
-from data.sources import clevrer, movi_a, physion
+from data.sources import clevrer, movi_a, physion, tracks
 from data.sources.validation import RecordError, RescaledVelocities
 from data.store import part_path, save_scene, scene_path
 
 log = logging.getLogger(__name__)
 
-READERS: dict[str, ModuleType] = {"clevrer": clevrer, "movi_a": movi_a, "physion": physion}
+READERS: dict[str, ModuleType] = {
+    "clevrer": clevrer, "movi_a": movi_a, "physion": physion, "tracks": tracks,
+}  # fmt: skip
 LOGGED_PROBLEMS = 5
 """Maximum number of invalid records that are logged one by one; the others are counted."""
 
 
-def list_release(cfg: BenchmarkConfig) -> list[Path]:
-    """Return the paths of a release's scenes, at most `cfg.scenes`. Raises UserError as the readers
-    do, and if the release's folder is not set."""
+def list_release(cfg: BenchmarkConfig) -> list[list[Path]]:
+    """Return the paths of a release's scenes, at most `cfg.scenes`, by video: all clips of a video
+    belong in one split. Raises UserError as the readers do, and if the release's folder is not
+    set."""
     if cfg.folder is None:
         raise UserError(
             f"benchmark.simulator={cfg.simulator} reads a release: set its folder with "
             "benchmark.folder=FOLDER",
             code="missing-setting",
         )
-    return READERS[cfg.simulator].list_scenes(Path(cfg.folder))[: cfg.scenes]
+    paths = READERS[cfg.simulator].list_scenes(Path(cfg.folder))[: cfg.scenes]
+    if cfg.simulator == "tracks":
+        return [list(clips) for _, clips in groupby(paths, key=lambda path: path.parent)]
+    return [[path] for path in paths]
 
 
 def read_release(

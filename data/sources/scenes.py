@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
@@ -47,7 +48,8 @@ def make_scenes(
             is invalid.
     """
     if cfg.simulator != "bullet":
-        splits = split_scenes(cfg, list_release(cfg))
+        videos = split_scenes(cfg, list_release(cfg))
+        splits = {split: [*chain.from_iterable(own)] for split, own in videos.items()}
         return read_release(cfg, splits, folder, workers, strict)
     names = [scene_prefix(cfg) + f"s{cfg.seed}-{k:06d}" for k in range(cfg.scenes)]
     scene_ids = split_scenes(cfg, names)
@@ -86,9 +88,10 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
             splits["test" if k in test else "train"].append(scene)
     for split in SPLITS if cfg.test_share < 1 else ("test",):
         if not splits[split]:
+            what = "video" if cfg.simulator == "tracks" else "scene"
             raise UserError(
-                f"benchmark.test_share={cfg.test_share} of {len(scenes)} scenes leaves no {split} "
-                f"scene: change it, or use more scenes (benchmark.scenes={cfg.scenes})",
+                f"benchmark.test_share={cfg.test_share} of {len(scenes)} {what}s leaves no {split} "
+                f"{what}: change it, or use more {what}s (benchmark.scenes={cfg.scenes})",
                 code="empty-split",
             )
     return splits

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import yaml
 from PIL import Image
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -58,7 +59,7 @@ class RescaledVelocities(UserWarning):
 
 
 class Layout(BaseModel):
-    """The keys of a JSON object that a reader uses; other keys are ignored."""
+    """The keys of a JSON or YAML object that a reader uses; other keys are ignored."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
@@ -80,15 +81,31 @@ def read_json(path: Path, layout: type[AnyLayout]) -> AnyLayout:
         first = error.errors(include_url=False)[0]
         if first["type"] == "json_invalid":
             raise RecordError(f"{path} is not JSON: {first['msg']}", "damaged-file") from error
-        where = ".".join(map(str, first["loc"])) or "the file"
-        raise RecordError(
-            f"{path} does not have the published layout: {where}: {first['msg']}"
-        ) from error
+        raise _other_layout(path, error) from error
 
 
-def scene_id(suite: str, *parts: str) -> str:
+def read_yaml(path: Path, layout: type[AnyLayout]) -> AnyLayout:
+    """Return the content of a YAML file. Raises RecordError as `read_json` does."""
+    try:
+        return layout.model_validate(yaml.safe_load(path.read_bytes()))
+    except FileNotFoundError as error:
+        raise RecordError(f"{path} is missing", "missing-file") from error
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise RecordError(f"{path} is not YAML: {reason}", "damaged-file") from error
+    except ValidationError as error:
+        raise _other_layout(path, error) from error
+
+
+def _other_layout(path: Path, error: ValidationError) -> RecordError:
+    first = error.errors(include_url=False)[0]
+    where = ".".join(map(str, first["loc"])) or "the file"
+    return RecordError(f"{path} does not have the published layout: {where}: {first['msg']}")
+
+
+def scene_id(*parts: str) -> str:
     """Return a scene's id, in which characters that are unsafe in file names are replaced."""
-    return "-".join([suite, *(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)])
+    return "-".join(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)
 
 
 def check_unique_scenes(

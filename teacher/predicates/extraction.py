@@ -77,6 +77,7 @@ def extract_facts(
         courses=tuple(describe_meeting(scene, p, cut) for p in find_collision_courses(scene, cut)),
         contacts=tuple(describe_meeting(scene, pair, cut) for pair in dict.fromkeys(contacts)),
         close=close_pairs(scene, target),
+        records_contacts=scene.records_contacts,
     )
 
 

@@ -7,7 +7,7 @@ shortly (see `teacher.predicates.motion.find_cut`). No fact contains a number.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -116,7 +116,8 @@ class Facts:
 
     `entering` and `leaving` are the objects that come into view and go out of view from the cut to
     the target. `courses` are pairs on a collision course at the cut. `contacts` are all pairs that
-    collide from the cut to the target. `close` are pairs that are very close at the target.
+    collide from the cut to the target. `close` are pairs that are very close at the target. These
+    three are unknown, and empty, if `records_contacts` is false.
     """
 
     instant: str
@@ -127,6 +128,7 @@ class Facts:
     courses: tuple[Meeting, ...]
     contacts: tuple[Meeting, ...]
     close: tuple[Closeness, ...]
+    records_contacts: bool = field(default=True, kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,11 @@ def find_collision_courses(scene: Scene, cut: int) -> list[tuple[int, int]]:
 
     The velocity is the mean over an object's last COURSE_FRAMES frames up to the cut, or over those
     since its last collision. Left out are pairs that touch within these frames, pairs with an
-    object that is hit at the cut, and pairs that hardly move relative to each other.
+    object that is hit at the cut, and pairs that hardly move relative to each other. No pairs are
+    found in a scene that does not record contacts.
     """
+    if not scene.records_contacts:
+        return []
     ground = scene.positions[:, :, :2]
     count = len(scene.objects)
     starts = [motion_start(scene, i, cut) for i in range(count)]

@@ -72,7 +72,10 @@ def object_sight(scene: Scene, frame: int, index: int) -> str:
 
 
 def close_pairs(scene: Scene, target: int) -> tuple[Closeness, ...]:
-    """Return the pairs of objects in view that are very close at a frame."""
+    """Return the pairs of objects in view that are very close at a frame; none in a scene that does
+    not record contacts."""
+    if not scene.records_contacts:
+        return ()
     ground = scene.positions[target, :, :2].tolist()
     places = (scene.image_positions[target] / scene.image_size).tolist()
     seen = [i for i in range(len(scene.objects)) if scene.in_view[target, i]]

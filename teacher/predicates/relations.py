@@ -16,7 +16,8 @@ A relation has a kind, objects and a value:
 | edge | a | reaches the left edge, and right, top and bottom |
 
 The last three describe the change from an earlier frame. Sides and heights are those of the centres
-in the image; gaps are measured on the ground.
+in the image; gaps are measured on the ground. A scene that does not record contacts has no gaps,
+and which object is nearer is measured in its image plane.
 """
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ class Places(NamedTuple):
     """The visible objects of a frame by name: their places in the image as shares of its width and
     height, their places on the ground in widths of an object of scale 1, their widths in the same
     unit, and their visible fractions. Objects that look alike are left out, since words cannot tell
-    them apart."""
+    them apart. Where contacts are not recorded, there are no widths: the gaps are unknown."""
 
     image: dict[str, tuple[float, float]]
     ground: dict[str, tuple[float, float]]
@@ -138,7 +139,11 @@ class Places(NamedTuple):
         return cls(
             {name: tuple(image[k]) for name, k in seen.items()},
             {name: tuple(ground[k]) for name, k in seen.items()},
-            {name: scene.object_radii[k] / RADIUS for name, k in seen.items()},
+            {
+                name: scene.object_radii[k] / RADIUS
+                for name, k in seen.items()
+                if scene.records_contacts
+            },
             {name: fraction[k] for name, k in seen.items()},
         )
 
@@ -155,13 +160,11 @@ def find_relations(places: Places, bounds: RelationBounds) -> set[Relation]:
         (gx, gy), (hx, hy) = places.ground[a], places.ground[b]
         apart = ((gx - hx) ** 2 + (gy - hy) ** 2) ** 0.5
         distance[a, b] = distance[b, a] = apart
-        gap = 2 * apart / (places.scale[a] + places.scale[b]) - 1
-        closeness = "against" if gap < bounds.against else "near"
-        found |= {
-            Relation("side", (a, b), side),
-            Relation("height", (a, b), height),
-            Relation("gap", (a, b), closeness if gap < bounds.near else "apart from"),
-        }
+        found |= {Relation("side", (a, b), side), Relation("height", (a, b), height)}
+        if places.scale:
+            gap = 2 * apart / (places.scale[a] + places.scale[b]) - 1
+            closeness = "against" if gap < bounds.against else "near"
+            found.add(Relation("gap", (a, b), closeness if gap < bounds.near else "apart from"))
         if (covering := find_covering(places, a, b, bounds)) is not None:
             value = "in front of" if covering == a else "behind"
             found.add(Relation("cover", (a, b), value))

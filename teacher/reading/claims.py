@@ -76,6 +76,7 @@ class IndexedPredicates:
         self.courses = {frozenset(m.objects): m.when for m in predicates.courses}
         self.contacts = {frozenset(m.objects): m.when for m in predicates.contacts}
         self.close = {frozenset(c.objects): c.region for c in predicates.close}
+        self.records_contacts = predicates.records_contacts
         self.candidates = {c.letter: c for c in predicates.candidates}
         self.differences: dict[str, dict[str, Difference]] = {
             c.letter: {d.object: d for d in c.differences} for c in predicates.candidates
@@ -115,6 +116,8 @@ class IndexedPredicates:
 
     def truth(self, claim: Claim) -> bool | None:
         """Return whether a claim without its negation holds; None if predicates do not tell."""
+        if not self.records_contacts and (claim.kind in PAIR_CHECKS or claim.kind == "gap"):
+            return None
         if claim.kind in VALUES:
             return self._truth_of_relation(claim)
         if claim.candidate is not None:

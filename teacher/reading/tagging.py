@@ -8,7 +8,7 @@ these prepositions), "relation" ("left of the red cube"), "candidate" (a letter)
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from data.records import COLORS, LETTERS, MATERIALS, SHAPES
@@ -91,6 +91,11 @@ NOUN_STARTS = ARTICLES | QUALITIES | LOOKS
 ADJECTIVES = LOOKS | QUALITIES - {"still", "only", "same"}
 
 
+class Name(str):
+    """Words of a text that end the name of an object whose noun is none of `SHAPES`, such as "van"
+    and "red van"."""
+
+
 class Noun(NamedTuple):
     """The attributes that a noun phrase states ("" if it does not state one). `still` is true for
     "the stationary red cube", `is_other` for "another cube"."""
@@ -109,7 +114,8 @@ class Noun(NamedTuple):
 
     def fits(self, name: str) -> bool:
         """Return whether an object's name, such as "red metal cube", has all stated attributes."""
-        return {self.color, self.material, self.shape} - {""} <= set(name.split())
+        stated = f"{self.color} {self.material} {self.shape}"
+        return {*stated.split()} <= {*name.split()}
 
 
 class RelationPhrase(NamedTuple):
@@ -174,9 +180,15 @@ class Sentence:
         return index
 
 
-def find_tags(text: str, start: int, stop: int) -> list[Tag]:
-    """Return the tags of text[start:stop] in order. Articles and `LABELS` are left out."""
+def find_tags(text: str, start: int, stop: int, names: Iterable[str] = ()) -> list[Tag]:
+    """Return the tags of text[start:stop] in order. Articles and `LABELS` are left out.
+
+    Args:
+        names: Names of objects. Those with a noun of `SHAPES` are known without.
+    """
     words, raw, spans = _split_words(text, start, stop)
+    if other := [name for name in names if name.split()[-1] not in SHAPES]:
+        _join_names(words, raw, spans, other)
     found: list[Tag] = []
     i = 0
     while i < len(spans):
@@ -209,6 +221,22 @@ def _split_words(
     return [*words, ""], raw, spans
 
 
+def _join_names(
+    words: list[str], raw: list[str], spans: list[tuple[int, int]], names: Iterable[str]
+) -> None:
+    """Replace the words of each name, or of its end, by a `Name`; the longest one counts."""
+    ends = {
+        tuple(parts[k:]) for name in names if (parts := name.split()) for k in range(len(parts))
+    }
+    longest = sorted(ends, key=len, reverse=True)
+    for i in range(len(spans)):
+        size = next((len(end) for end in longest if tuple(words[i : i + len(end)]) == end), 0)
+        if size:
+            words[i : i + size] = [Name(" ".join(words[i : i + size]))]
+            raw[i : i + size] = raw[i : i + 1]
+            spans[i : i + size] = [(spans[i][0], spans[i + size - 1][1])]
+
+
 Found = tuple[str, str | Noun | RelationPhrase, int]
 """The name and value of a tag, and the index of the word after it."""
 
@@ -220,7 +248,7 @@ def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
         return PUNCTUATION[word], word, i + 1
     if raw[i] in CANDIDATES and not _is_article(words, raw[i], i):
         return "candidate", raw[i], i + 1
-    if word in NOUN_STARTS and (found := _find_noun(words, i)):
+    if (word in NOUN_STARTS or isinstance(word, Name)) and (found := _find_noun(words, i)):
         return found
     if word in REGION_STARTS and (found := _find_region(words, i)):
         return found
@@ -241,7 +269,8 @@ def _tag_at(words: list[str], raw: list[str], i: int) -> Found:
 def _is_article(words: list[str], letter: str, i: int) -> bool:
     """Return whether an "A" is an article. In doubt it is a candidate's letter: if a letter were
     taken for an article, the claims after it would be assigned to another candidate."""
-    described = words[i + 1] in ADJECTIVES or words[i + 1] in AFTER_ARTICLE
+    after = words[i + 1]
+    described = after in ADJECTIVES or after in AFTER_ARTICLE or isinstance(after, Name)
     return letter == "A" and described and not (i > 0 and words[i - 1] in LABELS)
 
 
@@ -259,6 +288,8 @@ def _find_noun(words: list[str], i: int) -> Found | None:
     material = MATERIAL_WORDS.get(words[i], "")
     i += bool(material)
     shape = SINGULARS.get(words[i], PLURALS.get(words[i]))
+    if isinstance(words[i], Name):
+        shape = words[i]
     if shape is None or not (color or material or shape):
         return None
     return "object", Noun(color, material, shape, words[i] in PLURALS, still, is_other), i + 1
@@ -267,7 +298,8 @@ def _find_noun(words: list[str], i: int) -> Found | None:
 def _find_relation(words: list[str], begin: int, i: int, value: str) -> Found | None:
     """Return the relation at word `begin` whose objects begin at word i, if they are there."""
     kind = KINDS[value]
-    if words[begin] in AMBIGUOUS and words[begin - 1] not in PLACED | LOOKS:
+    is_placed = words[begin - 1] in PLACED | LOOKS or isinstance(words[begin - 1], Name)
+    if words[begin] in AMBIGUOUS and not is_placed:
         # "A contact between the red cube and the blue sphere" is not a relation.
         return None
     nouns: list[Noun | None] = []

@@ -29,6 +29,7 @@ MAX_SENTENCE_TAGS = 250
 def extract_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
     """Return the claims of a rationale in text order, each with its verdict; never raises."""
     indexed = IndexedPredicates(predicates)
+    names = [*indexed.objects, *indexed.extras]
     claims: list[Claim] = []
     for name, start, stop in split_sections(text):
         if name == "Answer":
@@ -36,7 +37,7 @@ def extract_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
             continue
         scene = SceneReader(indexed, MOMENTS.get(name, EITHER))
         candidates = CandidateReader(indexed, keeps_topic=name == "Candidate analysis")
-        for tags in _split_sentences(find_tags(text, start, stop)):
+        for tags in _split_sentences(find_tags(text, start, stop, names)):
             names_candidate = any(tag.name == "candidate" for tag in tags)
             if name == "Candidate analysis" or (name == "Outcome" and names_candidate):
                 claims += candidates.read(Sentence(text, tags))

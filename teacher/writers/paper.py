@@ -133,7 +133,9 @@ class Writer:
         parts[0] = f"{self.facts.instant}, {parts[0]}"
         courses = self.facts.courses[: self.detail.pairs]
         parts += [f"{name_pair(course.objects)} are on a collision course" for course in courses]
-        return parts if courses else [*parts, self.say("no_course")]
+        if courses or not self.facts.records_contacts:
+            return parts
+        return [*parts, self.say("no_course")]
 
     def order(self, objects: list[ObjectFacts]) -> list[ObjectFacts]:
         """Return objects in the order in which a section mentions them."""
@@ -161,7 +163,7 @@ class Writer:
             parts.append(self.say("all_stay"))
         elif any(o.extent == "stays" for o in ranked) and len(movers) <= self.detail.analysed:
             parts.append(self.say("others_stay"))
-        if self.padded:
+        if self.padded and facts.records_contacts:
             parts.append("an object keeps its heading until contact turns it or it comes to rest")
         return parts
 

@@ -183,7 +183,8 @@ def test_the_card_describes_the_export(micro_store, exported) -> None:
 
 
 @pytest.mark.parametrize(
-    ("simulator", "licence"), [("clevrer", "cc0-1.0"), ("movi_a", "other"), ("physion", "other")]
+    ("simulator", "licence"),
+    [("clevrer", "cc0-1.0"), ("movi_a", "other"), ("physion", "other"), ("tracks", "unknown")],
 )
 def test_the_card_of_a_release_states_its_licence_and_no_local_path(
     micro_store, simulator, licence
