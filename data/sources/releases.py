@@ -73,10 +73,7 @@ def read_release(
     jobs, split_of = {}, {}
     for split, paths in splits.items():
         for path in paths:
-            file = path if path.exists() else path.parent
-            # Size and time of the file, so that a record that has changed is read again.
-            inputs = [str(path), split, file.stat().st_size, file.stat().st_mtime_ns]
-            part = part_path(folder, inputs)
+            part = part_path(folder, [str(path), split, *_stamps(path, Path(cfg.folder))])
             if _problem_of(part):
                 # The problem may have been fixed since, such as a missing video beside the record.
                 part.unlink()
@@ -112,6 +109,14 @@ def read_release(
         more = len(problems) - LOGGED_PROBLEMS
         log.warning("left out: %d more invalid records of %d", more, len(split_of))
     return scene_ids, {"bad records left out": len(problems)}
+
+
+def _stamps(path: Path, folder: Path) -> list[tuple[int, int]]:
+    """Return the sizes and the times of the files of a record, so that it is read again when one
+    has changed: its own file, those beside it with the same stem, and those with names."""
+    file = path if path.exists() else path.parent
+    files = sorted({file, *file.parent.glob(f"{file.stem}.*"), *folder.glob("*.yaml")})
+    return [(each.stat().st_size, each.stat().st_mtime_ns) for each in files]
 
 
 def _problem_of(part: Path) -> str | None:

@@ -3,6 +3,7 @@ with the place of the fault."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -251,6 +252,22 @@ def test_a_bad_video_is_left_out_and_the_others_are_read(videos: Path, tmp_path:
     assert len(scenes["train"] + scenes["test"]) == 8
     with raises_user_error("invalid-record", contains="road1.txt"):
         make_scenes(config(tmp_path), tmp_path / "store", Workers(1), True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("changed", ["road1.txt", "tracks.yaml"])
+def test_files_that_changed_after_a_kill_are_read_again(
+    videos: Path, tmp_path: Path, changed: str
+) -> None:
+    folder = shutil.copytree(videos, tmp_path / "videos")
+    make_scenes(config(folder), tmp_path / "store", Workers(1), False)
+    path = folder / changed
+    path.write_text(path.read_text().replace(",20,8,6,", ",30,8,6,").replace("red", "blue"))
+    for name in ("store", "fresh"):
+        make_scenes(config(folder), tmp_path / name, Workers(1), False)
+    resumed, fresh = ({p.name: p.read_bytes() for p in (tmp_path / name).glob("scenes/*.npz")}
+                      for name in ("store", "fresh"))  # fmt: skip
+    assert resumed == fresh
 
 
 @pytest.mark.slow
