@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from conf.schema import TeacherConfig
     from data.store import Store
 
-VERSIONS = {"paper": "1", "relational": "7"}
+VERSIONS = {"paper": "2", "relational": "8"}
 """Version of each vocabulary. It changes whenever the same item gives other predicates or other
 deciding statements."""
 

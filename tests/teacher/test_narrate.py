@@ -309,7 +309,8 @@ def test_rationales_of_another_vocabulary_are_named_and_not_used(tmp_path, caplo
     kept = path.read_bytes()
     with caplog.at_level("INFO"):
         second = narrate_store(store, relational)
-    assert "3 responses of the vocabulary paper 1; they are not used" in caplog.text
+    paper = name_vocabulary(TEMPLATE)
+    assert f"3 responses of the vocabulary {paper}; they are not used" in caplog.text
     assert path.read_bytes().startswith(kept)
     assert {r.predicates for r in second.rationales} == {name_vocabulary(relational)}
     assert narrate_store(store, TEMPLATE).rationales == first.rationales

@@ -10,6 +10,7 @@ from conf.schema import TeacherConfig
 from data.records import Rationale
 from teacher.narrate import narrate_store
 from teacher.report import format_figures, summarize, write_report
+from teacher.vocabulary import name_vocabulary
 from tests.teacher import synthetic
 
 ITEMS = [synthetic.item((60, 80, 100, 120), item_id=f"item-{k}") for k in range(5)]
@@ -124,7 +125,7 @@ def test_page_shows_random_rationales_beside_their_frames(micro_store, tmp_path)
 
     page = write(narration.rationales, 0)
     written = (tmp_path / "report.txt").read_text()
-    assert written == f"predicates: paper 1\n\n{format_figures(figures)}\n"
+    assert written == f"predicates: {name_vocabulary(cfg)}\n\n{format_figures(figures)}\n"
     assert json.loads((tmp_path / "report.json").read_text())["accepted"] == len(
         narration.rationales
     )
