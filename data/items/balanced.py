@@ -44,7 +44,8 @@ NEAREST = {"same_obj_match": True, "same_near": True, "cross_scene": False, "sam
 """Whether the distractors of a balanced item are the nearest to the target or the farthest, by the
 distractors that the cell has in the paper's recipe."""
 TRIES = 3
-"""Number of timings of a scene for which futures are simulated in one cell."""
+"""Number of times that futures of a scene are simulated in one cell: for different timings or, in
+the time family, for different wrong moments of its only timing."""
 TARGET = 1
 """Index of the target among the frames from which candidates are chosen."""
 LARGEST_SHARE = 0.9
@@ -77,15 +78,30 @@ class BalancedPicker:
     def make_item(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
     ) -> SelectionItem | None:
-        family, cell = recipe.family, recipe.fields(timing)
-        groups = self._groups(scene, timing, about, family)
+        groups = self._groups(scene, timing, about, recipe.family)
         if not groups:
             return None
+        for _ in range(TRIES if recipe.family == "time" else 1):
+            if item := self._try_item(recipe, scene, timing, about, groups):
+                return item
+        self.dropped += 1
+        return None
+
+    def _try_item(
+        self,
+        recipe: Recipe,
+        scene: Scene,
+        timing: Timing,
+        about: tuple[int, ...],
+        groups: Sequence[Group],
+    ) -> SelectionItem | None:
+        """Make an item from new futures, or return None if no choice of them is suitable."""
+        family, cell = recipe.family, recipe.fields(timing)
         moments = [timing.target]
         if family == "time":
             moments += self._wrong_moment(scene, timing, about)
             if len(moments) == 1:
-                return self._drop()
+                return None
         futures = self._simulate(scene, timing.stop, max(moments), groups, FUTURES[family])
         name = f"{scene.scene_id}{ALTERNATIVE}{cell['subtype']}-{timing.stop}"
         frames, frame_moments = self._candidate_frames(scene, name, timing.stop, moments, futures)
@@ -94,12 +110,12 @@ class BalancedPicker:
         choices = _distinct(choices, displacement, self.min_displacement)
         choices = _of_difficulty(choices, displacement, NEAREST.get(cell["distractors"]))
         if not len(choices):
-            return self._drop()
+            return None
         states = [(frames, k) for k in range(frames.frames)]
         compared = CandidateFrames.compare(states, frame_moments, self._render(frames))
         best = self.balance.choose(compared.scores(choices))
         if best is None:
-            return self._drop()
+            return None
         candidates = []
         for frame in choices[best].tolist():
             moment = frame_moments[frame]
@@ -156,9 +172,6 @@ class BalancedPicker:
         if family != "time":
             return joint_groups(scene, timing.stop, timing.target, moving)
         return [(k,) for k in moving]
-
-    def _drop(self) -> None:
-        self.dropped += 1
 
     def _wrong_moment(self, scene: Scene, timing: Timing, about: tuple[int, ...]) -> list[int]:
         """Sample a moment after the prefix that differs visibly from the target, on the side of the
