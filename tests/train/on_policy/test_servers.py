@@ -152,7 +152,8 @@ def test_vllm_samples_from_the_current_adapters(
         randomize_adapters(model, 0.6)
         texts = sampler.sample(model, prompts, range(6))
         assert all(text.truncated and len(text.ids) == 12 for text in texts)
-        assert distance_from_greedy(model, processor, prompts, texts) < 0.05
+        # The server rounds otherwise; other adapters differ by more than 0.5.
+        assert distance_from_greedy(model, processor, prompts, texts) < 0.1
         found.append(texts)
     assert distance_from_greedy(model, processor, prompts, found[0]) > 0.5
     assert len(list((tmp_path / "sampled_adapters").iterdir())) == 1
