@@ -34,10 +34,10 @@ def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
     write_text(run.folder / "report.txt", text + "\n")
     write_text(run.folder / "report.json", json.dumps(statistics, indent=1))
     return {
-        f"{baseline}_{category}": accuracy
-        for category, row in statistics["baselines"].items()
-        for baseline, accuracy in row.items()
-        if baseline != "items" and accuracy is not None
+        f"{strategy}_{category}": accuracy
+        for category, row in statistics["shortcuts"].items()
+        for strategy, accuracy in row.items()
+        if strategy != "items" and accuracy is not None
     }
 
 

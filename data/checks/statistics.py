@@ -9,14 +9,13 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from data.checks import shortcuts
-from data.checks.baselines import BASELINES, score_baselines, score_scene_alone
-from data.items.scores import item_scores
-from data.oracle.displacement import cross_scene_displacement
-from data.records import FAMILIES, LETTERS, SPLITS, SelectionItem
+from data.checks.baselines import score_velocity
+from data.checks.shortcuts import SIMPLE, score_logistic_model, score_simple_strategies
+from data.items.scores import CandidateFrames, compare_item
+from data.records import LETTERS, SPLITS, SelectionItem
 from data.store import Store
 
-LOGISTIC = "logistic model of all scores"
+LOGISTIC, VELOCITY = "logistic model of all scores", "velocity"
 
 
 def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
@@ -27,62 +26,57 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
 
     Returns:
         ``scenes``: distributions of objects, collisions and event frames. ``answers``: items by
-        letter. ``cells``: items and quotas by family, window group and subtype. ``candidates``:
+        letter. ``cells``: items by family, subtype and split. ``candidates``:
         median displacements, and items by number of distractors earlier than the target, by
-        category. ``baselines``: accuracies by category. ``retrieval``: measures of a ranker that
-        only recognises the scene, on the standard test. ``shortcuts``: accuracies of the strategies
-        of `data.checks.shortcuts` on the test split, by category. ``shortfalls``: cells with fewer
-        records than their quotas. A category is a family, a kind of distractors in the event
-        family, or a difficulty in the window family.
+        category. ``shortcuts``: accuracies on the test split of the strategies of
+        `data.checks.shortcuts` and of the baseline `velocity`, by category. ``shortfalls``: cells
+        with fewer records than their quotas. A category is a family, a kind of distractors in the
+        event family, or a difficulty in the window family.
     """
-    items, queries = store.selection(), store.standard_test()
-    progress = tqdm(items, desc="describing items", unit="item")
-    rows = pd.DataFrame([_describe_item(item, store) for item in progress])
+    items, config = store.selection(), store.manifest["config"]
+    cells = [f"{item.family}/{item.subtype}" for item in items]
+    progress = tqdm(items, desc="comparing candidates", unit="item")
+    compared = [compare_item(item, store.scene, config) for item in progress]
+    rows = pd.DataFrame([_describe_item(*each) for each in zip(items, compared, strict=True)])
     categories = rows.explode("category").groupby("category")
     earlier = pd.crosstab(categories.obj["category"], categories.obj["earlier"])
     candidates = categories[["nearest distractor", "least"]].median()
     for count in range(4):
         candidates[f"{count} earlier"] = earlier.get(count, pd.Series(dtype=int))
-    baselines = categories[list(BASELINES)].mean()
-    baselines["items"] = categories.size()
+    shortcuts = measure_shortcuts(
+        items, np.stack([c.item_scores() for c in compared]), store, blind
+    )
     return {
         "scenes": describe_scenes(store),
         "answers": rows["letter"].value_counts().reindex(list(LETTERS), fill_value=0).to_dict(),
-        "cells": count_cells(items, store.manifest["config"]["selection"]),
+        "cells": pd.crosstab(cells, [item.split for item in items]).to_dict("index"),
         "candidates": candidates.fillna(0).to_dict("index"),
-        "baselines": _without_nan(baselines),
-        "retrieval": score_scene_alone(queries, store.database()) if queries else {},
-        "shortcuts": _without_nan(measure_shortcuts(items, store, blind)),
+        "shortcuts": shortcuts.astype(object).where(shortcuts.notna(), None).to_dict("index"),
         "shortfalls": store.manifest["shortfalls"],
     }
 
 
-def measure_shortcuts(items: list[SelectionItem], store: Store, blind: bool) -> pd.DataFrame:
-    """Return the accuracy of each shortcut on the items of the test split, by category."""
-    blind_right = {}
+def measure_shortcuts(
+    items: list[SelectionItem], scores: np.ndarray, store: Store, blind: bool
+) -> pd.DataFrame:
+    """Return the accuracy of each shortcut on the items of the test split, by category.
+
+    Args:
+        scores: (N, S, 4) scores of the items' candidates.
+    """
+    answers = np.array([item.answer for item in items])
+    right = pd.DataFrame(score_simple_strategies(scores, answers), columns=list(SIMPLE))
+    right[LOGISTIC] = score_logistic_model(items, scores, answers)
+    right[VELOCITY] = [score_velocity(item, store) for item in items]
     if blind:
         from data.checks.blind_models import score_blind_models
 
-        blind_right = score_blind_models(items, store, store.manifest["seed"])
-    progress = tqdm(items, desc="scoring shortcuts", unit="item")
-    config = store.manifest["config"]
-    scores = np.stack([item_scores(item, store.scene, config) for item in progress])
-    answers = np.array([item.answer for item in items])
-    right = pd.DataFrame(
-        shortcuts.score_simple_strategies(scores, answers), columns=list(shortcuts.SIMPLE)
-    )
-    right[LOGISTIC] = shortcuts.score_logistic_model(items, scores, answers)
-    for name, values in blind_right.items():
-        right[name] = values
+        right = right.assign(**score_blind_models(items, store, store.manifest["seed"]))
+    names = list(right)
     right["category"] = [list(_categories(item)) for item in items]
     test = right[[item.split == "test" for item in items]]
     categories = test.explode("category").groupby("category")
-    names = [name for name in right if name != "category"]
     return categories[names].mean().assign(items=categories.size())
-
-
-def _without_nan(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    return table.astype(object).where(table.notna(), None).to_dict("index")
 
 
 def describe_scenes(store: Store) -> dict[str, Any]:
@@ -99,37 +93,17 @@ def describe_scenes(store: Store) -> dict[str, Any]:
     }
 
 
-def count_cells(
-    items: list[SelectionItem], quotas: dict[str, dict[str, dict[str, int]]]
-) -> dict[str, dict[str, int]]:
-    """Return the items and the quotas of each split, for each family, window group and subtype."""
-    counts = [(item.family, item.subtype, item.split, 1) for item in items]
-    counts += [
-        (family, subtype, f"{split} quota", quotas[family][subtype][split])
-        for family in FAMILIES
-        for subtype in quotas[family]
-        for split in SPLITS
-    ]
-    rows = pd.DataFrame(counts, columns=["family", "subtype", "column", "count"])
-    group = rows["subtype"].str.partition("_")[0].where(rows["family"] == "window")
-    names = rows["family"], rows["family"] + "/" + rows["subtype"], rows["family"] + "/" + group
-    cells = pd.concat([rows.assign(cell=name) for name in names])
-    table = cells.pivot_table("count", "cell", "column", aggfunc="sum", fill_value=0)
-    columns = [*SPLITS, *(f"{split} quota" for split in SPLITS)]
-    return table.reindex(columns=columns, fill_value=0).to_dict("index")
-
-
-def _describe_item(item: SelectionItem, store: Store) -> dict[str, Any]:
-    frames = [(store.scene(c.scene_id), c.frame) for c in item.candidates]
-    target = frames.pop(item.answer)
-    same_scene = all(scene is target[0] for scene, _ in frames)
+def _describe_item(item: SelectionItem, compared: CandidateFrames) -> dict[str, Any]:
+    # Frame 0 is the last observed frame.
+    target, wrong = 1 + item.answer, [1 + k for k in range(4) if k != item.answer]
+    scenes = {candidate.scene_id for candidate in item.candidates}
+    earlier = sum(candidate.frame < item.target_frame for candidate in item.candidates)
     return {
         "category": list(_categories(item)),
         "letter": item.letter,
         "least": item.min_displacement,
-        "nearest distractor": min(cross_scene_displacement(*target, *frame) for frame in frames),
-        "earlier": sum(frame < item.target_frame for _, frame in frames) if same_scene else None,
-        **score_baselines(item, store),
+        "nearest distractor": compared.displacement[target, wrong].min(),
+        "earlier": earlier if len(scenes) == 1 else None,
     }
 
 
@@ -145,9 +119,9 @@ def format_statistics(statistics: dict[str, Any]) -> str:
     """Format the statistics as text tables whose lines have at most 100 characters."""
     scenes = statistics["scenes"]
     candidates = pd.DataFrame(statistics["candidates"]).T.round().astype(int)
-    baselines = pd.DataFrame(statistics["baselines"]).T.astype(float)
-    baselines[list(BASELINES)] *= 100
     cells = pd.DataFrame(statistics["cells"]).T
+    shortcuts = pd.DataFrame(statistics["shortcuts"]).filter(regex="^(?!event, )").astype(float)
+    shortcuts.loc[shortcuts.index != "items"] *= 100
     sections = [
         f"Objects per scene:    {_join(scenes['objects'])}\n"
         f"Collisions per scene: {_join(scenes['collisions'])} "
@@ -155,31 +129,18 @@ def format_statistics(statistics: dict[str, Any]) -> str:
         f"Event frames:         {' '.join(f'{q:g}' for q in scenes['event frames'])} "
         "(minimum, quartiles, maximum)\n"
         f"Answers:              {_join(statistics['answers'])}",
-        "Accuracy of baselines, %; only velocity predicts, from the moment and true velocities\n"
-        + baselines.astype({"items": int}).to_string(float_format="{:.1f}".format, na_rep="-"),
-        "Accuracy of shortcuts on the test split, %\n" + format_shortcuts(statistics["shortcuts"]),
+        "Accuracy on the test split, %; only velocity predicts, given the moment and velocities\n"
+        + shortcuts.to_string(float_format="{:.1f}".format, na_rep="-"),
         "Candidates: median displacement in px from the target to the nearest distractor and\n"
         "between any two candidates; items by number of distractors earlier than the target\n"
         + candidates.to_string(),
-        "Items and quotas\n" + cells.to_string(),
+        "Items\n" + cells.to_string(),
     ]
-    if retrieval := statistics["retrieval"]:
-        measures = "  ".join(f"{name} {value:.3g}" for name, value in retrieval.items())
-        sections.append(f"Standard test, a ranker that only recognises the scene\n{measures}")
     if shortfalls := statistics["shortfalls"]:
         sections.append(
             "Short of their quotas\n" + "\n".join(f"{k}: {n}" for k, n in shortfalls.items())
         )
     return "\n\n".join(sections)
-
-
-def format_shortcuts(shortcuts: dict[str, dict[str, Any]]) -> str:
-    """Format accuracies as a table with a row for each strategy, and a column for each family and
-    each difficulty."""
-    columns = [name for name in shortcuts if not name.startswith("event, ")]
-    table = pd.DataFrame(shortcuts)[columns].astype(float)
-    table.loc[table.index != "items"] *= 100
-    return table.to_string(float_format="{:.1f}".format, na_rep="-")
 
 
 def _join(counts: dict[str, int]) -> str:

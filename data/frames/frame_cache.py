@@ -12,7 +12,7 @@ import json
 import logging
 import zipfile
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -93,7 +93,7 @@ def frames_path(folder: Path, scene_id: str) -> Path:
 
 
 def render_frames(
-    scene: Scene, frames: list[int], config: Mapping[str, Any]
+    scene: Scene, frames: Sequence[int], config: Mapping[str, Any]
 ) -> dict[int, np.ndarray]:
     """Render frames of a scene, or read them from its release, by frame index.
 

@@ -67,7 +67,7 @@ class Recipe:
         fields: Function that returns the item's question, its subtype and its other fields that
             depend on the cell.
         pools: Function that returns the possible distractors of an item, given the scene, the
-            timing, the objects that count, a random generator and the picker.
+            timing, the objects that count and the picker.
         subjects: Function that returns the indices of the objects whose positions count in frames
             of the item's scene. Without any, there is no item at this timing. In frames of other
             scenes, all objects count.
@@ -77,9 +77,7 @@ class Recipe:
     family: str
     timings: Callable[[Scene], list[Timing]]
     fields: Callable[[Timing], Mapping[str, Any]]
-    pools: Callable[
-        [Scene, Timing, tuple[int, ...], np.random.Generator, DistractorPicker], Sequence[Pool]
-    ]
+    pools: Callable[[Scene, Timing, tuple[int, ...], DistractorPicker], Sequence[Pool]]
     subjects: Callable[[Scene, Timing], tuple[int, ...]] = visible_objects
     suite: str = "dynapix"
 
@@ -117,7 +115,7 @@ class DistractorPicker:
     def make_item(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
     ) -> SelectionItem | None:
-        pools = recipe.pools(scene, timing, about, self.rng, self)
+        pools = recipe.pools(scene, timing, about, self)
         chosen = [Candidate(scene.scene_id, timing.target)]
         for k, (pool, count) in enumerate(pools):
             # Stop if the remaining pools cannot complete the item.

@@ -78,16 +78,12 @@ def make_transfer_recipe(recipe: str, suite: str, family: str, subtype: str) -> 
         return {**fixed, "question": question, **axes}
 
     def pools(
-        scene: Scene,
-        timing: Timing,
-        about: tuple[int, ...],
-        rng: np.random.Generator,
-        picker: DistractorPicker,
+        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
     ) -> Sequence[Pool]:
         own, first = (1, timing.stop) if recipe == "movi_a" else (2, timing.target)
-        frames = rng.permutation(np.arange(first + 1, scene.frames))
+        frames = picker.rng.permutation(np.arange(first + 1, scene.frames))
         wrong = scene_candidates(scene, frames[frames != timing.target], "same_time")
-        others = cross_scene_targets(picker, scene, timings, rng, CROSS_SCENES)
+        others = cross_scene_targets(picker, scene, timings, CROSS_SCENES)
         return [(wrong, own), (others, 3 - own)]
 
     return Recipe(family, timings, fields, pools, lambda scene, _: (*range(len(scene.objects)),))

@@ -24,7 +24,7 @@ from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from conf.errors import UserError
-from conf.files import write_bytes
+from conf.files import read_json_if_valid, write_bytes
 from conf.runs import lock_file
 from data.publish.columns import (
     DESCRIPTIONS,
@@ -99,14 +99,14 @@ def ensure_export(store: Store, folder: Path, images: bool) -> list[Shard]:
         "images": images,
     }
     if folder.exists():
-        _verify(folder, plan)
+        shards = _verify(folder, plan)
         log.info("%s already holds this export", folder)
-        return _read_record(folder)["shards"]
+        return shards
     partial = folder.with_name(f".{folder.name}.partial")
     busy = f"another process is writing {folder}: run this command again when it has finished"
     with lock_file(partial.with_suffix(".lock"), busy):
         partial.mkdir(exist_ok=True)
-        if not plan.items() <= _read_record(partial).items():
+        if not plan.items() <= read_json_if_valid(partial / EXPORT_RECORD).items():
             for path in partial.iterdir():
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         _write_record(partial, plan)
@@ -215,16 +215,9 @@ def _write_record(folder: Path, record: dict[str, Any]) -> None:
     write_bytes(folder / EXPORT_RECORD, json.dumps(record, indent=1).encode())
 
 
-def _read_record(folder: Path) -> dict[str, Any]:
-    """Return the content of export.json; an empty dict if it is missing or cannot be read."""
-    try:
-        return dict(json.loads((folder / EXPORT_RECORD).read_text()))
-    except (OSError, ValueError, TypeError):
-        return {}
-
-
-def _verify(folder: Path, plan: dict[str, Any]) -> None:
-    record = _read_record(folder)
+def _verify(folder: Path, plan: dict[str, Any]) -> list[Shard]:
+    """Return the shards of an undamaged export of `plan`."""
+    record = read_json_if_valid(folder / EXPORT_RECORD)
     if "shards" not in record:
         raise UserError(
             f"{folder} exists but contains no readable export: choose another folder with "
@@ -246,6 +239,7 @@ def _verify(folder: Path, plan: dict[str, Any]) -> None:
             raise UserError(
                 f"{path} is {problem}: delete {folder} and export again", code=f"{problem}-file"
             )
+    return record["shards"]
 
 
 def summarize(shards: Sequence[Shard]) -> pd.DataFrame:
