@@ -15,10 +15,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from conf.schema import WorldConfig
 from data.items.futures import (
     Group,
     alternative_scene,
@@ -33,9 +33,6 @@ from data.items.pickers import Recipe, Timing, new_item
 from data.items.scores import Balance, CandidateFrames, render_small
 from data.oracle.displacement import frame_displacements
 from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
-
-if TYPE_CHECKING:
-    from conf.schema import WorldConfig
 
 FUTURES = {"event": 10, "time": 12, "window": 12}
 """Number of alternative futures from which the distractors of an item are chosen, by family."""

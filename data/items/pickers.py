@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from conf.schema import Quota
 from data.oracle.displacement import (
     cross_scene_displacement,
     frame_displacements,
@@ -21,9 +22,6 @@ from data.oracle.displacement import (
 )
 from data.records import SPLITS, Candidate, FrameRef, Scene, SelectionItem
 from data.seeded_order import named_rng
-
-if TYPE_CHECKING:
-    from conf.schema import Quota
 
 Pool = tuple[Iterable[Candidate], int]
 """Possible distractors in order of preference, and the maximum number of them to use."""

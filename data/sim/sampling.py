@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from conf.errors import UserError
+from conf.schema import WorldConfig
 from data.records import COLORS, MATERIALS, SceneObject
 from data.sim.camera import Camera
 from data.sim.parts import world_boxes
@@ -29,9 +29,6 @@ from data.sim.starts import (
     strike,
     throw,
 )
-
-if TYPE_CHECKING:
-    from conf.schema import WorldConfig
 
 STARTS = {"slide": slide, "throw": throw, "strike": strike}
 """Functions that sample the initial states of objects, by `start.kind` of the world."""
