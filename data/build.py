@@ -14,7 +14,7 @@ from typing import Any
 
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
-from conf.files import read_json, write_bytes
+from conf.files import read_json, write_bytes, write_json
 from conf.runs import compare_settings, flatten, lock_file
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.checks.counts import count_records, summarize_store
@@ -268,7 +268,7 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
             check_same_settings(read_json(partial / PLAN), plan, partial)
         for leftover in partial.rglob(".*.partial"):
             leftover.unlink()
-        write_bytes(partial / PLAN, json.dumps(plan).encode())
+        write_json(partial / PLAN, plan)
         yield partial
 
 

@@ -25,7 +25,7 @@ import contextlib
 import hashlib
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -131,9 +131,8 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def hash_files(folder: Path, names: Iterable[str]) -> dict[str, str]:
+def hash_files(folder: Path, names: Collection[str]) -> dict[str, str]:
     """SHA-256 of files of a store, by relative path."""
-    names = list(names)
     with ThreadPoolExecutor(4) as pool:
         hashes = pool.map(lambda name: hash_file(folder / name), names)
         return dict(zip(names, hashes, strict=True))

@@ -101,7 +101,6 @@ class DistractorPicker:
         min_displacement: Between any two candidates, the position of at least one object must
             differ by this many px at 336 x 336.
         scene_ids: Scenes of the split; cross-scene distractors come from these.
-        scene_of: Function that loads a scene by its id.
     """
 
     min_displacement: float
@@ -176,7 +175,6 @@ class CellInputs:
 
     Attributes:
         scene_ids: Scene ids by split.
-        scene_of: Function that loads a scene by its id.
         min_displacement: Minimum displacement between two candidates, px at 336 x 336.
         hard_negatives: Number of hard negatives of a query.
     """
@@ -197,10 +195,7 @@ def fill_quota(
 ) -> tuple[list[SelectionItem], int]:
     """Make the items of one cell, at most one per scene, from scenes in a seeded order.
 
-    The timings of a scene are tried in a random order.
-
-    Args:
-        make_picker: Function that returns the picker for a split and its random generator.
+    The item of a scene has the first timing, in a random order, at which one can be made.
 
     Returns:
         The items of each split up to its quota, and the number of timings that were dropped because
@@ -215,23 +210,16 @@ def fill_quota(
         for index in rng.permutation(len(scene_ids)):
             if len(made) == getattr(cell.quota, split):
                 break
-            if item := scene_item(recipe, cell.scene_of(scene_ids[index]), picker, rng):
-                made.append(item)
+            scene = cell.scene_of(scene_ids[index])
+            timings = recipe.timings(scene)
+            for timing in (timings[k] for k in rng.permutation(len(timings))):
+                about = recipe.subjects(scene, timing)
+                if about and (item := picker.make_item(recipe, scene, timing, about)):
+                    made.append(item)
+                    break
         items += shuffle_candidates(made, rng)
         dropped += picker.dropped
     return items, dropped
-
-
-def scene_item(
-    recipe: Recipe, scene: Scene, picker: Picker, rng: np.random.Generator
-) -> SelectionItem | None:
-    """Return the item of the first timing, in a random order, at which one can be made."""
-    timings = recipe.timings(scene)
-    for k in rng.permutation(len(timings)):
-        about = recipe.subjects(scene, timings[k])
-        if about and (item := picker.make_item(recipe, scene, timings[k], about)):
-            return item
-    return None
 
 
 def shuffle_candidates(

@@ -186,12 +186,8 @@ class Balance:
 def compare_item(
     item: SelectionItem, scene_of: Callable[[str], Scene], config: Mapping[str, Any]
 ) -> CandidateFrames:
-    """Compare the last observed frame and the candidates of an item.
-
-    Args:
-        scene_of: Function that loads a scene by its id.
-        config: Settings of the benchmark.
-    """
+    """Compare the last observed frame and the candidates of an item of a benchmark with these
+    settings."""
     frames = [FrameRef(item.scene_id, item.prefix_stop), *item.candidates]
     states = [(scene_of(f.scene_id), f.frame) for f in frames]
     images = np.concatenate([render_small(scene, [frame], config) for scene, frame in states])
