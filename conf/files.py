@@ -63,6 +63,14 @@ def read_json(path: Path) -> dict[str, Any]:
     )
 
 
+def read_json_if_valid(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file; an empty one if the file is damaged or missing."""
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        return {}
+
+
 def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the objects in a file of JSON lines; skip damaged lines, such as a last line that a
     killed process wrote only in part."""

@@ -14,7 +14,7 @@ from typing import Any
 
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
-from conf.files import read_json, write_bytes
+from conf.files import read_json, write_bytes, write_json
 from conf.runs import compare_settings, flatten, lock_file
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.checks.counts import count_records, summarize_store
@@ -124,12 +124,12 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         scene_ids, left_out = make_scenes(cfg, partial, workers, strict)
         scene_ids = keep_test_scenes(cfg, scene_ids)
         items, queries, dropped = make_items_and_queries(cfg, partial, scene_ids, workers)
-        save_rows([i.to_row() for i in items], partial / "selection.parquet")
+        save_rows([asdict(i) for i in items], partial / "selection.parquet")
         scene_of = functools.partial(load_cached, partial)
         queries, databases, unused = make_databases(cfg, queries, scene_ids, scene_of)
         if not items and not queries:
             raise empty_benchmark(cfg, scene_ids, scene_of, left_out)
-        save_rows([q.to_row() for q in queries], partial / "retrieval.parquet")
+        save_rows([asdict(q) for q in queries], partial / "retrieval.parquet")
         rows = [{**vars(f), "database": name} for name in databases for f in databases[name]]
         save_rows(rows, partial / "database.parquet")
         counts, shortfalls = count_records(cfg, scene_ids, items, queries, databases)
@@ -206,30 +206,32 @@ def world_changes(world: WorldConfig) -> dict[str, Any]:
 
 def check_quota_names(cfg: BenchmarkConfig) -> None:
     """Raises SettingsError if a quota is set for an unknown family, subtype or builder."""
-    known = {f"selection.{name}": [*names] for name, names in list_subtypes(cfg).items()}
-    known["retrieval.builders"] = [str(b) for b in BUILDERS]
-    quotas = {f"selection.{family}": named for family, named in family_quotas(cfg).items()}
     from conf.compose import nearest_key
 
-    problems = [
-        f"benchmark.selection.observation.{name}: unknown name; give event, window or a subtype "
-        "of theirs"
-        for name in cfg.selection.observation
-        if not any(
-            name in (family, *known.get(f"selection.{family}", ())) for family in OBSERVATIONS
-        )
-    ]
-    for key, named in {**quotas, "retrieval.builders": cfg.retrieval.builders}.items():
-        options = known.get(key, [])
-        if named and not options:
+    subtypes = list_subtypes(cfg)
+    named = {
+        **{
+            f"selection.{name}": (quotas, subtypes[name])
+            for name, quotas in family_quotas(cfg).items()
+        },
+        "selection.observation": (
+            cfg.selection.observation,
+            (*OBSERVATIONS, *(s for family in OBSERVATIONS for s in subtypes[family])),
+        ),
+        "retrieval.builders": (cfg.retrieval.builders, [str(b) for b in BUILDERS]),
+    }
+    problems = []
+    for key, (settings, options) in named.items():
+        if settings and not options:
             problems.append(
                 f"benchmark.{key}: suite {cfg.suite} lacks this family; remove its quotas"
             )
+            continue
         problems += [
             f"benchmark.{key}.{name}: unknown name; did you mean "
             f"{nearest_key(name, options) or options[0]}? The names are {', '.join(options)}"
-            for name in named
-            if options and name not in options
+            for name in settings
+            if name not in options
         ]
     if problems:
         raise SettingsError("\n".join(problems), code="unknown-option")
@@ -266,7 +268,7 @@ def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | No
             check_same_settings(read_json(partial / PLAN), plan, partial)
         for leftover in partial.rglob(".*.partial"):
             leftover.unlink()
-        write_bytes(partial / PLAN, json.dumps(plan).encode())
+        write_json(partial / PLAN, plan)
         yield partial
 
 

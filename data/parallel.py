@@ -23,6 +23,7 @@ from conf.errors import UserError
 log = logging.getLogger(__name__)
 
 Element = TypeVar("Element")
+Name = TypeVar("Name", str, Path)
 Job = Callable[[], Any]
 CHUNK = 32
 """Jobs per worker in one batch; all workers finish a batch before the next one starts."""
@@ -38,20 +39,18 @@ class Workers:
 
     def run(
         self,
-        jobs: Mapping[str, Job],
+        jobs: Mapping[Name, Job],
         title: str,
         unit: str,
         done: int = 0,
-        sizes: Mapping[str, int] | None = None,
-    ) -> Iterator[tuple[str, Any]]:
+        sizes: Mapping[Name, int] | None = None,
+    ) -> Iterator[tuple[Name, Any]]:
         """Run jobs and yield their names and results in order of completion.
 
         Args:
-            jobs: Functions without arguments, by name.
-            title: Title of the progress bar.
             unit: What the progress bar counts, in the singular.
             done: What has been done besides `jobs`, in units.
-            sizes: Units of each job, by name; one each by default.
+            sizes: Units of each job; one each by default.
 
         Raises:
             UserError: workers die repeatedly without finishing a job.
@@ -88,13 +87,12 @@ class Workers:
         sizes: Mapping[Path, int] | None = None,
     ) -> None:
         """Run the jobs whose files do not exist; see `run`. Each job must write this file last."""
-        missing = {str(path): job for path, job in jobs.items() if not path.exists()}
-        named = {str(path): sizes[path] if sizes else 1 for path in jobs}
-        done = sum(size for name, size in named.items() if name not in missing)
-        for _ in self.run(missing, title, unit, done, named):
+        missing = {path: job for path, job in jobs.items() if not path.exists()}
+        done = sum(sizes[path] if sizes else 1 for path in jobs if path not in missing)
+        for _ in self.run(missing, title, unit, done, sizes):
             pass
 
-    def _results(self, jobs: Mapping[str, Job]) -> Iterator[tuple[str, Any]]:
+    def _results(self, jobs: Mapping[Name, Job]) -> Iterator[tuple[Name, Any]]:
         from joblib import Parallel, delayed
 
         # A worker that asked for its parent could start too late, after the parent was killed.
@@ -113,7 +111,7 @@ def batched(elements: list[Element], size: int) -> Iterator[list[Element]]:
     return (elements[k : k + size] for k in range(0, len(elements), size))
 
 
-def _run_job(name: str, job: Job) -> tuple[str, Any]:
+def _run_job(name: Name, job: Job) -> tuple[Name, Any]:
     return name, job()
 
 

@@ -6,7 +6,7 @@ names equal the column names of the exported tables, which `data/publish/columns
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Any, Self
 
@@ -191,15 +191,8 @@ def original_scene_id(scene_id: str) -> str:
     return scene_id.partition(COUNTERFACTUAL)[0].partition(ALTERNATIVE)[0]
 
 
-class Record:
-    """A dataclass that is a row of a table."""
-
-    def to_row(self) -> dict[str, Any]:
-        return asdict(self)
-
-
 @dataclass(frozen=True)
-class SelectionItem(Record):
+class SelectionItem:
     """A question with four candidate frames, one of which is the target.
 
     `prefix_start` and `prefix_stop` are inclusive. `answer` is the index of the target among the
@@ -258,7 +251,7 @@ class SelectionItem(Record):
 
 
 @dataclass(frozen=True)
-class RetrievalQuery(Record):
+class RetrievalQuery:
     """A prefix and a question whose answer is one frame of a database.
 
     `pool` is `future`, or `counterfactual` for queries about the scene without one of its objects.
@@ -294,7 +287,7 @@ class RetrievalQuery(Record):
 
 
 @dataclass(frozen=True)
-class Rationale(Record):
+class Rationale:
     """One response of a teacher for one item, accepted or rejected with reasons."""
 
     item_id: str

@@ -25,7 +25,7 @@ import contextlib
 import hashlib
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from conf.errors import UserError
-from conf.files import write_bytes
+from conf.files import read_json_if_valid, write_bytes
 from data.records import (
     Collision,
     FrameRef,
@@ -131,9 +131,8 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def hash_files(folder: Path, names: Iterable[str]) -> dict[str, str]:
+def hash_files(folder: Path, names: Collection[str]) -> dict[str, str]:
     """SHA-256 of files of a store, by relative path."""
-    names = list(names)
     with ThreadPoolExecutor(4) as pool:
         hashes = pool.map(lambda name: hash_file(folder / name), names)
         return dict(zip(names, hashes, strict=True))
@@ -252,14 +251,17 @@ def open_store(folder: Path, verify: bool = False) -> Store:
     if missing := [name for name, stat in stats.items() if stat is None]:
         problem = f"{len(missing)} files are missing, such as {folder / min(missing)}"
         raise refusal(problem, "missing-file")
-    checked = {} if verify else _read_checked(folder)
+    checked = {} if verify else read_json_if_valid(folder / CHECKED)
     changed = [name for name in expected if checked.get(name) != [expected[name], *stats[name]]]
     hashes = hash_files(folder, changed)
     if damaged := [name for name in changed if hashes[name] != expected[name]]:
         problem = f"{len(damaged)} files differ from the manifest, such as {folder / damaged[0]}"
         raise refusal(problem, "damaged-file")
     if changed:
-        _write_checked(folder, {name: [expected[name], *stats[name]] for name in expected})
+        checked = {name: [expected[name], *stats[name]] for name in expected}
+        # A store may be read-only: its files are then hashed each time.
+        with contextlib.suppress(OSError):
+            write_bytes(folder / CHECKED, json.dumps(checked).encode())
     return Store(folder, manifest)
 
 
@@ -270,17 +272,3 @@ def _size_and_time(path: Path) -> tuple[int, int] | None:
     except FileNotFoundError:
         return None
     return stat.st_size, stat.st_mtime_ns
-
-
-def _read_checked(folder: Path) -> dict[str, list[str | int]]:
-    """Hash, size and modification time of each file at the last check, by relative path."""
-    try:
-        return dict(json.loads((folder / CHECKED).read_text()))
-    except (OSError, ValueError, TypeError):
-        return {}
-
-
-def _write_checked(folder: Path, checked: dict[str, list[str | int]]) -> None:
-    # A store may be read-only: its files are then hashed each time.
-    with contextlib.suppress(OSError):
-        write_bytes(folder / CHECKED, json.dumps(checked).encode())

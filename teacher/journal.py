@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,7 @@ class Journal:
 
 def _encode_line(rationale: Rationale) -> bytes:
     # A model may generate half of a surrogate pair, which UTF-8 cannot encode.
-    text = json.dumps(rationale.to_row(), ensure_ascii=False).encode("utf-8", "replace")
+    text = json.dumps(asdict(rationale), ensure_ascii=False).encode("utf-8", "replace")
     row = json.loads(text)
     return json.dumps({**row, DIGEST: _digest(row)}, ensure_ascii=False).encode() + b"\n"
 

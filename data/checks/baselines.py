@@ -1,36 +1,17 @@
-"""Baselines: simple rules that answer selection items from the oracle, and a ranker that only
-recognises the scene of a retrieval query.
+"""Baselines: simple rules that answer selection items from the oracle alone.
 
-A high accuracy of a rule that does not predict shows that items can be answered by a shortcut;
-`velocity` predicts.
+`data.checks.shortcuts` has further rules, which compare pixels too. A high accuracy of a rule that
+does not predict shows that items can be answered by a shortcut; `velocity` predicts.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
-
 import numpy as np
 
 from data.oracle.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
-from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
+from data.records import Candidate, SelectionItem
 from data.sim.camera import Camera
 from data.store import Store
-
-
-def displacement_from_prefix(item: SelectionItem, candidate: Candidate, store: Store) -> float:
-    """Displacement between the last frame of the prefix and the candidate."""
-    scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
-    return cross_scene_displacement(scene, item.prefix_stop, other, candidate.frame)
-
-
-def displacement_from_others(item: SelectionItem, candidate: Candidate, store: Store) -> float:
-    """Sum of the displacements between the candidate and the other candidates."""
-    scene = store.scene(candidate.scene_id)
-    return sum(
-        cross_scene_displacement(scene, candidate.frame, store.scene(c.scene_id), c.frame)
-        for c in item.candidates
-    )
 
 
 def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: Store) -> float:
@@ -61,57 +42,31 @@ def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: St
     return float(np.minimum(distances, DIAGONAL).mean())
 
 
-def baseline_costs(item: SelectionItem, store: Store) -> dict[str, np.ndarray]:
-    """Return each baseline's costs of the candidates, (4,), by the names in `BASELINES`."""
-
-    def costs(function: Callable[[SelectionItem, Candidate, Store], float]) -> np.ndarray:
-        return np.array([function(item, candidate, store) for candidate in item.candidates])
-
-    from_prefix, from_others = costs(displacement_from_prefix), costs(displacement_from_others)
-    frames = np.array([candidate.frame for candidate in item.candidates])
-    return {
-        "nearest": from_prefix,
-        "farthest": -from_prefix,
-        "first": np.arange(len(frames)),
-        "latest": -frames,
-        "odd": -from_others,
-        "typical": from_others,
-        "velocity": costs(constant_velocity_error),
-    }
-
-
-BASELINES = ("nearest", "farthest", "first", "latest", "odd", "typical", "velocity")
-"""Names of the baselines. A baseline chooses the candidate with the lowest cost."""
+def score_velocity(item: SelectionItem, store: Store) -> float:
+    """Return the score (see `share_of_lowest`) of the candidate nearest to constant velocity."""
+    costs = [constant_velocity_error(item, candidate, store) for candidate in item.candidates]
+    return share_of_lowest(np.array(costs), item.answer)
 
 
 def score_baselines(item: SelectionItem, store: Store) -> dict[str, float]:
-    """Return each baseline's score on an item: 1/m if the target is among the m candidates with the
-    lowest cost, otherwise 0; NaN if the baseline cannot be computed for the simulator."""
-    scores = {}
-    for name, costs in baseline_costs(item, store).items():
-        best = np.flatnonzero(costs == costs.min())
-        scores[name] = float(item.answer in best) / len(best) if len(best) else np.nan
-    return scores
-
-
-def count_frames_of_scene(
-    queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
-) -> np.ndarray:
-    """Return for each query the number of frames of its target's scene in the database, (Q,)."""
-    frames = Counter(frame.scene_id for frame in database)
-    return np.array([frames[query.target.scene_id] for query in queries])
-
-
-def score_scene_alone(
-    queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
-) -> dict[str, float]:
-    """Return the expected measures of a ranker that puts the frames of the target's scene first, in
-    a random order: recalls, the mean reciprocal rank and the median of the mean ranks."""
-    counts = count_frames_of_scene(queries, database)
-    harmonic = np.cumsum(1 / np.arange(1, counts.max() + 1))
-    recalls = {f"recall@{k}": float(np.minimum(k / counts, 1).mean()) for k in (1, 10, 50)}
-    return recalls | {
-        "mrr": float((harmonic[counts - 1] / counts).mean()),
-        "median rank": float(np.median((counts + 1) / 2)),
-        "frames per scene": float(counts.mean()),
+    """Return the score (see `share_of_lowest`) of each baseline on an item."""
+    frames = [(store.scene(c.scene_id), c.frame) for c in item.candidates]
+    last = store.scene(item.scene_id), item.prefix_stop
+    distances = np.array(
+        [[cross_scene_displacement(*one, *other) for other in frames] for one in (last, *frames)]
+    )
+    costs = {
+        "nearest": distances[0],
+        "odd": -distances[1:].sum(axis=0),
+        "first": np.arange(len(frames)),
+        "latest": np.array([-frame for _, frame in frames]),
     }
+    scores = {name: share_of_lowest(each, item.answer) for name, each in costs.items()}
+    return scores | {"velocity": score_velocity(item, store)}
+
+
+def share_of_lowest(costs: np.ndarray, answer: int) -> float:
+    """Return 1/m if the target is among the m candidates with the lowest cost, otherwise 0; NaN if
+    the costs are NaN."""
+    best = np.flatnonzero(costs == costs.min())
+    return float(answer in best) / len(best) if len(best) else np.nan

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from data.frames.frame_cache import render_frames
+from data.parallel import batched
 from data.records import FrameRef, SelectionItem
 from data.seeded_order import named_rng
 from data.store import Store
@@ -145,14 +146,8 @@ def encode_items(items: Sequence[SelectionItem], store: Store) -> tuple[torch.Te
         for ref in (FrameRef(item.scene_id, item.prefix_stop), *item.candidates)
     ]
     encode = _load_encoder()
-    parts = []
-    progress = tqdm(total=len(frames), desc="encoding frames", unit="frame")
-    for first in range(0, len(frames), CHUNK):
-        images = [_image(ref, store) for ref in frames[first : first + CHUNK]]
-        parts.append(encode(images))
-        progress.update(len(images))
-    progress.close()
-    features = torch.cat(parts)
+    chunks = tqdm([*batched(frames, CHUNK)], desc="encoding frames", unit="batch")
+    features = torch.cat([encode([_image(ref, store) for ref in chunk]) for chunk in chunks])
     features = features.reshape(len(items), 5, *features.shape[1:])
     return features[:, 0], features[:, 1:]
 

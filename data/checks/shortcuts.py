@@ -41,16 +41,13 @@ def fit_logistic(features: np.ndarray, answers: np.ndarray) -> np.ndarray:
     The probability of a candidate is the softmax of its linear score over the four candidates.
     """
     from scipy.optimize import minimize
+    from scipy.special import softmax
 
     rows = np.arange(len(answers))
 
     def loss(weights: np.ndarray) -> tuple[float, np.ndarray]:
-        linear = features @ weights
-        linear -= linear.max(axis=-1, keepdims=True)
-        odds = np.exp(linear)
-        probabilities = odds / odds.sum(axis=-1, keepdims=True)
-        likelihood = np.log(probabilities[rows, answers]).mean()
-        residual = probabilities.copy()
+        residual = softmax(features @ weights, axis=-1)
+        likelihood = np.log(residual[rows, answers]).mean()
         residual[rows, answers] -= 1
         gradient = np.einsum("nc,ncf->f", residual, features) / len(rows)
         penalty = PENALTY * (weights**2).sum() / 2

@@ -12,7 +12,7 @@ import json
 import logging
 import zipfile
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -49,15 +49,8 @@ def save_frames(frames: dict[int, np.ndarray], path: Path) -> None:
 
 
 def load_frames(path: Path, wanted: Iterable[int] | None = None) -> dict[int, np.ndarray]:
-    """Read frames of an archive, by frame index.
-
-    Args:
-        wanted: Frame indices; all frames of the archive by default.
-
-    Returns:
-        The wanted frames that the archive contains; none if it is missing or damaged. A damaged
-        archive is logged.
-    """
+    """Return those of the wanted frames (by default all) that an archive contains, by frame index:
+    none if it is missing or damaged. A damaged archive is logged."""
     try:
         with zipfile.ZipFile(path) as archive:
             header = json.loads(archive.comment)
@@ -93,16 +86,10 @@ def frames_path(folder: Path, scene_id: str) -> Path:
 
 
 def render_frames(
-    scene: Scene, frames: list[int], config: Mapping[str, Any]
+    scene: Scene, frames: Sequence[int], config: Mapping[str, Any]
 ) -> dict[int, np.ndarray]:
-    """Render frames of a scene, or read them from its release, by frame index.
-
-    Args:
-        config: Settings of the benchmark.
-
-    Returns:
-        (height, width, 3) uint8 arrays.
-    """
+    """Render frames of a scene of a benchmark with these settings, or read them from its release;
+    return (height, width, 3) uint8 arrays by frame index."""
     if scene.footage is not None:
         # Reading the frames of simulated scenes does not need pydantic.
         from data.sources.releases import READERS

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from conf.files import read_json, write_bytes
+from conf.files import read_json, write_json
 from conf.runs import LOCK, lock_file
 from data.frames.frame_cache import frames_path, load_frames, render_frames, save_frames
 from data.parallel import Workers
@@ -38,7 +37,7 @@ def prerender_frames(store: Store, which: str, workers: Workers) -> None:
         with lock_file(record.with_name(LOCK), busy, wait=True):
             if not is_done():
                 summary = _render_scenes(store, which, workers)
-                write_bytes(record, json.dumps(options | summary, indent=1).encode())
+                write_json(record, options | summary)
 
 
 def _render_scenes(store: Store, which: str, workers: Workers) -> dict[str, int]:

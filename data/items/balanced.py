@@ -15,10 +15,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from conf.schema import WorldConfig
 from data.items.futures import (
     Group,
     alternative_scene,
@@ -30,13 +30,9 @@ from data.items.futures import (
     simulate_futures,
 )
 from data.items.pickers import Recipe, Timing, new_item
-from data.items.scores import IMAGE_SIZE, SCORES, Balance, CandidateFrames
+from data.items.scores import Balance, CandidateFrames, render_small
 from data.oracle.displacement import frame_displacements
 from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
-from data.render import get_renderer
-
-if TYPE_CHECKING:
-    from conf.schema import WorldConfig
 
 FUTURES = {"event": 10, "time": 12, "window": 12}
 """Number of alternative futures from which the distractors of an item are chosen, by family."""
@@ -102,7 +98,9 @@ class BalancedPicker:
             moments += self._wrong_moment(scene, timing, about)
             if len(moments) == 1:
                 return None
-        futures = self._simulate(scene, timing.stop, max(moments), groups, FUTURES[family])
+        count, quarter = FUTURES[family], int(self.balance.counts_of("nearness").argmin())
+        velocities = sample_velocities(scene, timing.stop, groups, count, quarter, self.rng)
+        futures = simulate_futures(scene, timing.stop, max(moments), velocities, self.world)
         name = f"{scene.scene_id}{ALTERNATIVE}{cell['subtype']}-{timing.stop}"
         frames, frame_moments = self._candidate_frames(scene, name, timing.stop, moments, futures)
         displacement = frame_displacements(frames, about)
@@ -112,7 +110,8 @@ class BalancedPicker:
         if not len(choices):
             return None
         states = [(frames, k) for k in range(frames.frames)]
-        compared = CandidateFrames.compare(states, frame_moments, self._render(frames))
+        images = render_small(frames, range(frames.frames), {"world": asdict(self.world)})
+        compared = CandidateFrames.compare(states, frame_moments, images)
         best = self.balance.choose(compared.scores(choices))
         if best is None:
             return None
@@ -130,14 +129,6 @@ class BalancedPicker:
         pairs = frame_displacements(frames)[np.ix_(choices[best], choices[best])]
         least = float(pairs[np.triu_indices(4, 1)].min())
         return new_item(recipe, scene, timing, candidates, least, distractors="alternative")
-
-    def _simulate(
-        self, scene: Scene, frame: int, last: int, groups: Sequence[Group], count: int
-    ) -> np.ndarray:
-        """Simulate futures from `frame` to `last`, (count, last - frame + 1, N, 13) states."""
-        quarter = self.balance.rarest_rank("nearness")
-        velocities = sample_velocities(scene, frame, groups, count, quarter, self.rng)
-        return simulate_futures(scene, frame, last, velocities, self.world)
 
     def _candidate_frames(
         self, scene: Scene, name: str, stop: int, moments: Sequence[int], futures: np.ndarray
@@ -184,18 +175,11 @@ class BalancedPicker:
         horizon = timing.target - timing.stop
         least = horizon / (scene.frames - 1 - timing.stop)
         share = self.rng.uniform(least, LARGEST_SHARE)
-        counts = self.balance.counts[SCORES.index("moment")]
+        counts = self.balance.counts_of("moment")
         lead = horizon * share if counts[0] >= counts[3] else horizon / share
         moment = timing.stop + int(lead)
         shift = frame_displacements(scene, about)[timing.target, moment]
         return [moment] if shift >= self.min_displacement else []
-
-    def _render(self, frames: Scene) -> np.ndarray:
-        """Render all frames of a scene as small images, (M, H, W, 3) uint8."""
-        width, height = IMAGE_SIZE
-        size = {"renderer": "bullet", "width": width, "height": height}
-        renderer = get_renderer({**size, "world": asdict(self.world)})
-        return np.stack([np.asarray(renderer.render(frames, k)) for k in range(frames.frames)])
 
 
 def _choices(moments: int, futures: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, astuple, replace
 from functools import lru_cache, partial
 from itertools import groupby
@@ -34,7 +34,7 @@ from data.items.pickers import (
     shuffle_candidates,
 )
 from data.items.queries import make_counterfactual_queries, make_future_queries
-from data.items.scores import item_scores, order_target_first
+from data.items.scores import compare_item, order_target_first
 from data.parallel import Workers
 from data.records import FAMILIES, MATCHED_ANCHOR, RetrievalQuery, Scene, SelectionItem
 from data.seeded_order import named_rng
@@ -75,7 +75,10 @@ def make_items_and_queries(
         jobs[paths[name]] = partial(_make_cell, cfg, name, cell, paths[name])
         sizes[paths[name]] = quota.train + quota.test
     if is_balanced:
-        remove_other_parts(folder, paths.values())
+        # The alternative futures of balanced items have the same names for other settings: a result
+        # from before a change of settings may refer to futures that were simulated since.
+        for path in {*(folder / PARTS).glob("*.json")} - {*paths.values()}:
+            path.unlink()
     workers.write_files(jobs, "making items and queries", "item", sizes)
     items: list[SelectionItem] = []
     scores: dict[str, list[list[list[float]]]] = {}
@@ -107,16 +110,16 @@ def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) ->
     elif group == MATCHED_ANCHOR:
         by_time, dropped = fill_quota(name, recipes.MATCHED, cell, partial(_paper_picker, cell))
         made = [paired for item in by_time for paired in recipes.make_pair(item)]
-    elif cfg.distractors == "paper":
-        recipe = cell_recipe(cfg, group, subtype)
-        made, dropped = fill_quota(subtype, recipe, cell, partial(_paper_picker, cell))
     else:
-        recipe = cell_recipe(cfg, group, subtype)
-        picker = partial(_balanced_picker, cfg, folder)
-        made, dropped = fill_quota(subtype, recipe, cell, picker)
-        scene_of = partial(load_cached, folder)
-        part["scores"] = [item_scores(i, scene_of, asdict(cfg)).tolist() for i in made]
-    part |= {"rows": [row.to_row() for row in made], "dropped": dropped}
+        is_balanced = cfg.distractors == "balanced"
+        picker = (
+            partial(_balanced_picker, cfg, folder) if is_balanced else partial(_paper_picker, cell)
+        )
+        made, dropped = fill_quota(subtype, cell_recipe(cfg, group, subtype), cell, picker)
+        if is_balanced:
+            compared = (compare_item(item, cell.scene_of, asdict(cfg)) for item in made)
+            part["scores"] = [each.item_scores().tolist() for each in compared]
+    part |= {"rows": [asdict(row) for row in made], "dropped": dropped}
     write_bytes(path, json.dumps(part).encode())
 
 
@@ -227,13 +230,3 @@ def _is_query_cell(name: str) -> bool:
 def load_cached(folder: Path, scene_id: str) -> Scene:
     """Load a scene of a store or a partial build, and keep it in memory."""
     return load_scene(scene_path(folder, scene_id))
-
-
-def remove_other_parts(folder: Path, kept: Iterable[Path]) -> None:
-    """Delete the results of jobs below `folder` that are not in `kept`.
-
-    The alternative futures of balanced items have the same names for other settings, so that a
-    result from before a change of settings may refer to futures that were simulated since.
-    """
-    for path in {*(folder / PARTS).glob("*.json")} - {*kept}:
-        path.unlink()

@@ -9,18 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from conf.schema import WorldConfig
 from data.oracle.contacts import collisions_in
 from data.oracle.displacement import visible_positions
 from data.records import Scene
 from data.sim.physics import shared_simulator
 from data.sources.scenes import oracle_arrays
-
-if TYPE_CHECKING:
-    from conf.schema import WorldConfig
 
 MOVING = 0.1
 """Speed (simulator units/s) above which an object counts as moving."""

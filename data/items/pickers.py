@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from conf.schema import Quota
 from data.oracle.displacement import (
     cross_scene_displacement,
     frame_displacements,
@@ -21,9 +22,6 @@ from data.oracle.displacement import (
 )
 from data.records import SPLITS, Candidate, FrameRef, Scene, SelectionItem
 from data.seeded_order import named_rng
-
-if TYPE_CHECKING:
-    from conf.schema import Quota
 
 Pool = tuple[Iterable[Candidate], int]
 """Possible distractors in order of preference, and the maximum number of them to use."""
@@ -67,7 +65,7 @@ class Recipe:
         fields: Function that returns the item's question, its subtype and its other fields that
             depend on the cell.
         pools: Function that returns the possible distractors of an item, given the scene, the
-            timing, the objects that count, a random generator and the picker.
+            timing, the objects that count and the picker.
         subjects: Function that returns the indices of the objects whose positions count in frames
             of the item's scene. Without any, there is no item at this timing. In frames of other
             scenes, all objects count.
@@ -77,9 +75,7 @@ class Recipe:
     family: str
     timings: Callable[[Scene], list[Timing]]
     fields: Callable[[Timing], Mapping[str, Any]]
-    pools: Callable[
-        [Scene, Timing, tuple[int, ...], np.random.Generator, DistractorPicker], Sequence[Pool]
-    ]
+    pools: Callable[[Scene, Timing, tuple[int, ...], DistractorPicker], Sequence[Pool]]
     subjects: Callable[[Scene, Timing], tuple[int, ...]] = visible_objects
     suite: str = "dynapix"
 
@@ -105,7 +101,6 @@ class DistractorPicker:
         min_displacement: Between any two candidates, the position of at least one object must
             differ by this many px at 336 x 336.
         scene_ids: Scenes of the split; cross-scene distractors come from these.
-        scene_of: Function that loads a scene by its id.
     """
 
     min_displacement: float
@@ -117,7 +112,7 @@ class DistractorPicker:
     def make_item(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
     ) -> SelectionItem | None:
-        pools = recipe.pools(scene, timing, about, self.rng, self)
+        pools = recipe.pools(scene, timing, about, self)
         chosen = [Candidate(scene.scene_id, timing.target)]
         for k, (pool, count) in enumerate(pools):
             # Stop if the remaining pools cannot complete the item.
@@ -180,7 +175,6 @@ class CellInputs:
 
     Attributes:
         scene_ids: Scene ids by split.
-        scene_of: Function that loads a scene by its id.
         min_displacement: Minimum displacement between two candidates, px at 336 x 336.
         hard_negatives: Number of hard negatives of a query.
     """
@@ -201,10 +195,7 @@ def fill_quota(
 ) -> tuple[list[SelectionItem], int]:
     """Make the items of one cell, at most one per scene, from scenes in a seeded order.
 
-    The timings of a scene are tried in a random order.
-
-    Args:
-        make_picker: Function that returns the picker for a split and its random generator.
+    The item of a scene has the first timing, in a random order, at which one can be made.
 
     Returns:
         The items of each split up to its quota, and the number of timings that were dropped because
@@ -219,23 +210,16 @@ def fill_quota(
         for index in rng.permutation(len(scene_ids)):
             if len(made) == getattr(cell.quota, split):
                 break
-            if item := scene_item(recipe, cell.scene_of(scene_ids[index]), picker, rng):
-                made.append(item)
+            scene = cell.scene_of(scene_ids[index])
+            timings = recipe.timings(scene)
+            for timing in (timings[k] for k in rng.permutation(len(timings))):
+                about = recipe.subjects(scene, timing)
+                if about and (item := picker.make_item(recipe, scene, timing, about)):
+                    made.append(item)
+                    break
         items += shuffle_candidates(made, rng)
         dropped += picker.dropped
     return items, dropped
-
-
-def scene_item(
-    recipe: Recipe, scene: Scene, picker: Picker, rng: np.random.Generator
-) -> SelectionItem | None:
-    """Return the item of the first timing, in a random order, at which one can be made."""
-    timings = recipe.timings(scene)
-    for k in rng.permutation(len(timings)):
-        about = recipe.subjects(scene, timings[k])
-        if about and (item := picker.make_item(recipe, scene, timings[k], about)):
-            return item
-    return None
 
 
 def shuffle_candidates(

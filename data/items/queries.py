@@ -20,7 +20,7 @@ import numpy as np
 from conf.schema.benchmark import QUERIES_PER_SCENE
 from data.items.pickers import CellInputs
 from data.items.recipes import spell_seconds
-from data.oracle.contacts import collision_frames, next_collision
+from data.oracle.contacts import collision_frames, is_next
 from data.oracle.displacement import (
     cross_scene_displacement,
     frame_displacements,
@@ -87,7 +87,7 @@ def _clock(scene: Scene) -> Iterator[TimedQuestion]:
 
 
 def _next_event(scene: Scene) -> Iterator[TimedQuestion]:
-    events = [e for e in collision_frames(scene) if _is_next(scene, e - LEAD, e)]
+    events = [e for e in collision_frames(scene) if is_next(scene, e - LEAD, e)]
     for event in [e for e in events if e - LEAD + 1 >= MIN_OBSERVED][:EVENTS_PER_SCENE]:
         yield NEXT_COLLISION, 0, event - LEAD, event
 
@@ -96,13 +96,8 @@ def _around_event(lead: int, text: str, scene: Scene) -> Iterator[TimedQuestion]
     """Yield questions whose prefix ends `lead` frames before an event and 1 s before the target."""
     for event in collision_frames(scene):
         stop = event - lead
-        if stop >= FPS and stop + FPS < scene.frames and (not lead or _is_next(scene, stop, event)):
+        if stop >= FPS and stop + FPS < scene.frames and (not lead or is_next(scene, stop, event)):
             yield text, stop - FPS, stop, stop + FPS
-
-
-def _is_next(scene: Scene, stop: int, event: int) -> bool:
-    collision = next_collision(scene, stop)
-    return collision is not None and collision.frame == event
 
 
 BUILDERS: dict[int, Callable[[Scene], Iterator[TimedQuestion]]] = {

@@ -35,7 +35,7 @@ from conf.schema.benchmark import (
     needs_contacts,
 )
 from data.items.pickers import DistractorPicker, Pool, Recipe, Timing, visible_objects
-from data.oracle.contacts import collision_frames, next_collision
+from data.oracle.contacts import collision_frames, is_next, next_collision
 from data.oracle.displacement import object_match_scores, visible_positions
 from data.oracle.events import window_group
 from data.records import MATCHED_ANCHOR, SELECTION_SECOND, Candidate, Scene, SelectionItem
@@ -120,36 +120,26 @@ def event_recipe(subtype: str, observed: int) -> Recipe:
             for event in collision_frames(scene)
             if (stop := event - lead) >= observed - 1 and stop + gap <= scene.frames - 1 - TAIL
         ]
-        return [t for t in every if framing == "contact" or is_next(scene, t)]
+        return [t for t in every if framing == "contact" or is_next(scene, t.stop, t.event)]
 
     def pools(
-        scene: Scene,
-        timing: Timing,
-        about: tuple[int, ...],
-        rng: np.random.Generator,
-        picker: DistractorPicker,
+        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
     ) -> Sequence[Pool]:
         if distractors == "cross_scene":
-            return [(cross_scene_targets(picker, scene, timings, rng, CROSS_SCENES), 3)]
+            return [(cross_scene_targets(picker, scene, timings, CROSS_SCENES), 3)]
         if distractors == "same_offset":
             sides = [f for o in OFFSETS for f in (timing.target - o, timing.target + o)]
-            frames = rng.permutation([f for f in sides if 0 <= f < scene.frames])
+            frames = picker.rng.permutation([f for f in sides if 0 <= f < scene.frames])
         else:
             frames = similar_frames(scene, timing.target)
         wrong = scene_candidates(scene, timing.outside_prefix(frames), distractors)
-        return balance_in_time(wrong, timing.target, rng)
+        return balance_in_time(wrong, timing.target, picker.rng)
 
     fields = {
         "subtype": subtype, "question": EVENT_QUESTION, "framing": framing,
         "distractors": distractors, "gap": gap,
     }  # fmt: skip
     return Recipe("event", timings, lambda timing: fields, pools)
-
-
-def is_next(scene: Scene, timing: Timing) -> bool:
-    """Return whether the event of a timing is the first collision after its prefix."""
-    collision = next_collision(scene, timing.stop)
-    return collision is not None and collision.frame == timing.event
 
 
 def time_timings(seconds: int, second: int | None, scene: Scene) -> list[Timing]:
@@ -177,16 +167,12 @@ def spell_seconds(count: int) -> str:
 
 
 def frames_after_prefix(
-    scene: Scene,
-    timing: Timing,
-    about: tuple[int, ...],
-    rng: np.random.Generator,
-    picker: DistractorPicker,
+    scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
 ) -> Sequence[Pool]:
     """Return pools of the other frames after the prefix."""
-    later = rng.permutation(np.arange(timing.stop + 1, scene.frames))
+    later = picker.rng.permutation(np.arange(timing.stop + 1, scene.frames))
     wrong = scene_candidates(scene, later[later != timing.target], "same_time")
-    return balance_in_time(wrong, timing.target, rng)
+    return balance_in_time(wrong, timing.target, picker.rng)
 
 
 def window_recipe(subtype: str, observed: int) -> Recipe:
@@ -205,18 +191,14 @@ def window_recipe(subtype: str, observed: int) -> Recipe:
         return tuple(k for k in window_subjects(window_family, scene, timing) if k in visible)
 
     def pools(
-        scene: Scene,
-        timing: Timing,
-        about: tuple[int, ...],
-        rng: np.random.Generator,
-        picker: DistractorPicker,
+        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
     ) -> Sequence[Pool]:
         frames = timing.outside_prefix(similar_frames(scene, timing.target, about))
         if not is_hard:
             # Shuffled, because the least similar frames are consecutive and the target would stand
             # out.
-            frames = rng.permutation(frames[len(frames) // 2 :])
-        return balance_in_time(scene_candidates(scene, frames, source), timing.target, rng)
+            frames = picker.rng.permutation(frames[len(frames) // 2 :])
+        return balance_in_time(scene_candidates(scene, frames, source), timing.target, picker.rng)
 
     fields = {
         "subtype": subtype, "question": WINDOW_QUESTION, "distractors": source, "group": group,
@@ -250,7 +232,7 @@ def matched_timings(scene: Scene) -> list[Timing]:
         if (stop := target - seconds * SELECTION_SECOND - 1) >= SELECTION_SECOND - 1
         and target <= scene.frames - 1 - TAIL
     ]
-    return [timing for timing in every if is_next(scene, timing)]
+    return [t for t in every if is_next(scene, t.stop, t.event)]
 
 
 MATCHED = Recipe("time", matched_timings, time_fields, frames_after_prefix)
@@ -290,13 +272,13 @@ def cross_scene_targets(
     picker: DistractorPicker,
     scene: Scene,
     timings: Callable[[Scene], Sequence[Timing]],
-    rng: np.random.Generator,
     count: int,
 ) -> list[Candidate]:
     """Return the first target of up to `count` other scenes of the split and of the scene's
     scenario. Scenes that share more objects with `scene` come first."""
+    order = picker.rng.permutation(len(picker.scene_ids))
     # The generators are lazy: no more scenes are loaded than needed.
-    scenes = (picker.scene_of(picker.scene_ids[k]) for k in rng.permutation(len(picker.scene_ids)))
+    scenes = (picker.scene_of(picker.scene_ids[k]) for k in order)
     others = (s for s in scenes if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
     found = islice(((s, own) for s in others if (own := timings(s))), count)
     objects = {*scene.objects}

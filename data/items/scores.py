@@ -15,7 +15,11 @@ import numpy as np
 from PIL import Image
 
 from data.frames.frame_cache import render_frames
-from data.oracle.displacement import DIAGONAL, cross_scene_displacement, visible_positions
+from data.oracle.displacement import (
+    cross_scene_displacement,
+    object_displacements,
+    visible_positions,
+)
 from data.records import FrameRef, Scene, SelectionItem
 
 SCORES = (
@@ -70,12 +74,16 @@ class CandidateFrames:
         flat = images.reshape(len(images), -1).astype(np.float32)
         single = [
             moments,
-            [_travel(*frames[0], *frame) for frame in frames],
+            [sum(object_displacements(*frames[0], *frame)) for frame in frames],
             [visible_positions(scene)[1][frame].sum() for scene, frame in frames],
             [_gap(scene, frame) for scene, frame in frames],
         ]
         pixels = np.stack([np.abs(flat - image).mean(axis=-1) for image in flat])
         return cls(displacement, pixels, np.array(single, dtype=float))
+
+    def item_scores(self) -> np.ndarray:
+        """Return the scores (S, 4) of frames 1 to 4, in the order of `SCORES`."""
+        return self.scores(np.array([[1, 2, 3, 4]]))[:, 0]
 
     def scores(self, candidates: np.ndarray) -> np.ndarray:
         """Return the scores (S, T, 4) of T choices of candidates, (T, 4) indices of frames."""
@@ -89,22 +97,6 @@ class CandidateFrames:
                 *self.single[:, candidates],
             ]
         )
-
-
-def _travel(scene: Scene, frame: int, other: Scene, other_frame: int) -> float:
-    """Return the sum of the displacements of all objects between frames of two scenes, px at
-    336 x 336. An object that one scene lacks counts with the image's diagonal."""
-    positions, visible = (array[frame] for array in visible_positions(scene))
-    other_positions, other_visible = (array[other_frame] for array in visible_positions(other))
-    index = {key: k for k, key in enumerate(other.object_keys)}
-    total = 0.0
-    for k, key in enumerate(scene.object_keys):
-        match = index.pop(key, None)
-        if match is None:
-            total += DIAGONAL * visible[k]
-        elif visible[k] or other_visible[match]:
-            total += float(np.linalg.norm(positions[k] - other_positions[match]))
-    return total + DIAGONAL * float(other_visible[list(index.values())].sum())
 
 
 def _gap(scene: Scene, frame: int) -> float:
@@ -162,9 +154,9 @@ class Balance:
         start = rng.uniform(-START, START, (len(SCORES), 4))
         self.counts = start - start.mean(axis=-1, keepdims=True)
 
-    def rarest_rank(self, score: str) -> int:
-        """Return the rank that the fewest targets have in a score."""
-        return int(self.counts[SCORES.index(score)].argmin())
+    def counts_of(self, score: str) -> np.ndarray:
+        """Return the number of targets with each rank (4,) in a score."""
+        return self.counts[SCORES.index(score)]
 
     def choose(self, scores: np.ndarray) -> int | None:
         """Return the choice of candidates that keeps the counts of ranks most even, and count it.
@@ -191,30 +183,24 @@ class Balance:
         return best
 
 
-def item_scores(
+def compare_item(
     item: SelectionItem, scene_of: Callable[[str], Scene], config: Mapping[str, Any]
-) -> np.ndarray:
-    """Return the scores (S, 4) of an item's candidates, in the order of `SCORES`.
-
-    Args:
-        scene_of: Function that loads a scene by its id.
-        config: Settings of the benchmark.
-    """
+) -> CandidateFrames:
+    """Compare the last observed frame and the candidates of an item of a benchmark with these
+    settings."""
     frames = [FrameRef(item.scene_id, item.prefix_stop), *item.candidates]
     states = [(scene_of(f.scene_id), f.frame) for f in frames]
-    images = np.stack([_small_image(*state, config) for state in states])
-    compared = CandidateFrames.compare(states, [f.frame for f in frames], images)
-    return compared.scores(np.array([[1, 2, 3, 4]]))[:, 0]
+    images = np.concatenate([render_small(scene, [frame], config) for scene, frame in states])
+    return CandidateFrames.compare(states, [f.frame for f in frames], images)
 
 
-def _small_image(scene: Scene, frame: int, config: Mapping[str, Any]) -> np.ndarray:
-    """Return a frame as a small (H, W, 3) image, rendered by Bullet if its scene was simulated."""
+def render_small(scene: Scene, frames: Sequence[int], config: Mapping[str, Any]) -> np.ndarray:
+    """Return frames as small images (T, H, W, 3), rendered by Bullet if the scene was simulated."""
     width, height = IMAGE_SIZE
     small = {"renderer": "bullet", "width": width, "height": height}
-    pixels = render_frames(scene, [frame], {**config, **small})[frame]
-    if pixels.shape[:2] == (height, width):
-        return pixels
-    return np.asarray(Image.fromarray(pixels).resize(IMAGE_SIZE))
+    images = render_frames(scene, frames, {**config, **small})
+    # Releases have frames of other sizes.
+    return np.stack([Image.fromarray(images[frame]).resize(IMAGE_SIZE) for frame in frames])
 
 
 def order_target_first(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:

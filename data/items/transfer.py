@@ -66,7 +66,12 @@ def make_transfer_recipe(recipe: str, suite: str, family: str, subtype: str) -> 
     def timings(scene: Scene) -> list[Timing]:
         if is_event:
             return event_timings(EVENTS[recipe][subtype](scene))
-        return time_timings(scene, TIME_CELLS[subtype])
+        # The prefix is the first second. As in the suite `dynapix`, the target is the first frame
+        # after the stated seconds; a scene of MoVi-A ends one frame earlier.
+        second = round(scene.fps)
+        end = second * (1 + TIME_CELLS[subtype])
+        is_long_enough = scene.frames >= end
+        return [Timing(0, second - 1, min(end, scene.frames - 1))] if is_long_enough else []
 
     def fields(timing: Timing) -> dict[str, Any]:
         lead = timing.target - timing.stop
@@ -78,16 +83,12 @@ def make_transfer_recipe(recipe: str, suite: str, family: str, subtype: str) -> 
         return {**fixed, "question": question, **axes}
 
     def pools(
-        scene: Scene,
-        timing: Timing,
-        about: tuple[int, ...],
-        rng: np.random.Generator,
-        picker: DistractorPicker,
+        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
     ) -> Sequence[Pool]:
         own, first = (1, timing.stop) if recipe == "movi_a" else (2, timing.target)
-        frames = rng.permutation(np.arange(first + 1, scene.frames))
+        frames = picker.rng.permutation(np.arange(first + 1, scene.frames))
         wrong = scene_candidates(scene, frames[frames != timing.target], "same_time")
-        others = cross_scene_targets(picker, scene, timings, rng, CROSS_SCENES)
+        others = cross_scene_targets(picker, scene, timings, CROSS_SCENES)
         return [(wrong, own), (others, 3 - own)]
 
     return Recipe(family, timings, fields, pools, lambda scene, _: (*range(len(scene.objects)),))
@@ -101,13 +102,3 @@ def event_timings(events: Sequence[int]) -> list[Timing]:
         for stop in stops
         if stop + 1 >= MIN_PREFIX_FRAMES
     ]
-
-
-def time_timings(scene: Scene, seconds: int) -> list[Timing]:
-    """Return the single timing of a scene that is long enough: its prefix is the first second."""
-    second = round(scene.fps)
-    # As in the suite `dynapix`, the target is the first frame after the stated seconds; a scene
-    # of MoVi-A ends one frame earlier.
-    target = min(second * (1 + seconds), scene.frames - 1)
-    is_long_enough = scene.frames >= second * (1 + seconds)
-    return [Timing(0, second - 1, target)] if is_long_enough else []

@@ -52,6 +52,12 @@ def next_collision(scene: Scene, frame: int) -> Collision | None:
     return next(iter(collisions_in(scene, frame + 1, scene.frames)), None)
 
 
+def is_next(scene: Scene, frame: int, collision: int) -> bool:
+    """Return whether the first contact that begins after a frame begins at frame `collision`."""
+    following = next_collision(scene, frame)
+    return following is not None and following.frame == collision
+
+
 def first_collisions(scene: Scene) -> list[Collision]:
     """Return the first contact of each pair that does not touch from the start, in order."""
     first: dict[Pair, Collision] = {}

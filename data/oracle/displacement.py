@@ -50,17 +50,23 @@ def cross_scene_displacement(scene: Scene, frame: int, other: Scene, other_frame
     As in `frame_displacements`, but with objects matched by appearance. An object that is visible
     in one scene and does not exist in the other counts as displaced by the image's diagonal.
     """
+    return min(max(object_displacements(scene, frame, other, other_frame), default=0.0), DIAGONAL)
+
+
+def object_displacements(scene: Scene, frame: int, other: Scene, other_frame: int) -> list[float]:
+    """Return the displacement of each object that is visible in at least one of two frames, px at
+    336 x 336; the image's diagonal for an object that one of the scenes lacks."""
     first = _positions_by_appearance(scene, frame)
     second = _positions_by_appearance(other, other_frame)
-    absent = (np.full(2, np.inf), False)
-    displacement = 0.0
-    for key in first.keys() | second.keys():
-        position, visible = first.get(key, absent)
-        other_position, other_visible = second.get(key, absent)
+    displacements = []
+    for key in first | second:
+        position, visible = first.get(key, (None, False))
+        other_position, other_visible = second.get(key, (None, False))
         if visible or other_visible:
-            distance = float(np.linalg.norm(position - other_position))
-            displacement = max(displacement, distance)
-    return min(displacement, DIAGONAL)
+            is_shared = position is not None and other_position is not None
+            distance = float(np.linalg.norm(position - other_position)) if is_shared else DIAGONAL
+            displacements.append(distance)
+    return displacements
 
 
 @lru_cache(maxsize=256)

@@ -13,18 +13,16 @@ import sys
 import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from PIL import Image
 
 from conf.errors import UserError
+from conf.schema import WorldConfig
 from data.records import Scene
 from data.render.appearance import RGB
 from data.sim.camera import Camera
 from data.sim.shapes import CUBE_HALF, RADIUS
-
-if TYPE_CHECKING:
-    from conf.schema import WorldConfig
 
 BPY = "4.2.23"
 """Release of Blender's Python module; other releases give other pixels."""

@@ -11,20 +11,18 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
 
+from conf.schema import WorldConfig
 from data.records import MATERIALS, Scene, SceneObject
 from data.render.appearance import RGB, Mesh, box_mesh, mesh, texture
 from data.render.floor import Floor
 from data.sim.camera import Camera
 from data.sim.parts import Box, world_boxes
 from data.sim.physics import start_bullet
-
-if TYPE_CHECKING:
-    from conf.schema import WorldConfig
 
 OVERSAMPLING = 2
 NEAR, FAR = 0.1, 50.0

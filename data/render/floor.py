@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from conf.schema import WorldConfig
 from data.sim.camera import Camera
 from data.sim.parts import world_boxes
 from data.sim.shapes import RADIUS
-
-if TYPE_CHECKING:
-    from conf.schema import WorldConfig
 
 SHADOW_DEPTH = 0.55
 """Fraction of the light that a shadow removes at its centre."""

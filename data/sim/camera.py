@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from math import radians, tan
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from conf.schema import CameraConfig
+from conf.schema import CameraConfig
 
 WIDTH, HEIGHT = 480, 320
 """Size in px of the image plane to which the image positions of a simulated scene refer."""

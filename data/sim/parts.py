@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from conf.schema import PartConfig, WorldConfig
 from data.sim.shapes import CORNERS, intersect_box, rotation_matrix
-
-if TYPE_CHECKING:
-    from conf.schema import PartConfig, WorldConfig
 
 HIGH = 100.0
 """A height above all parts, simulator units."""

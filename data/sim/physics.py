@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from conf.schema import PartConfig, WorldConfig
 from data.records import Landing, SceneObject
 from data.sim.parts import part_box
 from data.sim.shapes import CUBE_HALF, RADIUS, half_height
@@ -25,7 +26,6 @@ from data.sim.shapes import CUBE_HALF, RADIUS, half_height
 if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient
 
-    from conf.schema import PartConfig, WorldConfig
 
 SOLVER_ITERATIONS = 20
 CONTACT_FREE_FRAMES = 5

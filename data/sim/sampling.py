@@ -8,32 +8,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from conf.errors import UserError
+from conf.schema import WorldConfig
 from data.records import COLORS, MATERIALS, SceneObject
+from data.sim import starts
 from data.sim.camera import Camera
 from data.sim.parts import world_boxes
-from data.sim.starts import (
-    NO_COLLISION,
-    NO_PLACE,
-    OFF_SCREEN,
-    OVERLAP,
-    RejectedError,
-    Sample,
-    SizedObject,
-    is_on_screen,
-    slide,
-    strike,
-    throw,
-)
+from data.sim.starts import RejectedError, Sample, SizedObject
 
-if TYPE_CHECKING:
-    from conf.schema import WorldConfig
-
-STARTS = {"slide": slide, "throw": throw, "strike": strike}
+STARTS = {"slide": starts.slide, "throw": starts.throw, "strike": starts.strike}
 """Functions that sample the initial states of objects, by `start.kind` of the world."""
 ATTEMPTS = 300
 """Number of samples after which a world is refused because none was suitable."""
@@ -47,12 +33,12 @@ MIN_CENTRE_HEIGHT = -0.1
 TOO_MANY = "objects collide too often"
 FALLEN = "an object falls through the floor"
 REMEDIES: Mapping[str, str] = {
-    OFF_SCREEN: "change start.area, or camera.position, camera.aim or camera.field_of_view",
-    OVERLAP: "lower objects.scale or objects.max_count, enlarge start.area or start.height, or "
-    "move the parts",
-    NO_COLLISION: "raise start.speed, lower start.spread, or lower the friction in physics",
-    NO_PLACE: "lower objects.scale or objects.max_count, raise start.speed, or move the camera or "
-    "the parts",
+    starts.OFF_SCREEN: "change start.area, or camera.position, camera.aim or camera.field_of_view",
+    starts.OVERLAP: "lower objects.scale or objects.max_count, enlarge start.area or start.height, "
+    "or move the parts",
+    starts.NO_COLLISION: "raise start.speed, lower start.spread, or lower the friction in physics",
+    starts.NO_PLACE: "lower objects.scale or objects.max_count, raise start.speed, or move the "
+    "camera or the parts",
     TOO_MANY: "raise start.max_collisions or set it to null",
     FALLEN: "raise physics.substeps, or lower start.speed, start.height or physics.gravity",
 }
@@ -91,7 +77,7 @@ def check_view(world: WorldConfig, camera: Camera) -> None:
     """Raises UserError if the camera does not see `start.middle`, or if a part is not entirely in
     front of the camera and above the floor."""
     uses_middle = world.start.kind != "strike"
-    if uses_middle and not is_on_screen(np.array(world.start.middle), 0.0, camera):
+    if uses_middle and not starts.is_on_screen(np.array(world.start.middle), 0.0, camera):
         raise UserError(
             f"world {world.name}: the camera does not see benchmark.world.start.middle="
             f"{world.start.middle}: change benchmark.world.camera.aim={world.camera.aim} or "
@@ -128,12 +114,12 @@ def check_sample(sample: Sample, world: WorldConfig) -> None:
     """Raises RejectedError if a scene is unsuitable, whatever its start."""
     motion, most = sample.motion, world.start.max_collisions
     if motion.touching_at_start:
-        raise RejectedError(OVERLAP)
+        raise RejectedError(starts.OVERLAP)
     # Objects that fall through the floor often miss all others, so that this is checked before the
     # collisions. NaN counts as fallen.
     if not (motion.positions[..., 2] > MIN_CENTRE_HEIGHT).all():
         raise RejectedError(FALLEN)
     if not motion.touching:
-        raise RejectedError(NO_COLLISION)
+        raise RejectedError(starts.NO_COLLISION)
     if most is not None and len(motion.touching) > most:
         raise RejectedError(TOO_MANY)

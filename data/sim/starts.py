@@ -9,18 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from conf.schema import WorldConfig
 from data.records import SceneObject
 from data.sim.camera import Camera
 from data.sim.parts import surface_height, world_boxes
 from data.sim.physics import Body, Motion, Touching, has_repeated, shared_simulator
 from data.sim.shapes import BOUNDING_RADIUS, RADIUS, half_height
-
-if TYPE_CHECKING:
-    from conf.schema import WorldConfig
 
 COLLISIONS = {2: 0.63, 3: 0.33, 4: 0.04}
 """Probabilities of the intended number of collisions, from a sample of CLEVRER's release."""

@@ -15,8 +15,9 @@ from data.checks.blind_models import (
     score_blind_models,
     train_model,
 )
-from data.checks.statistics import measure_shortcuts
 from data.frames.frame_cache import render_frames
+from data.items.scores import SCORES
+from data.statistics import measure_shortcuts
 from data.store import Store
 from tests.user_errors import raises_user_error
 
@@ -76,7 +77,8 @@ def test_statistics_report_blind_models(
     monkeypatch.setattr(blind_models, "EPOCHS", 2)
     items = micro_store.selection()
     items = [i for split in ("train", "test") for i in [i for i in items if i.split == split][:8]]
-    table = measure_shortcuts(items, micro_store, blind=True)
+    scores = np.zeros((len(items), len(SCORES), 4))
+    table = measure_shortcuts(items, scores, micro_store, blind=True)
     first = score_blind_models(items, micro_store, seed=0)
     for name, right in first.items():
         assert np.isnan(right).tolist() == [item.split == "train" for item in items]

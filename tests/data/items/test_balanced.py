@@ -17,7 +17,7 @@ from data.checks.counts import summarize_store
 from data.items import balanced as balanced_items
 from data.items.balanced_subset import choose_items
 from data.items.pickers import shuffle_candidates
-from data.items.scores import item_scores, order_target_first
+from data.items.scores import compare_item, order_target_first
 from data.oracle.displacement import cross_scene_displacement
 from data.parallel import Workers
 from data.records import ALTERNATIVE, SelectionItem, original_scene_id
@@ -251,7 +251,7 @@ def test_scores_of_items_are_those_that_were_balanced(
     """The scores that the statistics compute from the store equal those of the builder."""
     store, pools = build
     config = store.manifest["config"]
-    scores = np.stack([item_scores(item, store.scene, config) for item in items])
+    scores = np.stack([compare_item(item, store.scene, config).item_scores() for item in items])
     scores = order_target_first(scores, np.array([item.answer for item in items]))
     built = np.concatenate(pools)
     assert len(built) == len(scores)
