@@ -1,4 +1,5 @@
-"""Baselines: simple rules that answer selection items from the oracle alone.
+"""Baselines: simple rules that answer selection items from the oracle alone, and a ranker that only
+recognises the scene of a retrieval query.
 
 `data.checks.shortcuts` has further rules, which compare pixels too. A high accuracy of a rule that
 does not predict shows that items can be answered by a shortcut; `velocity` predicts.
@@ -6,10 +7,13 @@ does not predict shows that items can be answered by a shortcut; `velocity` pred
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+
 import numpy as np
 
 from data.oracle.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
-from data.records import Candidate, SelectionItem
+from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
 from data.sim.camera import Camera
 from data.store import Store
 
@@ -70,3 +74,26 @@ def share_of_lowest(costs: np.ndarray, answer: int) -> float:
     the costs are NaN."""
     best = np.flatnonzero(costs == costs.min())
     return float(answer in best) / len(best) if len(best) else np.nan
+
+
+def count_frames_of_scene(
+    queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
+) -> np.ndarray:
+    """Return for each query the number of frames of its target's scene in the database, (Q,)."""
+    frames = Counter(frame.scene_id for frame in database)
+    return np.array([frames[query.target.scene_id] for query in queries])
+
+
+def score_scene_alone(
+    queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
+) -> dict[str, float]:
+    """Return the expected measures of a ranker that puts the frames of the target's scene first, in
+    a random order: recalls, the mean reciprocal rank and the median of the mean ranks."""
+    counts = count_frames_of_scene(queries, database)
+    harmonic = np.cumsum(1 / np.arange(1, counts.max() + 1))
+    recalls = {f"recall@{k}": float(np.minimum(k / counts, 1).mean()) for k in (1, 10, 50)}
+    return recalls | {
+        "mrr": float((harmonic[counts - 1] / counts).mean()),
+        "median rank": float(np.median((counts + 1) / 2)),
+        "frames per scene": float(counts.mean()),
+    }

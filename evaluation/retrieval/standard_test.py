@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 
 from conf.files import write_text
 from conf.schema import RetrieverConfig
+from data.checks.baselines import count_frames_of_scene
 from data.checks.queries import check_test
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
@@ -52,8 +52,7 @@ def rank_targets(
 
 def rank_scene_alone(queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]) -> Ranks:
     """Rank as a retriever that only recognises the scene: its frames tie above all others."""
-    frames = Counter(frame.scene_id for frame in database)
-    tied = np.array([[frames[query.target.scene_id] - 1 for query in queries]])
+    tied = count_frames_of_scene(queries, database)[None] - 1
     found = np.ones(len(queries), bool)
     return Ranks((None,), np.zeros_like(tied), tied, found, len(database), 0, 0.0)
 

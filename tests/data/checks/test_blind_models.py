@@ -15,9 +15,9 @@ from data.checks.blind_models import (
     score_blind_models,
     train_model,
 )
+from data.checks.statistics import measure_shortcuts
 from data.frames.frame_cache import render_frames
 from data.items.scores import SCORES
-from data.statistics import measure_shortcuts
 from data.store import Store
 from tests.user_errors import raises_user_error
 

@@ -13,7 +13,7 @@ from conf.entry import Run
 from conf.schema import ExportCommand, StatisticsCommand, WorldConfig
 from data import export, statistics
 from data.checks.baselines import score_baselines
-from data.statistics import compute_statistics, format_statistics
+from data.checks.statistics import compute_statistics, format_statistics
 from tests.teacher import synthetic
 
 STANDARD = {"config": {"simulator": "bullet", "world": asdict(WorldConfig())}}

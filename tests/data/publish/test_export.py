@@ -13,10 +13,10 @@ import pytest
 from datasets import load_dataset
 from huggingface_hub import DatasetCard
 
-from data import export
-from data.export import ensure_export, render_card
 from data.frames.frame_cache import FrameReader
+from data.publish import huggingface
 from data.publish.columns import COLUMNS, DESCRIPTIONS, dataset_features
+from data.publish.huggingface import ensure_export, render_card
 from data.records import (
     MATCHED_ANCHOR,
     POOLS,
@@ -36,8 +36,8 @@ def exported(micro_store: Store, tmp_path_factory) -> Path:
     """An export of the small benchmark with images, in several files per split."""
     folder = tmp_path_factory.mktemp("exports") / "micro"
     with pytest.MonkeyPatch.context() as small:
-        small.setattr(export, "GROUP_IMAGES", 64)
-        small.setattr(export, "SHARD_GROUPS", 5)
+        small.setattr(huggingface, "GROUP_IMAGES", 64)
+        small.setattr(huggingface, "SHARD_GROUPS", 5)
         ensure_export(micro_store, folder, images=True)
     return folder
 
@@ -103,8 +103,8 @@ def test_without_images_the_columns_are_the_records_fields(micro_store, tmp_path
 def test_a_killed_export_resumes_and_gives_the_same_bytes(
     micro_store, exported, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(export, "GROUP_IMAGES", 64)
-    monkeypatch.setattr(export, "SHARD_GROUPS", 5)
+    monkeypatch.setattr(huggingface, "GROUP_IMAGES", 64)
+    monkeypatch.setattr(huggingface, "SHARD_GROUPS", 5)
     folder = tmp_path / "copy" / "micro"
     shutil.copytree(micro_store.folder, folder)
     damaged = Store(folder, micro_store.manifest)

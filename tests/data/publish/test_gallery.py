@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from data.frames.frame_cache import FrameReader
-from data.gallery import draw_sheets, render_page
 from data.publish.contact_sheets import SheetRows
+from data.publish.gallery import draw_sheets, render_page
 from data.records import LETTERS
 from data.store import Store
 
