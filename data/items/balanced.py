@@ -12,9 +12,10 @@ easy items are the farthest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
@@ -29,10 +30,11 @@ from data.items.futures import (
     scene_with_states,
     simulate_futures,
 )
-from data.items.pickers import Recipe, Timing, new_item
+from data.items.pickers import CellInputs, Recipe, Timing, new_item
 from data.items.scores import Balance, CandidateFrames, render_small
 from data.oracle.displacement import frame_displacements
 from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
+from data.store import save_scene, scene_path
 
 FUTURES = {"event": 10, "time": 12, "window": 12}
 """Number of alternative futures from which the distractors of an item are chosen, by family."""
@@ -54,16 +56,15 @@ class BalancedPicker:
     the paper's recipe, but not its distractors.
 
     Attributes:
-        min_displacement: Between any two candidates, the position of at least one object must
-            differ by this many px at 336 x 336.
-        save: Function that stores an alternative future.
+        folder: The store or partial build in which alternative futures are saved.
         dropped: Number of timings for which no choice of distractors was suitable.
     """
 
-    min_displacement: float
-    world: WorldConfig
+    cell: CellInputs
+    split: str
     rng: np.random.Generator
-    save: Callable[[Scene], None]
+    world: WorldConfig
+    folder: Path
     dropped: int = 0
     balance: Balance = field(init=False)
     _tries: tuple[str, int] = ("", 0)
@@ -105,7 +106,7 @@ class BalancedPicker:
         frames, frame_moments = self._candidate_frames(scene, name, timing.stop, moments, futures)
         displacement = frame_displacements(frames, about)
         choices = _choices(len(moments), len(futures))
-        choices = _distinct(choices, displacement, self.min_displacement)
+        choices = _distinct(choices, displacement, self.cell.min_displacement)
         choices = _of_difficulty(choices, displacement, NEAREST.get(cell["distractors"]))
         if not len(choices):
             return None
@@ -124,7 +125,8 @@ class BalancedPicker:
                 continue
             index = (frame - TARGET - len(moments)) % len(futures)
             other = f"{name}-{index}"
-            self.save(alternative_scene(scene, other, timing.stop, futures[index], self.world))
+            future = alternative_scene(scene, other, timing.stop, futures[index], self.world)
+            save_scene(future, scene_path(self.folder, other))
             candidates.append(Candidate(other, moment, "alternative"))
         pairs = frame_displacements(frames)[np.ix_(choices[best], choices[best])]
         least = float(pairs[np.triu_indices(4, 1)].min())
@@ -154,7 +156,7 @@ class BalancedPicker:
         """
         shift = frame_displacements(scene, about)[timing.stop, timing.target]
         moving = moving_objects(scene, timing.stop, about)
-        if not moving or shift < self.min_displacement:
+        if not moving or shift < self.cell.min_displacement:
             return []
         tried, tries = self._tries
         self._tries = scene.scene_id, tries + 1 if tried == scene.scene_id else 1
@@ -179,7 +181,7 @@ class BalancedPicker:
         lead = horizon * share if counts[0] >= counts[3] else horizon / share
         moment = timing.stop + int(lead)
         shift = frame_displacements(scene, about)[timing.target, moment]
-        return [moment] if shift >= self.min_displacement else []
+        return [moment] if shift >= self.cell.min_displacement else []
 
 
 def _choices(moments: int, futures: int) -> np.ndarray:

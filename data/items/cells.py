@@ -28,7 +28,6 @@ from data.items.balanced_subset import RESERVE, choose_items
 from data.items.pickers import (
     CellInputs,
     DistractorPicker,
-    Picker,
     Recipe,
     fill_quota,
     shuffle_candidates,
@@ -38,7 +37,7 @@ from data.items.scores import compare_item, order_target_first
 from data.parallel import Workers
 from data.records import FAMILIES, MATCHED_ANCHOR, RetrievalQuery, Scene, SelectionItem
 from data.seeded_order import named_rng
-from data.store import PARTS, load_scene, part_path, save_scene, scene_path
+from data.store import PARTS, load_scene, part_path, scene_path
 from data.versions import component_versions
 
 COUNTERFACTUAL = "counterfactual"
@@ -101,39 +100,23 @@ def make_items_and_queries(
 def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> None:
     """Make the items or queries of one cell, and write them to a file."""
     group, _, subtype = name.partition("/")
-    folder = path.parents[1]
     part: dict[str, Any] = {}
     if group == COUNTERFACTUAL:
         made, dropped = make_counterfactual_queries(cell)
     elif _is_query_cell(group):
         made, dropped = make_future_queries(int(group.split()[1]), cell)
     elif group == MATCHED_ANCHOR:
-        by_time, dropped = fill_quota(name, recipes.MATCHED, cell, partial(_paper_picker, cell))
+        by_time, dropped = fill_quota(name, recipes.MATCHED, cell)
         made = [paired for item in by_time for paired in recipes.make_pair(item)]
     else:
-        is_balanced = cfg.distractors == "balanced"
-        picker = (
-            partial(_balanced_picker, cfg, folder) if is_balanced else partial(_paper_picker, cell)
-        )
+        balanced = partial(BalancedPicker, world=cfg.world, folder=path.parents[1])
+        picker = {"paper": DistractorPicker, "balanced": balanced}[cfg.distractors]
         made, dropped = fill_quota(subtype, cell_recipe(cfg, group, subtype), cell, picker)
-        if is_balanced:
+        if cfg.distractors == "balanced":
             compared = (compare_item(item, cell.scene_of, asdict(cfg)) for item in made)
             part["scores"] = [each.item_scores().tolist() for each in compared]
     part |= {"rows": [asdict(row) for row in made], "dropped": dropped}
     write_bytes(path, json.dumps(part).encode())
-
-
-def _paper_picker(cell: CellInputs, split: str, rng: np.random.Generator) -> Picker:
-    return DistractorPicker(cell.min_displacement, cell.scene_ids[split], cell.scene_of, rng)
-
-
-def _balanced_picker(
-    cfg: BenchmarkConfig, folder: Path, split: str, rng: np.random.Generator
-) -> Picker:
-    def save(scene: Scene) -> None:
-        save_scene(scene, scene_path(folder, scene.scene_id))
-
-    return BalancedPicker(cfg.selection.min_displacement, cfg.world, rng, save)
 
 
 def cell_recipe(cfg: BenchmarkConfig, family: str, subtype: str) -> Recipe:

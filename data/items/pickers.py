@@ -97,15 +97,11 @@ class Picker(Protocol):
 class DistractorPicker:
     """Takes the first distractors of the recipe's pools that differ visibly from each other.
 
-    Attributes:
-        min_displacement: Between any two candidates, the position of at least one object must
-            differ by this many px at 336 x 336.
-        scene_ids: Scenes of the split; cross-scene distractors come from these.
+    Cross-scene distractors come from the scenes of the split.
     """
 
-    min_displacement: float
-    scene_ids: list[str]
-    scene_of: Callable[[str], Scene]
+    cell: CellInputs
+    split: str
     rng: np.random.Generator
     dropped: int = 0
 
@@ -122,7 +118,8 @@ class DistractorPicker:
                 candidate
                 for candidate in pool
                 if all(
-                    self._displacement(candidate, c, about) >= self.min_displacement for c in chosen
+                    self._displacement(candidate, c, about) >= self.cell.min_displacement
+                    for c in chosen
                 )
             )
             # `fitting` is lazy, so it also compares each candidate with those chosen in this loop.
@@ -137,10 +134,10 @@ class DistractorPicker:
     def _displacement(
         self, a: FrameRef, b: FrameRef, about: tuple[int, ...] | None = None
     ) -> float:
-        scene = self.scene_of(a.scene_id)
+        scene = self.cell.scene_of(a.scene_id)
         if a.scene_id == b.scene_id:
             return float(frame_displacements(scene, about)[a.frame, b.frame])
-        return cross_scene_displacement(scene, a.frame, self.scene_of(b.scene_id), b.frame)
+        return cross_scene_displacement(scene, a.frame, self.cell.scene_of(b.scene_id), b.frame)
 
 
 def new_item(
@@ -175,7 +172,8 @@ class CellInputs:
 
     Attributes:
         scene_ids: Scene ids by split.
-        min_displacement: Minimum displacement between two candidates, px at 336 x 336.
+        min_displacement: Between any two candidates, the position of at least one object must
+            differ by this many px at 336 x 336.
         hard_negatives: Number of hard negatives of a query.
     """
 
@@ -191,7 +189,7 @@ def fill_quota(
     cell_name: str,
     recipe: Recipe,
     cell: CellInputs,
-    make_picker: Callable[[str, np.random.Generator], Picker],
+    make_picker: Callable[[CellInputs, str, np.random.Generator], Picker] = DistractorPicker,
 ) -> tuple[list[SelectionItem], int]:
     """Make the items of one cell, at most one per scene, from scenes in a seeded order.
 
@@ -205,7 +203,7 @@ def fill_quota(
     for split in SPLITS:
         scene_ids = cell.scene_ids[split]
         rng = named_rng(cell.seed, cell_name, split)
-        picker = make_picker(split, rng)
+        picker = make_picker(cell, split, rng)
         made: list[SelectionItem] = []
         for index in rng.permutation(len(scene_ids)):
             if len(made) == getattr(cell.quota, split):

@@ -276,9 +276,10 @@ def cross_scene_targets(
 ) -> list[Candidate]:
     """Return the first target of up to `count` other scenes of the split and of the scene's
     scenario. Scenes that share more objects with `scene` come first."""
-    order = picker.rng.permutation(len(picker.scene_ids))
+    cell, scene_ids = picker.cell, picker.cell.scene_ids[picker.split]
+    order = picker.rng.permutation(len(scene_ids))
     # The generators are lazy: no more scenes are loaded than needed.
-    scenes = (picker.scene_of(picker.scene_ids[k]) for k in order)
+    scenes = (cell.scene_of(scene_ids[k]) for k in order)
     others = (s for s in scenes if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
     found = islice(((s, own) for s in others if (own := timings(s))), count)
     objects = {*scene.objects}

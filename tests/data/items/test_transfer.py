@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from conf.schema import Quota
-from data.items.pickers import CellInputs, DistractorPicker, fill_quota
+from data.items.pickers import CellInputs, fill_quota
 from data.items.recipes import EVENT_QUESTION, TIME_QUESTION
 from data.items.transfer import CELLS as TRANSFER_CELLS
 from data.items.transfer import make_transfer_recipe
@@ -76,11 +76,7 @@ def items_of(
         scene_ids, scenes.__getitem__, Quota(0, 24), seed=0, min_displacement=MIN_DISPLACEMENT
     )
     recipe = make_transfer_recipe(suite.removeprefix("standin_"), suite, family, subtype)
-
-    def make_picker(split: str, rng: np.random.Generator) -> DistractorPicker:
-        return DistractorPicker(MIN_DISPLACEMENT, scene_ids[split], scenes.__getitem__, rng)
-
-    return fill_quota(subtype, recipe, cell, make_picker)[0]
+    return fill_quota(subtype, recipe, cell)[0]
 
 
 CELLS = [
