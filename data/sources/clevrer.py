@@ -18,7 +18,6 @@ with the video by 0.93, lying ones by 0.73 and 0.80.
 from __future__ import annotations
 
 import re
-from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
@@ -27,7 +26,6 @@ import numpy as np
 from PIL import Image
 from pydantic import Field, conlist, constr
 
-from data.oracle.contacts import group_contacts
 from data.oracle.visibility import compute_visibility
 from data.records import COLORS, FPS, FRAMES, MATERIALS, SHAPES, Scene, SceneObject
 from data.sim.camera import Camera
@@ -35,8 +33,10 @@ from data.sim.shapes import CUBE_HALF
 from data.sources.validation import (
     Layout,
     RecordError,
+    Vector,
     check_unique_scenes,
-    read_json,
+    find_contacts,
+    read_layout,
     reconcile_velocities,
     scene_id,
 )
@@ -50,7 +50,6 @@ FRAME_SECONDS = 0.028
 """Simulated seconds per frame."""
 RADIUS = 0.2
 """Radius of spheres and cylinders and half edge of cubes, simulator units."""
-Vector = conlist(float, min_length=3, max_length=3)
 
 
 # The layout of an annotation.
@@ -110,7 +109,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     """
     from scipy.spatial.transform import Rotation
 
-    annotation = read_json(path, Annotation)
+    annotation = read_layout(path, Annotation)
     number = Path(annotation.video_filename).stem.removeprefix("video_")
     index = annotation.scene_index
     if scene_id("clevrer", number) != _scene_id(path) or index not in (None, int(number)):
@@ -123,12 +122,10 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
         o.object_id: SceneObject(o.shape, o.material, o.color) for o in annotation.object_property
     }
     ids, objects = list(appearances), tuple(appearances.values())
-    touching: dict[tuple[int, int], list[int]] = defaultdict(list)
     for contact in annotation.collision:
-        one, other = contact.object_ids
-        if one == other or not {one, other} <= set(ids):
+        if len({*contact.object_ids} & {*ids}) < 2:
             raise RecordError(f"{path}: collision of {contact.object_ids}, expected two of {ids}")
-        touching[tuple(sorted(map(ids.index, contact.object_ids)))].append(contact.frame_id)
+    touches = [(c.frame_id, [*map(ids.index, c.object_ids)]) for c in annotation.collision]
     states = []
     for index, frame in enumerate(annotation.motion_trajectory):
         by_id = {state.object_id: state for state in frame.objects}
@@ -164,7 +161,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
         scene_id=_scene_id(path),
         split=split,
         objects=objects,
-        collisions=group_contacts(touching),
+        collisions=find_contacts(touches, len(ids), FPS),
         positions=array("location"),
         quaternions=quaternions.astype(np.float32),
         velocities=array("velocity") * rate,

@@ -14,22 +14,43 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict, Field
 
-from data.sources.validation import RecordError
+from data.sources.validation import Layout, RecordError, check_layout
 
-LAYOUTS = {
-    9: ["frame", "id", "bb_left", "bb_top", "bb_width", "bb_height", "conf", "class", "visibility"],
-    10: ["frame", "id", "bb_left", "bb_top", "bb_width", "bb_height", "conf", "x", "y", "z"],
-}
-"""Names of the columns of a line, by their number."""
-WHOLE = ("frame", "id", "class")
-"""Columns of whole numbers."""
-LEAST = {"frame": 1, "id": 0, "bb_width": 0, "bb_height": 0}
-"""Smallest values of columns. Detections that no tracker has linked have id -1."""
-RESULTS_COLUMNS = 10
+Whole = Annotated[float, Field(multiple_of=1)]
+
+
+# The layouts of a line.
+class Box(Layout):
+    model_config = ConfigDict(strict=False)
+
+    frame: Annotated[Whole, Field(ge=1)]
+    # Detections that no tracker has linked have id -1.
+    id: Annotated[Whole, Field(ge=0)]
+    bb_left: float
+    bb_top: float
+    bb_width: Annotated[float, Field(ge=0)]
+    bb_height: Annotated[float, Field(ge=0)]
+    conf: float
+
+
+class TruthBox(Box):
+    category: Whole = Field(alias="class")
+    visibility: float
+
+
+class ResultBox(Box):
+    x: float
+    y: float
+    z: float
+
+
+LAYOUTS: dict[int, type[Box]] = {9: TruthBox, 10: ResultBox}
+"""Layout of a line by its number of columns."""
 CACHED_FILES = 2
 
 
@@ -74,54 +95,40 @@ def read_tracks(path: Path) -> dict[int, Track]:
 def _parse(path: Path, modified: int) -> dict[int, Track]:
     """Parse a file. The clips of a video share the result, while the time `modified` of the file's
     last change stays the same."""
-    first_lines: dict[tuple[int, int], int] = {}
+    first_lines: dict[tuple[float, float], int] = {}
     rows: list[tuple[float, ...]] = []
-    columns = 0
+    expected = [*LAYOUTS]
     for number, line in enumerate(path.read_text().splitlines(), 1):
         if not line.strip():
             continue
         cells = [cell.strip() for cell in line.split(",")]
         where = f"{path}: line {number} (frame {cells[0]})"
-        if len(cells) not in LAYOUTS or (columns and len(cells) != columns):
-            expected = columns or "9 or 10"
-            raise RecordError(f"{where} has {len(cells)} columns, expected {expected}")
-        columns = len(cells)
-        row = {
-            name: _parse_number(name, cell, where)
-            for name, cell in zip(LAYOUTS[columns], cells, strict=True)
-        }
-        # In the layout of results, the last two are x and y.
-        frame, key, left, top, width, height, confidence, category, visibility, *_ = row.values()
-        if (other := first_lines.setdefault((key, frame), number)) != number:
+        if len(cells) not in expected:
+            numbers = " or ".join(map(str, expected))
+            raise RecordError(f"{where} has {len(cells)} columns, expected {numbers}")
+        expected = [len(cells)]
+        layout = LAYOUTS[len(cells)]
+        names = [field.alias or name for name, field in layout.model_fields.items()]
+        box = check_layout(where, dict(zip(names, cells, strict=True)), layout)
+        if (other := first_lines.setdefault((box.id, box.frame), number)) != number:
             raise RecordError(
-                f"{where}: id {key:.0f} has another box in this frame on line {other}"
+                f"{where}: id {box.id:.0f} has another box in this frame on line {other}"
             )
-        is_result = columns == RESULTS_COLUMNS
-        if confidence > 0 or (is_result and confidence == -1):
-            if is_result or visibility < 0:
-                visibility = np.nan
-            centre = left + width / 2, top + height / 2
-            rows.append((key, frame - 1, *centre, width, height, visibility, category, number))
+        visibility, category = np.nan, np.nan
+        if isinstance(box, TruthBox):
+            visibility = box.visibility if box.visibility >= 0 else np.nan
+            category = box.category
+        if box.conf > 0 or (isinstance(box, ResultBox) and box.conf == -1):
+            centre = box.bb_left + box.bb_width / 2, box.bb_top + box.bb_height / 2
+            size = box.bb_width, box.bb_height
+            rows.append((box.id, box.frame - 1, *centre, *size, visibility, category, number))
     if not rows:
         raise RecordError(f"{path} has no box of an object: expected the tracks of a video")
     boxes = np.array(sorted(rows))
     tracks = {}
     for own in np.split(boxes, np.flatnonzero(np.diff(boxes[:, 0])) + 1):
         frames, lines = own[:, 1].astype(int), own[:, 8].astype(int)
-        category = None if columns == RESULTS_COLUMNS else int(own[0, 7])
+        category = None if np.isnan(own[0, 7]) else int(own[0, 7])
         track = Track(frames, own[:, 2:4], own[:, 4:6], own[:, 6], category, lines)
         tracks[int(own[0, 0])] = track
     return tracks
-
-
-def _parse_number(name: str, cell: str, where: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = np.nan
-    least = LEAST.get(name, -np.inf)
-    if not np.isfinite(value) or value < least or (name in WHOLE and value % 1):
-        kind = "whole number" if name in WHOLE else "number"
-        bound = f" of at least {least}" if name in LEAST else ""
-        raise RecordError(f"{where}: {name} is {cell!r}, expected a {kind}{bound}")
-    return value

@@ -17,28 +17,30 @@ is small and 1.4 if it is large, the sizes of Kubric's CLEVR objects.
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from PIL import Image
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, PlainValidator, conlist
 
-from data.oracle.contacts import group_contacts
-from data.records import Landing, Scene, SceneObject
+from data.records import Scene, SceneObject
 from data.sources.tfrecord import feature_values, read_example, record_ranges
 from data.sources.validation import (
     FLOOR_TOLERANCE,
     MIN_VERTICAL,
     Layout,
     RecordError,
+    Vector,
+    check_layout,
     check_unique_scenes,
     decode_image,
+    find_contacts,
     finite_array,
-    read_json,
+    first_landings,
+    read_layout,
     reconcile_velocities,
     scene_id,
 )
@@ -54,22 +56,8 @@ COLORS = ("blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow")
 SIZES = ("small", "large")
 APPEARANCE = {"shape": SHAPES, "material": MATERIALS, "color": COLORS, "size": SIZES}
 """Words of each attribute, in the order in which TensorFlow Datasets numbers them."""
-STATES = {
-    "positions": (FRAMES, 3),
-    "quaternions": (FRAMES, 4),
-    "velocities": (FRAMES, 3),
-    "angular_velocities": (FRAMES, 3),
-    "image_positions": (FRAMES, 2),
-    "visibility": (FRAMES,),
-    "bboxes_3d": (FRAMES, 8, 3),
-}
-"""Shape of each array for one object."""
-OPTIONAL = ("quaternions", "velocities", "angular_velocities", "bboxes_3d")
-"""Arrays that may be missing; NaN stands for their values."""
 RADII = {"small": 0.35, "large": 0.7}
 """Half of the width of objects without a recorded box, by size label."""
-CONTACTS = {"instances": (2,), "frame": (), "position": (3,), "contact_normal": (3,)}
-"""Shape of each array for one contact point."""
 
 
 def _check_float(value: object) -> object:
@@ -78,55 +66,53 @@ def _check_float(value: object) -> object:
     return value
 
 
-# The layout of metadata.json and events.json.
-class Instance(Layout):
+def _numbers(*shape: int) -> Any:
+    """Return the type of an array of this shape, which may be given as a flat list."""
+    return Annotated[Any, PlainValidator(partial(finite_array, shape=shape))]
+
+
+def _unknown(*shape: int) -> Any:
+    return Field(default_factory=partial(np.full, shape, np.nan))
+
+
+# The layout of metadata.json and events.json, and of the features of a record.
+class States(Layout):
+    positions: _numbers(FRAMES, 3)
+    image_positions: _numbers(FRAMES, 2)
+    visibility: _numbers(FRAMES)
+    quaternions: _numbers(FRAMES, 4) = _unknown(FRAMES, 4)
+    velocities: _numbers(FRAMES, 3) = _unknown(FRAMES, 3)
+    angular_velocities: _numbers(FRAMES, 3) = _unknown(FRAMES, 3)
+    bboxes_3d: _numbers(FRAMES, 8, 3) = _unknown(FRAMES, 8, 3)
+
+
+class Instance(States):
     shape: Literal[SHAPES]
     material: Literal[MATERIALS]
     color: Literal[COLORS] = Field(alias="color_label")
     size: Literal[SIZES] = Field(alias="size_label")
-    positions: list
-    image_positions: list
-    visibility: list
-    quaternions: list | None = None
-    velocities: list | None = None
-    angular_velocities: list | None = None
-    bboxes_3d: list | None = None
 
 
 class Video(Layout):
-    resolution: tuple[int, int]
+    resolution: conlist(int, min_length=2, max_length=2)
     num_frames: Literal[FRAMES]
     frame_rate: Literal[FPS]
 
 
 class Metadata(Layout):
     metadata: Video
-    instances: list[Instance]
+    instances: conlist(Instance, min_length=1)
 
 
 class Contact(Layout):
-    instances: list
+    instances: conlist(int, min_length=2, max_length=2)
     frame: Annotated[float, BeforeValidator(_check_float)]
-    position: list
-    contact_normal: list
+    position: Vector
+    contact_normal: Vector
 
 
 class Events(Layout):
     collisions: list[Contact]
-
-
-class Arrays(NamedTuple):
-    """The data of a scene that both formats contain.
-
-    `states` has the arrays that `STATES` names, with shapes (objects, ...), and `contacts` those
-    that `CONTACTS` names, with shapes (contact points, ...). `contacts["frame"]` is the index of
-    the first frame of the video at or after each contact.
-    """
-
-    objects: tuple[SceneObject, ...]
-    image_size: tuple[int, int]
-    states: dict[str, np.ndarray]
-    contacts: dict[str, np.ndarray]
 
 
 def list_scenes(folder: Path) -> list[Path]:
@@ -161,120 +147,101 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     """
     is_folder = path.name == "metadata.json"
     footage = path.parent if is_folder else path
-    record = _read_folder(footage) if is_folder else _read_record(footage)
+    if is_folder:
+        metadata = read_layout(path, Metadata)
+        contacts = read_layout(footage / "events.json", Events).collisions
+    else:
+        metadata, contacts = _read_record(path)
     _list_images(footage)  # raises an error if an image is missing
-    count = len(record.objects)
-    pairs, frames = (record.contacts[key].astype(int) for key in ("instances", "frame"))
-    is_object = (pairs >= 0) & (pairs < count)
-    collides = is_object.all(axis=1) & (frames < FRAMES) & (pairs[:, 0] != pairs[:, 1])
-    touching: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for frame, pair in zip(frames[collides].tolist(), pairs[collides].tolist(), strict=True):
-        touching[min(pair), max(pair)].append(frame)
-    states = {key: array.swapaxes(0, 1) for key, array in record.states.items()}
-    upright = np.isnan(states["quaternions"]).any(axis=-1, keepdims=True)
+    instances, size = metadata.instances, tuple(metadata.metadata.resolution)
+
+    def array(key: str) -> np.ndarray:
+        return np.stack([getattr(each, key) for each in instances], 1, dtype=np.float32)
+
+    # The first frame at or after each contact, if it is one of the video.
+    times = np.ceil(np.float32([contact.frame for contact in contacts])) - 1
+    frames = np.maximum(times, 0).astype(int).tolist()
+    touches = [each for each in zip(frames, contacts, strict=True) if each[0] < FRAMES]
+    quaternions = np.roll(array("quaternions"), -1, axis=-1)  # from w x y z to x y z w
+    upright = np.isnan(quaternions).any(axis=-1, keepdims=True)
     # The corner that is nearest to the first one ends an edge of the same box.
-    corners = states["bboxes_3d"][0]
-    edges = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=-1).min(axis=-1, initial=np.inf)
-    sizes = zip(record.objects, (edges / 2).tolist(), strict=True)
+    corners = array("bboxes_3d")[0]
+    edges = np.linalg.norm(corners[:, 1:] - corners[:, :1], axis=-1).min(axis=-1)
+    sizes = zip(instances, (edges / 2).tolist(), strict=True)
     scene = Scene(
         scene_id=_scene_id(path, folder),
         split=split,
-        objects=record.objects,
-        collisions=group_contacts(touching, FPS),
-        positions=states["positions"],
-        # From w x y z to x y z w.
-        quaternions=np.where(upright, [0, 0, 0, 1], np.roll(states["quaternions"], -1, axis=-1)),
-        velocities=states["velocities"],
-        angular_velocities=states["angular_velocities"],
-        image_positions=states["image_positions"] * np.float32(record.image_size),
-        in_view=states["visibility"] > 0,
-        visible_fraction=np.full((FRAMES, count), np.nan, np.float32),
-        image_size=record.image_size,
+        objects=tuple(SceneObject(i.shape, i.material, i.color, i.size) for i in instances),
+        collisions=find_contacts([(f, c.instances) for f, c in touches], len(instances), FPS),
+        positions=array("positions"),
+        quaternions=np.where(upright, [0, 0, 0, 1], quaternions),
+        velocities=array("velocities"),
+        angular_velocities=array("angular_velocities"),
+        image_positions=array("image_positions") * np.float32(size),
+        in_view=array("visibility") > 0,
+        visible_fraction=np.full((FRAMES, len(instances)), np.nan, np.float32),
+        image_size=size,
         fps=FPS,
-        landings=_find_landings(record.contacts, pairs, frames, is_object),
+        # All objects start in the air.
+        landings=first_landings(
+            (frame, k) for frame, contact in touches for k in _on_floor(contact, len(instances))
+        ),
         footage=footage.relative_to(folder).as_posix(),
         radii=tuple(radius if radius > 0 else RADII[each.size] for each, radius in sizes),
     )
     return reconcile_velocities(scene, path)
 
 
-def _read_folder(folder: Path) -> Arrays:
-    """Read a scene in Kubric's format, a folder with metadata.json and events.json."""
-    metadata = read_json(folder / "metadata.json", Metadata)
-    events = read_json(folder / "events.json", Events)
-
-    def array(rows: list[Instance] | list[Contact], key: str, *shape: int) -> np.ndarray:
-        name = "metadata.json: instances" if key in STATES else "events.json: collisions"
-        values = [getattr(row, key) for row in rows]
-        if key in OPTIONAL:
-            values = [np.full(shape, np.nan) if value is None else value for value in values]
-        where = f"{folder}/{name}.{key}"
-        return finite_array(values, (len(rows), *shape), where, optional=key in OPTIONAL)
-
-    contacts = {key: array(events.collisions, key, *shape) for key, shape in CONTACTS.items()}
-    contacts["frame"] = np.maximum(np.ceil(contacts["frame"]) - 1, 0)
-    return Arrays(
-        tuple(SceneObject(i.shape, i.material, i.color, i.size) for i in metadata.instances),
-        metadata.metadata.resolution,
-        {key: array(metadata.instances, key, *shape) for key, shape in STATES.items()},
-        contacts,
-    )
+def _on_floor(contact: Contact, count: int) -> list[int]:
+    """Return which of `count` objects touches the floor: one or none."""
+    objects = [k for k in contact.instances if 0 <= k < count]
+    is_low = abs(contact.position[2]) < FLOOR_TOLERANCE
+    is_level = abs(contact.contact_normal[2]) > MIN_VERTICAL
+    return objects if len(objects) == 1 and is_low and is_level else []
 
 
-def _read_record(path: Path) -> Arrays:
+def _read_record(path: Path) -> tuple[Metadata, list[Contact]]:
     """Read a scene in TensorFlow Datasets' format; `path` is as in `list_scenes`."""
     features = read_example(path.parent, int(path.name))
     where = f"{path.parent}: record {int(path.name)}"
 
-    def array(name: str, *shape: int) -> np.ndarray:
-        is_optional = name.removeprefix("instances/") in OPTIONAL
-        if name in features:
-            values = feature_values(features[name])
-        elif is_optional:
-            values = np.full(shape, np.nan)
-        else:
+    def values(name: str) -> Sequence[Any]:
+        if name not in features:
             raise RecordError(f"{where} has no feature {name!r}, which the published layout has")
-        return finite_array(values, shape, f"{where}: {name}", optional=is_optional)
+        return feature_values(features[name])
 
-    frames, count, width, height = (
-        int(array(f"metadata/{key}")) for key in ("num_frames", "num_instances", "width", "height")
-    )
-    if frames != FRAMES or min(count, width, height) < 0:
-        raise RecordError(
-            f"{where} has {frames} frames of {width} x {height} px with {count} objects, expected "
-            f"{FRAMES} frames"
-        )
-    appearances = []
-    for name, words in APPEARANCE.items():
-        numbers = array(f"instances/{name}_label", count).astype(int)
-        if not set(numbers) <= set(range(len(words))):
-            raise RecordError(f"{where}: {name}_label is {numbers}, expected 0 to {len(words) - 1}")
-        appearances.append([words[n] for n in numbers])
-    points = len(array("events/collisions/frame", -1))
-    return Arrays(
-        tuple(map(SceneObject, *appearances)),
-        (width, height),
-        {key: array(f"instances/{key}", count, *shape) for key, shape in STATES.items()},
-        {key: array(f"events/collisions/{key}", points, *shape) for key, shape in CONTACTS.items()},
-    )
+    def column(name: str, count: int) -> list[list[Any]]:
+        """Return the values of a feature for each of `count` rows."""
+        flat = values(name)
+        width, rest = divmod(len(flat), count) if count else (0, len(flat))
+        if rest or width < min(count, 1):
+            raise RecordError(f"{where}: {name} has {len(flat)} values for {count} rows")
+        return np.reshape(flat, (count, width)).tolist()
 
+    def rows(group: str, layout: type[Layout], count: int) -> list[dict[str, Any]]:
+        columns = {
+            key: column(f"{group}/{key}", count)
+            for key, field in layout.model_fields.items()
+            if field.is_required() or f"{group}/{key}" in features
+        }
+        return [{key: values[k] for key, values in columns.items()} for k in range(count)]
 
-def _find_landings(
-    contacts: dict[str, np.ndarray], pairs: np.ndarray, frames: np.ndarray, is_object: np.ndarray
-) -> tuple[Landing, ...]:
-    """Return each object's first contact with the floor. All objects start in the air; contacts in
-    the first frame of the video are not counted as landings."""
-    on_floor = (
-        (is_object.sum(axis=1) == 1)
-        & (np.abs(contacts["position"][:, 2]) < FLOOR_TOLERANCE)
-        & (np.abs(contacts["contact_normal"][:, 2]) > MIN_VERTICAL)
+    width, height, length, count = (
+        column(f"metadata/{key}", 1)[0][0]
+        for key in ("width", "height", "num_frames", "num_instances")
     )
-    first: dict[int, int] = {}
-    for frame, k in sorted(
-        zip(frames[on_floor], pairs[on_floor][is_object[on_floor]], strict=True)
-    ):
-        first.setdefault(int(k), int(frame))
-    return tuple(Landing(frame, k) for k, frame in first.items() if 0 < frame < FRAMES)
+    instances = rows("instances", States, count)
+    for key, words in APPEARANCE.items():
+        name, word_of = Instance.model_fields[key].alias or key, dict(enumerate(words))
+        for row, [number] in zip(instances, column(f"instances/{key}_label", count), strict=True):
+            row[name] = word_of.get(number, number)
+    contacts = rows("events/collisions", Contact, len(values("events/collisions/frame")))
+    for contact in contacts:
+        # The latest time that is truncated to this integer.
+        contact["frame"] = float(contact["frame"][0] + 1)
+    video = {"resolution": [width, height], "num_frames": length, "frame_rate": FPS}
+    metadata = check_layout(where, {"metadata": video, "instances": instances}, Metadata)
+    return metadata, check_layout(where, {"collisions": contacts}, Events).collisions
 
 
 def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:

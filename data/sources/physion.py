@@ -24,7 +24,6 @@ those of the centres of the bounds, if a file records bounds.
 from __future__ import annotations
 
 import re
-from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -34,7 +33,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from data.oracle.contacts import group_contacts
 from data.records import Collision, Landing, Scene, SceneObject
 from data.sources.validation import (
     FLOOR_TOLERANCE,
@@ -42,7 +40,9 @@ from data.sources.validation import (
     RecordError,
     check_unique_scenes,
     decode_image,
+    find_contacts,
     finite_array,
+    first_landings,
     reconcile_velocities,
     scene_id,
 )
@@ -80,7 +80,7 @@ SIDES = ("left", "right", "front", "back")
 
 def list_scenes(folder: Path) -> list[Path]:
     """Return the trials below a folder, in order of their path."""
-    paths = sorted(path for end in ("hdf5", "h5") for path in folder.rglob(f"*.{end}"))
+    paths = sorted(folder.rglob("*.hdf5"))
     return check_unique_scenes(folder, paths, partial(_stimulus, folder=folder), FOLDER_CONTENTS)
 
 
@@ -96,34 +96,34 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
     view if the segmentation image contains its colour. `fps` is for files without frame rate.
     """
     with _open(path) as file:
-        static, frames = _get_group(file, "static"), _list_frames(file)
-        ids = _read_array(static, "object_ids", (-1,), np.int64).tolist()
-        models = [_decode(name) for name in _read_values(static, "model_names").ravel()]
+        frames = _list_frames(file)
+        ids = _read_array(file, "static/object_ids", (-1,), np.int64).tolist()
+        models = _read_texts(file, "static/model_names")
         if len(models) != len(ids):
             raise RecordError(f"{path} names {len(models)} models of {len(ids)} objects")
-        if "framerate" in static:
-            fps = float(_read_array(static, "framerate", ()))
+        if "static/framerate" in file:
+            fps = float(_read_array(file, "static/framerate", ()))
             if fps <= 0:
-                raise RecordError(f"{_locate(static, 'framerate')} is {fps:g}, expected above 0")
-        colors = _read_array(static, "object_segmentation_colors", (len(ids), 3))
-        objects = [_get_group(frame, "objects") for frame in frames]
-        positions = np.stack([_read_array(group, "positions", (len(ids), 3)) for group in objects])
-        rotations = _read_vectors(objects, "rotations", np.tile([0, 0, 0, 1], (len(ids), 1)))
-        unknown = np.full((len(ids), 3), np.nan)
-        velocities = _read_vectors(objects, "velocities", unknown)
-        angular_velocities = _read_vectors(objects, "angular_velocities", unknown)
-        centres = _read_vectors(objects, "center", unknown)
+                raise RecordError(f"{path}: /static/framerate is {fps:g}, expected above 0")
+        colors = _read_array(file, "static/object_segmentation_colors", (len(ids), 3))
+        vectors = (len(ids), 3)
+        positions = _read_series(frames, "objects/positions", vectors)
+        rotations = _read_series(frames, "objects/rotations", (len(ids), 4))
+        velocities, angular_velocities, centres = (
+            _read_series(frames, f"objects/{key}", vectors, optional=True)
+            for key in ("velocities", "angular_velocities", "center")
+        )
         centres = np.where(np.isfinite(centres), centres, positions)
         names = stimulus = _stimulus(path, folder)
-        if "stimulus_name" in static:
-            names += f" {_decode(_read_values(static, 'stimulus_name')[()])}"
+        if "static/stimulus_name" in file:
+            names = " ".join([names, *_read_texts(file, "static/stimulus_name")])
         scenario = _find_scenario(names, path)
         is_swapped = scenario == "Roll" and models[2:3] == [SWAPPED_RAMP]
         order = [0, 2, 1, *range(3, len(ids))] if is_swapped else [*range(len(ids))]
-        collisions = _find_collisions(frames, ids, fps)
-        size = _read_image(frames[0], "_img").size
+        collisions, landings = _find_events(frames, ids, positions, fps)
+        size = _read_image(frames[0], "images/_img").size
         for frame in frames:
-            _get_dataset(_get_group(frame, "images"), "_img")
+            _find(frame, "images/_img")
         scene = Scene(
             scene_id=scene_id("physion", scenario, stimulus),
             split=split,
@@ -133,36 +133,23 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
             quaternions=rotations[..., [*AXES, 3]] * np.float32([-1, -1, -1, 1]),
             velocities=velocities[..., AXES],
             angular_velocities=-angular_velocities[..., AXES],
-            image_positions=np.stack(
-                [_project(*pair, size) for pair in zip(frames, centres, strict=True)]
-            ),
+            image_positions=_project(frames, centres, size),
             in_view=np.stack([_read_in_view(frame, colors) for frame in frames]),
             visible_fraction=np.full((len(frames), len(ids)), np.nan, np.float32),
             image_size=size,
             fps=fps,
-            landings=_find_landings(frames, ids, positions),
+            landings=landings,
             scenario=scenario,
             footage=path.relative_to(folder).as_posix(),
-            radii=_find_radii(static, order, objects[0], collisions, positions),
+            radii=_find_radii(file, order, frames[0], collisions, positions),
         )
     return reconcile_velocities(scene, path)
 
 
-def _read_vectors(objects: list[h5py.Group], key: str, absent: np.ndarray) -> np.ndarray:
-    """Return vectors of all objects (F, N, ...), which may be non-finite where `absent` is; this is
-    their value in each frame of a file that lacks them in the first frame."""
-    if not _find_names(objects[0], key):
-        return np.stack([absent.astype(np.float32)] * len(objects))
-    is_optional = bool(np.isnan(absent).any())
-    return np.stack(
-        [_read_array(group, key, absent.shape, optional=is_optional) for group in objects]
-    )
-
-
 def _find_radii(
-    static: h5py.Group,
+    file: h5py.File,
     order: list[int],
-    objects: h5py.Group,
+    frame: h5py.Group,
     collisions: tuple[Collision, ...],
     positions: np.ndarray,
 ) -> tuple[float, ...]:
@@ -172,19 +159,18 @@ def _find_radii(
     as TDW's primitives have it, at the object's scale; without scales, half of the distance on the
     ground at the object's first contact, or the mean of the others.
     """
-    count = positions.shape[1]
-    radii = np.full(count, np.nan)
+    shape = positions.shape[1:]
+    radii = np.full(len(order), np.nan)
     for contact in reversed(collisions):
         one, other = (positions[contact.frame, k][[0, 2]] for k in contact.objects)
         radii[list(contact.objects)] = np.linalg.norm(one - other) / 2
-    if "scale" in static:
-        radii = _read_array(static, "scale", (count, 3))[order][:, [0, 2]].mean(axis=1) / 2
-    if all(_find_names(objects, side) for side in SIDES):
-        left, right, front, back = (
-            _read_array(objects, side, (count, 3), optional=True) for side in SIDES
-        )
-        widths = np.linalg.norm([right - left, front - back], axis=-1).mean(axis=0)
-        radii = np.where(widths > 0, widths / 2, radii)
+    if "static/scale" in file:
+        radii = _read_array(file, "static/scale", shape)[order][:, [0, 2]].mean(axis=1) / 2
+    left, right, front, back = (
+        _read_series([frame], f"objects/{side}", shape, optional=True)[0] for side in SIDES
+    )
+    widths = np.linalg.norm([right - left, front - back], axis=-1).mean(axis=0)
+    radii = np.where(widths > 0, widths / 2, radii)
     known = radii[radii > 0]
     return tuple(np.where(radii > 0, radii, known.mean()).tolist()) if len(known) else ()
 
@@ -200,122 +186,98 @@ def _find_scenario(names: str, path: Path) -> str:
 
 def _list_frames(file: h5py.File) -> list[h5py.Group]:
     """Return the groups of all frames, in order."""
-    frames = _get_group(file, "frames")
-    names = sorted(map(str, frames))
+    names = sorted(_find(file, "frames"))
     first = 1 if names[:1] == ["0001"] else 0
     for k, name in enumerate(names or [""], first):
         if name != f"{k:04d}":
-            raise RecordError(f"{_locate(frames)} has frame {name!r}, expected '{k:04d}'")
-    return [_get_group(frames, name) for name in names]
+            raise RecordError(f"{_locate(file, 'frames')} has frame {name!r}, expected '{k:04d}'")
+    return [_find(file, f"frames/{name}") for name in names]
 
 
-def _project(frame: h5py.Group, positions: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Project (N, 3) centres in TDW's axes to (N, 2) px with the frame's camera matrices."""
-    cameras = _get_group(frame, "camera_matrices")
+def _project(frames: list[h5py.Group], positions: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Project (F, N, 3) centres in TDW's axes to (F, N, 2) px with the camera of each frame."""
     projection, view = (
-        _read_array(cameras, key, (4, 4), np.float64)
+        _read_series(frames, f"camera_matrices/{key}", (4, 4), np.float64)
         for key in ("projection_matrix", "camera_matrix")
     )
-    homogeneous = np.concatenate([positions, np.ones((len(positions), 1))], axis=1)
-    clip = homogeneous @ (projection @ view).T
+    homogeneous = np.concatenate([positions, np.ones((*positions.shape[:2], 1))], axis=-1)
+    clip = homogeneous @ (projection @ view).swapaxes(1, 2)
     # A point beside or behind the camera has no projection; keep it finite and far off screen.
-    x, y = (clip[:, :2] / np.maximum(clip[:, 3:], 1e-3)).T
-    return (np.stack([1 + x, 1 - y], axis=1) / 2 * size).astype(np.float32)
+    places = clip[..., :2] / np.maximum(clip[..., 3:], 1e-3)
+    return ((1 + places * [1, -1]) / 2 * size).astype(np.float32)
 
 
 def _read_in_view(frame: h5py.Group, colors: np.ndarray) -> np.ndarray:
     """Return whether the segmentation image contains each object's colour, (N,) bool."""
     weights = [1 << 16, 1 << 8, 1]
-    pixels = np.asarray(_read_image(frame, "_id")).astype(np.int32) @ weights
+    pixels = np.asarray(_read_image(frame, "images/_id")).astype(np.int32) @ weights
     # An object that is never drawn has the colour of the background, black.
     return np.isin(colors.astype(np.int32) @ weights, pixels) & colors.any(axis=1)
 
 
-def _find_collisions(frames: list[h5py.Group], ids: list[int], fps: float) -> tuple[Collision, ...]:
-    """Return the contacts of pairs. A pair that a file without `states` lists before frame
-    `START_FRAMES` is in contact from the start."""
-    touching: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for k, frame in enumerate(frames):
-        for pair, state in _read_pairs(frame):
-            if not set(pair) <= set(ids) or pair[0] == pair[1] or state == b"exit":
-                continue
-            first, second = sorted(ids.index(name) for name in pair)
-            from_start = state is None and k < START_FRAMES
-            touching[first, second].append(0 if from_start else k)
-    return group_contacts(touching, fps)
+def _find_events(
+    frames: list[h5py.Group], ids: list[int], positions: np.ndarray, fps: float
+) -> tuple[tuple[Collision, ...], tuple[Landing, ...]]:
+    """Return the contacts of pairs, and each object's first contact with the floor after some
+    frames without any contact. A pair that a file without `states` lists before frame
+    `START_FRAMES` is in contact from the start.
 
-
-def _read_pairs(frame: h5py.Group) -> list[tuple[list[int], bytes | None]]:
-    """Return the pairs of object ids that a frame lists, and their states (None: not recorded)."""
-    if "collisions" not in frame:
-        return []
-    collisions = _get_group(frame, "collisions")
-    pairs = _read_array(collisions, "object_ids", (-1, 2), np.int64).tolist()
-    if "states" not in collisions:
-        return [(pair, None) for pair in pairs]
-    states = _read_values(collisions, "states").astype("S").ravel().tolist()
-    if len(states) != len(pairs):
-        raise RecordError(f"{_locate(collisions)} has {len(states)} states of {len(pairs)} pairs")
-    return list(zip(pairs, states, strict=True))
-
-
-def _find_landings(
-    frames: list[h5py.Group], ids: list[int], positions: np.ndarray
-) -> tuple[Landing, ...]:
-    """Return each object's first contact with the floor after some frames without any contact.
-
-    Args:
-        positions: (F, N, 3) centres in TDW's axes."""
-    in_air = np.zeros(len(ids), int)
-    landed: dict[int, int] = {}
-    for k, frame in enumerate(frames):
-        listed = np.empty(0, np.int64)
-        if "env_collisions" in frame:
-            environment = _get_group(frame, "env_collisions")
-            listed = _read_array(environment, "object_ids", (-1,), np.int64)
-            touching = [n for n, name in enumerate(ids) if name in listed]
-            for n in _find_on_floor(environment, touching, positions[k]):
-                if in_air[n] >= AIR_FRAMES:
-                    landed.setdefault(n, k)
-        in_contact = [
-            name for pair, state in _read_pairs(frame) if state != b"exit" for name in pair
-        ]
-        in_air = np.where(np.isin(ids, [*in_contact, *listed]), 0, in_air + 1)
-    return tuple(Landing(k, n) for k, n in sorted((k, n) for n, k in landed.items()))
-
-
-def _find_on_floor(environment: h5py.Group, touching: list[int], positions: np.ndarray) -> set[int]:
-    """Return the objects that touch the floor, among those `touching` a wall or the floor.
-
-    The file does not assign contact points to objects, so each point is assigned to the object
-    that is nearest to it seen from above.
+    The file does not assign contact points with walls and the floor to objects, so each is assigned
+    to the object that is nearest to it seen from above, among those that touch a wall or the floor.
     """
-    contacts = _read_array(environment, "contacts", (-1, 2, 3))
-    normals, points = contacts[:, 0], contacts[:, 1]
-    floor = points[(normals[:, 1] > MIN_VERTICAL) & (np.abs(points[:, 1]) < FLOOR_TOLERANCE)]
-    if not touching:
-        return set()
-    distances = np.linalg.norm((floor[:, None] - positions[touching])[..., [0, 2]], axis=-1)
-    return {touching[n] for n in distances.argmin(axis=1)}
+    index_of = {name: k for k, name in enumerate(ids)}
+    touches = np.zeros((len(frames), len(ids)), bool)
+    touching, landed = [], []
+    for k, frame in enumerate(frames):
+        listed = _read_pairs(frame)
+        start = 0 if k < START_FRAMES and "collisions/states" not in frame else k
+        for pair in listed.tolist():
+            touching.append((start, [index_of.get(name, -1) for name in pair]))
+        in_environment = np.zeros(len(ids), bool)
+        if "env_collisions" in frame:
+            own = _read_array(frame, "env_collisions/object_ids", (-1,), np.int64)
+            in_environment = np.isin(ids, own)
+            contacts = _read_array(frame, "env_collisions/contacts", (-1, 2, 3))
+            normals, points = contacts[:, 0], contacts[:, 1]
+            on_floor = (normals[:, 1] > MIN_VERTICAL) & (np.abs(points[:, 1]) < FLOOR_TOLERANCE)
+            near = np.flatnonzero(in_environment)
+            steps = (points[on_floor][:, None] - positions[k, near])[..., [0, 2]]
+            was_in_air = ~touches[k - AIR_FRAMES : k].any(axis=0) & (k >= AIR_FRAMES)
+            if near.size:
+                nearest = near[np.linalg.norm(steps, axis=-1).argmin(axis=1)]
+                landed += [(k, n) for n in nearest if was_in_air[n]]
+        touches[k] = in_environment | np.isin(ids, listed)
+    return find_contacts(touching, len(ids), fps), first_landings(landed)
+
+
+def _read_pairs(frame: h5py.Group) -> np.ndarray:
+    """Return the pairs of object ids that touch in a frame, (C, 2)."""
+    if "collisions" not in frame:
+        return np.empty((0, 2), np.int64)
+    pairs = _read_array(frame, "collisions/object_ids", (-1, 2), np.int64)
+    if "collisions/states" not in frame:
+        return pairs
+    states = _read_texts(frame, "collisions/states")
+    if len(states) != len(pairs):
+        where = _locate(frame, "collisions")
+        raise RecordError(f"{where} has {len(states)} states of {len(pairs)} pairs")
+    return pairs[[state != "exit" for state in states]]
 
 
 def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
     """Return frames of a trial as RGB images, by frame index (from 0 for files of all versions)."""
-    path = folder / str(scene.footage)
-    with _open(path) as file:
-        groups = _list_frames(file)
-        if len(groups) != scene.frames:
-            raise RecordError(f"{path} has {len(groups)} frames, expected {scene.frames}")
-        return {frame: _read_image(groups[frame], "_img") for frame in frames}
+    with _open(folder / str(scene.footage)) as file:
+        first = 0 if "frames/0000" in file else 1
+        return {k: _read_image(file, f"frames/{k + first:04d}/images/_img") for k in frames}
 
 
-def _read_image(frame: h5py.Group, key: str) -> Image.Image:
-    images = _get_group(frame, "images")
-    return decode_image(_read_values(images, key).tobytes(), _locate(images, key))
+def _read_image(parent: h5py.Group, key: str) -> Image.Image:
+    return decode_image(_read_values(parent, key).tobytes(), _locate(parent, key))
 
 
-def _decode(text: Any) -> str:
-    return text.decode(errors="replace") if isinstance(text, bytes) else str(text)
+def _read_texts(parent: h5py.Group, key: str) -> list[str]:
+    values = _read_values(parent, key).astype("S").ravel()
+    return np.strings.decode(values, errors="replace").tolist()
 
 
 @contextmanager
@@ -332,47 +294,50 @@ def _open(path: Path) -> Iterator[h5py.File]:
         ) from error
 
 
-def _locate(parent: h5py.Group, *keys: str) -> str:
+def _locate(parent: h5py.Group, key: str) -> str:
     """Return the file and the path inside it, for error messages."""
-    return f"{parent.file.filename}: {'/'.join([parent.name.rstrip('/'), *keys])}"
-
-
-def _get_group(parent: h5py.Group, key: str) -> h5py.Group:
-    return _get_child(parent, key, "keys")
-
-
-def _get_dataset(parent: h5py.Group, key: str) -> h5py.Dataset:
-    return _get_child(parent, key, "shape")
-
-
-def _get_child(parent: h5py.Group, key: str, attribute: str) -> Any:
-    """Return a child of `parent`, with or without the suffix of later versions.
-
-    Raises:
-        RecordError: The child is missing, damaged or of another kind, which is recognized by its
-            `attribute`: a dataset has a `shape`, a group has `keys`.
-    """
-    names = _find_names(parent, key)
-    for name in names:
-        # `get` returns None if the child's header is damaged.
-        child = parent.get(name)
-        if getattr(child, attribute, None) is not None:
-            return child
-    if names:
-        raise RecordError(f"{_locate(parent, key)} is damaged", "damaged-file")
-    raise RecordError(f"{_locate(parent, key)} is missing")
+    return f"{parent.file.filename}: {parent.name.rstrip('/')}/{key}"
 
 
 def _find_names(parent: h5py.Group, key: str) -> list[str]:
     return [name for name in (key, f"{key}_cam0") if name in parent]
 
 
+def _find(parent: h5py.Group, key: str) -> Any:
+    """Return a group or dataset below `parent`, with or without the suffix of later versions.
+
+    Raises:
+        RecordError: It is missing or damaged.
+    """
+    names = _find_names(parent, key)
+    if not names:
+        raise RecordError(f"{_locate(parent, key)} is missing")
+    # `get` returns None if the header is damaged.
+    if (child := parent.get(names[0])) is None:
+        raise RecordError(f"{_locate(parent, key)} is damaged", "damaged-file")
+    return child
+
+
 def _read_values(parent: h5py.Group, key: str) -> np.ndarray:
     """Return a dataset's values. Raises RecordError if it is missing, or if its type is damaged."""
     try:
-        return np.asarray(_get_dataset(parent, key)[()])
+        return np.asarray(_find(parent, key)[()])
     except (TypeError, ValueError) as error:
         raise RecordError(f"{_locate(parent, key)} is damaged: {error}", "damaged-file") from error
+
+
+def _read_series(
+    frames: list[h5py.Group],
+    key: str,
+    shape: tuple[int, ...],
+    dtype: type = np.float32,
+    optional: bool = False,
+) -> np.ndarray:
+    """Return a dataset of all frames as an array (F, *shape); with `optional`, the first frame may
+    lack it, for which NaN stands in all frames."""
+    if optional and not _find_names(frames[0], key):
+        return np.full((len(frames), *shape), np.nan, dtype)
+    return np.stack([_read_array(frame, key, shape, dtype, optional) for frame in frames])
 
 
 def _read_array(
@@ -388,9 +353,12 @@ def _read_array(
     Raises:
         RecordError: The dataset is missing, does not fit the shape, or has non-finite values.
     """
-    dataset = _get_dataset(parent, key)
-    lengths = list(zip(dataset.shape, shape, strict=False))
+    values = _read_values(parent, key)
+    lengths = list(zip(values.shape, shape, strict=False))
     # Other numbers of axes are reshaped: a matrix may be flat, and an empty list has one axis.
-    if dataset.ndim == len(shape) and any(-1 != wanted != found for found, wanted in lengths):
-        raise RecordError(f"{_locate(dataset)}: shape {dataset.shape}, expected {shape}")
-    return finite_array(_read_values(parent, key), shape, _locate(dataset), dtype, optional)
+    if values.ndim == len(shape) and any(-1 != wanted != found for found, wanted in lengths):
+        raise RecordError(f"{_locate(parent, key)}: shape {values.shape}, expected {shape}")
+    try:
+        return finite_array(values, shape, optional).astype(dtype)
+    except ValueError as error:
+        raise RecordError(f"{_locate(parent, key)}: {error}") from error

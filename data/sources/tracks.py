@@ -36,7 +36,7 @@ from pydantic import ConfigDict, Field
 
 from data.records import FRAMES, Scene, SceneObject
 from data.sources.motchallenge import Track, read_tracks
-from data.sources.validation import Layout, RecordError, check_unique_scenes, read_yaml, scene_id
+from data.sources.validation import Layout, RecordError, check_unique_scenes, read_layout, scene_id
 from data.sources.videos import Video, describe_video, load_frames
 
 FOLDER_CONTENTS = "a video street.mp4 beside its tracks street.txt, and tracks.yaml"
@@ -84,7 +84,7 @@ def list_scenes(folder: Path) -> list[Path]:
     found = sorted(path for path in folder.glob("*") if path.suffix.lower() in VIDEO_SUFFIXES)
     paths = [video / f"{first:06d}" for video in found for first in _clip_starts(video)]
     check_unique_scenes(folder, paths, _scene_id, FOLDER_CONTENTS)
-    names = read_yaml(folder / NAMES, Names)
+    names = read_layout(folder / NAMES, Names)
     if unknown := sorted(names.videos.keys() - {video.stem for video in found}):
         raise RecordError(f"{folder / NAMES}: videos.{unknown[0]}: {folder} has no such video")
     return paths
@@ -106,7 +106,7 @@ def _scene_id(path: Path) -> str:
 def read_scene(path: Path, folder: Path, split: str) -> Scene:
     """Return the scene of a clip, with the objects that have a box in it."""
     file, first = path.parent, int(path.name)
-    video, names = describe_video(file), read_yaml(folder / NAMES, Names)
+    video, names = describe_video(file), read_layout(folder / NAMES, Names)
     own = names.videos.get(file.stem, VideoNames())
     total, (_, height) = len(video.times), video.size
     if total < SHORTEST_CLIP:

@@ -1,11 +1,12 @@
-"""Checks that the readers of other simulators' releases share."""
+"""What the readers of other simulators' releases share: checks, and the grouping of contacts."""
 
 from __future__ import annotations
 
 import io
 import re
 import warnings
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,10 +14,12 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 from PIL import Image
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, conlist
+from pydantic_core import from_json
 
 from conf.errors import UserError
-from data.records import Scene
+from data.oracle.contacts import group_contacts
+from data.records import Collision, Landing, Scene
 
 FLOOR_TOLERANCE = 0.05
 """Maximum distance from the floor's plane of a contact with the floor, simulator units."""
@@ -65,42 +68,37 @@ class Layout(BaseModel):
 
 
 AnyLayout = TypeVar("AnyLayout", bound=Layout)
+Vector = conlist(float, min_length=3, max_length=3)
 
 
-def read_json(path: Path, layout: type[AnyLayout]) -> AnyLayout:
-    """Return the content of a JSON file.
+def read_layout(path: Path, layout: type[AnyLayout]) -> AnyLayout:
+    """Return the content of a JSON or YAML file.
 
     Raises:
         RecordError: The file is missing or damaged, or does not have the layout.
     """
+    kind = "YAML" if path.suffix == ".yaml" else "JSON"
     try:
-        return layout.model_validate_json(path.read_bytes())
+        content = (yaml.safe_load if kind == "YAML" else from_json)(path.read_bytes())
     except FileNotFoundError as error:
         raise RecordError(f"{path} is missing", "missing-file") from error
+    except (ValueError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise RecordError(f"{path} is not {kind}: {reason}", "damaged-file") from error
+    return check_layout(str(path), content, layout)
+
+
+def check_layout(where: str, content: Any, layout: type[AnyLayout]) -> AnyLayout:
+    """Return content as a layout. Raises RecordError if it does not have it."""
+    try:
+        return layout.model_validate(content)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        if first["type"] == "json_invalid":
-            raise RecordError(f"{path} is not JSON: {first['msg']}", "damaged-file") from error
-        raise _other_layout(path, error) from error
-
-
-def read_yaml(path: Path, layout: type[AnyLayout]) -> AnyLayout:
-    """Return the content of a YAML file. Raises RecordError as `read_json` does."""
-    try:
-        return layout.model_validate(yaml.safe_load(path.read_bytes()))
-    except FileNotFoundError as error:
-        raise RecordError(f"{path} is missing", "missing-file") from error
-    except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise RecordError(f"{path} is not YAML: {reason}", "damaged-file") from error
-    except ValidationError as error:
-        raise _other_layout(path, error) from error
-
-
-def _other_layout(path: Path, error: ValidationError) -> RecordError:
-    first = error.errors(include_url=False)[0]
-    where = ".".join(map(str, first["loc"])) or "the file"
-    return RecordError(f"{path} does not have the published layout: {where}: {first['msg']}")
+        place = ".".join(map(str, first["loc"])) or "the file"
+        found = f" is {first['input']!r}" if isinstance(first["input"], str | int | float) else ""
+        raise RecordError(
+            f"{where} does not have the published layout: {place}{found}: {first['msg']}"
+        ) from error
 
 
 def scene_id(*parts: str) -> str:
@@ -139,29 +137,45 @@ def check_unique_scenes(
     return paths
 
 
-def finite_array(
-    values: Any,
-    shape: tuple[int, ...],
-    where: str,
-    dtype: type = np.float32,
-    optional: bool = False,
-) -> np.ndarray:
+def finite_array(values: Any, shape: tuple[int, ...], optional: bool = False) -> np.ndarray:
     """Return numbers as an array of `shape`, in which -1 stands for any length.
 
     Args:
         optional: Let non-finite numbers pass: they stand for what is not recorded.
 
     Raises:
-        RecordError: The values do not fit the shape, or not all of them are finite numbers.
+        ValueError: The values do not fit the shape, or not all of them are finite numbers.
     """
     try:
         array = np.asarray(values, np.float64).reshape(shape)
     except (TypeError, ValueError) as error:
-        raise RecordError(f"{where}: expected numbers of shape {shape}: {error}") from error
-    if not optional and not np.isfinite(array).all():
-        first = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
-        raise RecordError(f"{where}: non-finite values (NaN or Inf), the first at index {first}")
-    return array.astype(dtype)
+        raise ValueError(f"expected numbers of shape {shape}: {error}") from error
+    if not optional and (wrong := np.argwhere(~np.isfinite(array))).size:
+        first = tuple(wrong[0].tolist())
+        raise ValueError(f"non-finite values (NaN or Inf), the first at index {first}")
+    return array
+
+
+def find_contacts(
+    touches: Iterable[tuple[int, Sequence[int]]], count: int, fps: float
+) -> tuple[Collision, ...]:
+    """Return the contacts of two of `count` objects, from the frames in which pairs touch. Another
+    index stands for what is no object, such as the floor."""
+    touching: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for frame, pair in touches:
+        one, other = sorted(pair)
+        if 0 <= one < other < count:
+            touching[one, other].append(frame)
+    return group_contacts(touching, fps)
+
+
+def first_landings(touches: Iterable[tuple[int, int]]) -> tuple[Landing, ...]:
+    """Return each object's first landing, from the frames in which objects (by index) land. An
+    object that touches the floor in the first frame has none."""
+    first: dict[int, int] = {}
+    for frame, k in sorted(touches):
+        first.setdefault(int(k), int(frame))
+    return tuple(Landing(frame, k) for k, frame in first.items() if frame > 0)
 
 
 def decode_image(image: bytes | Path, where: str) -> Image.Image:

@@ -74,28 +74,18 @@ def load_frames(path: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
     index_of = {time: k for k, time in enumerate(times)}
     start = min(wanted) - SEEK_MARGIN
     can_seek = None not in index_of and len(index_of) == len(times) > start > 0
-    images = _decode(path, wanted, index_of, times[start]) if can_seek else {}
-    if missing := wanted - images.keys():
-        images |= _decode(path, missing)
-    if missing := wanted - images.keys():
-        raise RecordError(f"{path} ends before frame {min(missing)}", "damaged-file")
-    return images
-
-
-def _decode(
-    path: Path, wanted: set[int], index_of: dict[int, int] | None = None, since: int | None = None
-) -> dict[int, Image.Image]:
-    """Return the wanted frames as far as they are found, by decoding from the time `since`, where
-    `index_of` tells the frames by their times, or from the start of the video."""
     images: dict[int, Image.Image] = {}
-    with open_video(path) as video:
-        stream = video.streams.video[0]
-        if since is not None:
-            video.seek(since, stream=stream)
-        for number, frame in enumerate(video.decode(stream)):
-            index = number if index_of is None else index_of.get(frame.pts)
-            if index in wanted:
-                images[index] = frame.to_image()
-                if len(images) == len(wanted):
-                    break
-    return images
+    # If a search for the time finds a later frame, decode again from the start of the video.
+    for since in ([times[start]] if can_seek else []) + [None]:
+        with open_video(path) as video:
+            stream = video.streams.video[0]
+            if since is not None:
+                video.seek(since, stream=stream)
+            for number, frame in enumerate(video.decode(stream)):
+                index = number if since is None else index_of.get(frame.pts)
+                if index in wanted:
+                    images[index] = frame.to_image()
+                    if len(images) == len(wanted):
+                        return images
+    missing = min(wanted - images.keys())
+    raise RecordError(f"{path} ends before frame {missing}", "damaged-file")

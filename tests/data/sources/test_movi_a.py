@@ -172,7 +172,9 @@ FOLDER_DEFECTS: dict[str, tuple[str, Callable[[dict], object], str]] = {
     ),
     "fewer frames": ("metadata.json", lambda r: r["metadata"].update(num_frames=12), "num_frames"),
     "an array of 23 frames": (
-        "metadata.json", lambda r: [i["positions"].pop() for i in r["instances"]], "(3,24,3)"
+        "metadata.json",
+        lambda r: [i["positions"].pop() for i in r["instances"]],
+        "instances.0.positions",
     ),
     "MoVi-B's shapes": (
         "metadata.json", lambda r: r["instances"][0].update(shape="teapot"), "instances.0.shape"
@@ -211,7 +213,9 @@ def test_missing_and_damaged_files_of_a_folder_are_named(tmp_path: Path) -> None
 RECORD_DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
     "no positions": (lambda f: f.pop("instances/positions"), "'instances/positions'"),
     "one value too few": (lambda f: f["instances/positions"].pop(), "215"),
-    "MoVi-B's shapes": (lambda f: f["instances/shape_label"].__setitem__(1, 9), "shape_label"),
+    "MoVi-B's shapes": (
+        lambda f: f["instances/shape_label"].__setitem__(1, 9), "instances.1.shape"
+    ),
     "one frame too few": (lambda f: f["video"].pop(), "23"),
 }  # fmt: skip
 
