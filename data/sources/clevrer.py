@@ -43,8 +43,7 @@ from data.sources.validation import (
 from data.sources.videos import describe_video, load_frames
 
 FOLDER_CONTENTS = (
-    "annotation_train/annotation_00000-01000/annotation_00000.json and so on beside "
-    "video_train/video_00000-01000/video_00000.mp4"
+    "annotation_train/.../annotation_00000.json beside video_train/.../video_00000.mp4"
 )
 FRAME_SECONDS = 0.028
 """Simulated seconds per frame."""
@@ -88,10 +87,8 @@ class Annotation(Layout):
 
 
 def list_scenes(folder: Path) -> list[Path]:
-    """Return the paths of the annotations below a folder, in order of their numbers.
-
-    A copy such as `annotation_00000 (1).json` has the number of its original.
-    """
+    """Return the paths of the annotations below a folder, in order of their numbers. A copy such as
+    `annotation_00000 (1).json` has the number of its original."""
     paths = sorted(folder.rglob("annotation_*.json"), key=lambda path: (path.stem, path))
     return check_unique_scenes(folder, paths, _scene_id, FOLDER_CONTENTS)
 
@@ -102,11 +99,8 @@ def _scene_id(path: Path) -> str:
 
 
 def read_scene(path: Path, folder: Path, split: str) -> Scene:
-    """Return the scene of an annotation.
-
-    Visible fractions are computed from the poses; whether an object is in view is read from the
-    annotation.
-    """
+    """Return the scene of an annotation. Visible fractions are computed from the poses; whether an
+    object is in view is read from the annotation."""
     from scipy.spatial.transform import Rotation
 
     annotation = read_layout(path, Annotation)
@@ -118,42 +112,40 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
             "those of the file's number: as a copy of another scene, it would occur twice",
             "duplicate-scene",
         )
-    appearances = {
-        o.object_id: SceneObject(o.shape, o.material, o.color) for o in annotation.object_property
-    }
-    ids, objects = list(appearances), tuple(appearances.values())
+    ids = [each.object_id for each in annotation.object_property]
+    objects = tuple(SceneObject(o.shape, o.material, o.color) for o in annotation.object_property)
+    touches = []
     for contact in annotation.collision:
         if len({*contact.object_ids} & {*ids}) < 2:
             raise RecordError(f"{path}: collision of {contact.object_ids}, expected two of {ids}")
-    touches = [(c.frame_id, [*map(ids.index, c.object_ids)]) for c in annotation.collision]
-    states = []
+        touches.append((contact.frame_id, [*map(ids.index, contact.object_ids)]))
+    place = {name: k for k, name in enumerate(ids)}
     for index, frame in enumerate(annotation.motion_trajectory):
-        by_id = {state.object_id: state for state in frame.objects}
-        if frame.frame_id != index or by_id.keys() != set(ids):
+        frame.objects.sort(key=lambda state: place.get(state.object_id, len(ids)))
+        listed = [state.object_id for state in frame.objects]
+        if frame.frame_id != index or listed != ids:
             raise RecordError(
-                f"{path}: frame {frame.frame_id} lists objects {sorted(by_id)}, expected frame "
-                f"{index} with objects {sorted(ids)}"
+                f"{path}: frame {frame.frame_id} lists objects {listed}, expected frame {index} "
+                f"with objects {ids}"
             )
-        states.append([by_id[k] for k in ids])
 
     def array(key: str, dtype: type = np.float32) -> np.ndarray:
-        return np.array([[getattr(state, key) for state in row] for row in states], dtype)
+        frames = annotation.motion_trajectory
+        return np.array([[getattr(s, key) for s in frame.objects] for frame in frames], dtype)
 
     footage = Path(str(path.relative_to(folder)).replace("annotation", "video"))
     footage = footage.with_name(annotation.video_filename)
     count = len(describe_video(folder / footage).times)
     if count != FRAMES:
         raise RecordError(f"{folder / footage} has {count} frames, expected {FRAMES}")
-    angles = array("orientation").astype(np.float64).reshape(-1, 3)
-    turns = Rotation.from_euler("xyz", angles).as_quat().reshape(FRAMES, -1, 4)
-    # Ours have the axis z. The rotation comes first: it is in the cylinder's own coordinates.
-    upright = Rotation.from_euler("x", -np.pi / 2)
-    quaternions = turns.copy()
-    for k, each in enumerate(objects):
-        if each.shape == "cylinder":
-            quaternions[:, k] = (Rotation.from_quat(turns[:, k]) * upright).as_quat()
+    quaternions = np.empty((FRAMES, len(ids), 4))
+    for k, angles in enumerate(array("orientation").astype(float).swapaxes(0, 1)):
+        turns = Rotation.from_euler("xyz", angles)
+        if objects[k].shape == "cylinder":
+            # Ours have the axis z. This rotation is first, in the cylinder's own coordinates.
+            turns = turns * Rotation.from_euler("x", -np.pi / 2)
+        quaternions[:, k] = turns.as_quat()
     camera, positions = Camera(), array("location").astype(np.float64)
-    image_positions, _ = camera.project(positions)
     scales = tuple(RADIUS / CUBE_HALF if each.shape == "cube" else 1.0 for each in objects)
     _, fraction = compute_visibility(objects, positions, quaternions, camera, scales)
     rate = np.float32(FPS * FRAME_SECONDS)
@@ -166,7 +158,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
         quaternions=quaternions.astype(np.float32),
         velocities=array("velocity") * rate,
         angular_velocities=array("angular_velocity") * rate,
-        image_positions=image_positions.astype(np.float32),
+        image_positions=camera.project(positions)[0].astype(np.float32),
         in_view=array("inside_camera_view", bool),
         visible_fraction=fraction.astype(np.float32),
         image_size=(camera.width, camera.height),

@@ -17,40 +17,30 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from data.sources.validation import Layout, RecordError, check_layout
 
 Whole = Annotated[float, Field(multiple_of=1)]
 
 
-# The layouts of a line.
-class Box(Layout):
-    model_config = ConfigDict(strict=False)
+class Box(Layout, strict=False):
+    """A line. Detections that no tracker has linked have id -1; they are refused."""
 
     frame: Annotated[Whole, Field(ge=1)]
-    # Detections that no tracker has linked have id -1.
     id: Annotated[Whole, Field(ge=0)]
     bb_left: float
     bb_top: float
     bb_width: Annotated[float, Field(ge=0)]
     bb_height: Annotated[float, Field(ge=0)]
     conf: float
+    category: Whole = Field(np.nan, alias="class")
+    visibility: float = np.nan
 
 
-class TruthBox(Box):
-    category: Whole = Field(alias="class")
-    visibility: float
-
-
-class ResultBox(Box):
-    x: float
-    y: float
-    z: float
-
-
-LAYOUTS: dict[int, type[Box]] = {9: TruthBox, 10: ResultBox}
-"""Layout of a line by its number of columns."""
+TRUTH = ["frame", "id", "bb_left", "bb_top", "bb_width", "bb_height", "conf", "class", "visibility"]
+COLUMNS = {9: TRUTH, 10: [*TRUTH[:7], "x", "y", "z"]}
+"""Names of the columns of a line, by their number."""
 CACHED_FILES = 2
 
 
@@ -80,11 +70,7 @@ class Track(NamedTuple):
 
 
 def read_tracks(path: Path) -> dict[int, Track]:
-    """Return the tracks of a file by id, in order of id.
-
-    Raises:
-        RecordError: The file is missing, has no box, or a line without one of the layouts.
-    """
+    """Return the tracks of a file by id, in order of id."""
     try:
         return _parse(path, path.stat().st_mtime_ns)
     except FileNotFoundError as error:
@@ -97,7 +83,7 @@ def _parse(path: Path, modified: int) -> dict[int, Track]:
     last change stays the same."""
     first_lines: dict[tuple[float, float], int] = {}
     rows: list[tuple[float, ...]] = []
-    expected = [*LAYOUTS]
+    expected = [*COLUMNS]
     for number, line in enumerate(path.read_text().splitlines(), 1):
         if not line.strip():
             continue
@@ -107,21 +93,16 @@ def _parse(path: Path, modified: int) -> dict[int, Track]:
             numbers = " or ".join(map(str, expected))
             raise RecordError(f"{where} has {len(cells)} columns, expected {numbers}")
         expected = [len(cells)]
-        layout = LAYOUTS[len(cells)]
-        names = [field.alias or name for name, field in layout.model_fields.items()]
-        box = check_layout(where, dict(zip(names, cells, strict=True)), layout)
+        box = check_layout(where, dict(zip(COLUMNS[len(cells)], cells, strict=True)), Box)
         if (other := first_lines.setdefault((box.id, box.frame), number)) != number:
             raise RecordError(
                 f"{where}: id {box.id:.0f} has another box in this frame on line {other}"
             )
-        visibility, category = np.nan, np.nan
-        if isinstance(box, TruthBox):
-            visibility = box.visibility if box.visibility >= 0 else np.nan
-            category = box.category
-        if box.conf > 0 or (isinstance(box, ResultBox) and box.conf == -1):
+        if box.conf > 0 or (len(cells) == 10 and box.conf == -1):
             centre = box.bb_left + box.bb_width / 2, box.bb_top + box.bb_height / 2
-            size = box.bb_width, box.bb_height
-            rows.append((box.id, box.frame - 1, *centre, *size, visibility, category, number))
+            visibility = box.visibility if box.visibility >= 0 else np.nan
+            sizes = box.bb_width, box.bb_height
+            rows.append((box.id, box.frame - 1, *centre, *sizes, visibility, box.category, number))
     if not rows:
         raise RecordError(f"{path} has no box of an object: expected the tracks of a video")
     boxes = np.array(sorted(rows))

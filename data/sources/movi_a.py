@@ -156,7 +156,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     instances, size = metadata.instances, tuple(metadata.metadata.resolution)
 
     def array(key: str) -> np.ndarray:
-        return np.stack([getattr(each, key) for each in instances], 1, dtype=np.float32)
+        return np.stack([getattr(each, key) for each in instances], dtype=np.float32).swapaxes(0, 1)
 
     # The first frame at or after each contact, if it is one of the video.
     times = np.ceil(np.float32([contact.frame for contact in contacts])) - 1

@@ -197,7 +197,7 @@ def _list_frames(file: h5py.File) -> list[h5py.Group]:
 def _project(frames: list[h5py.Group], positions: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Project (F, N, 3) centres in TDW's axes to (F, N, 2) px with the camera of each frame."""
     projection, view = (
-        _read_series(frames, f"camera_matrices/{key}", (4, 4), np.float64)
+        _read_series(frames, f"camera_matrices/{key}", (4, 4)).astype(float)
         for key in ("projection_matrix", "camera_matrix")
     )
     homogeneous = np.concatenate([positions, np.ones((*positions.shape[:2], 1))], axis=-1)
@@ -229,39 +229,36 @@ def _find_events(
     touches = np.zeros((len(frames), len(ids)), bool)
     touching, landed = [], []
     for k, frame in enumerate(frames):
-        listed = _read_pairs(frame)
-        start = 0 if k < START_FRAMES and "collisions/states" not in frame else k
+        listed, start = _read_ids(frame, "collisions", 2), k
+        if "collisions/states" in frame:
+            states = _read_texts(frame, "collisions/states")
+            if len(states) != len(listed):
+                where = _locate(frame, "collisions")
+                raise RecordError(f"{where} has {len(states)} states of {len(listed)} pairs")
+            listed = listed[[state != "exit" for state in states]]
+        elif k < START_FRAMES:
+            start = 0
         for pair in listed.tolist():
             touching.append((start, [index_of.get(name, -1) for name in pair]))
-        in_environment = np.zeros(len(ids), bool)
-        if "env_collisions" in frame:
-            own = _read_array(frame, "env_collisions/object_ids", (-1,), np.int64)
-            in_environment = np.isin(ids, own)
+        environment = _read_ids(frame, "env_collisions")
+        touches[k] = np.isin(ids, [*listed.ravel(), *environment])
+        near = np.flatnonzero(np.isin(ids, environment))
+        if near.size and k >= AIR_FRAMES:
             contacts = _read_array(frame, "env_collisions/contacts", (-1, 2, 3))
             normals, points = contacts[:, 0], contacts[:, 1]
             on_floor = (normals[:, 1] > MIN_VERTICAL) & (np.abs(points[:, 1]) < FLOOR_TOLERANCE)
-            near = np.flatnonzero(in_environment)
             steps = (points[on_floor][:, None] - positions[k, near])[..., [0, 2]]
-            was_in_air = ~touches[k - AIR_FRAMES : k].any(axis=0) & (k >= AIR_FRAMES)
-            if near.size:
-                nearest = near[np.linalg.norm(steps, axis=-1).argmin(axis=1)]
-                landed += [(k, n) for n in nearest if was_in_air[n]]
-        touches[k] = in_environment | np.isin(ids, listed)
+            nearest = near[np.linalg.norm(steps, axis=-1).argmin(axis=1)]
+            was_in_air = ~touches[k - AIR_FRAMES : k].any(axis=0)
+            landed += [(k, n) for n in nearest if was_in_air[n]]
     return find_contacts(touching, len(ids), fps), first_landings(landed)
 
 
-def _read_pairs(frame: h5py.Group) -> np.ndarray:
-    """Return the pairs of object ids that touch in a frame, (C, 2)."""
-    if "collisions" not in frame:
-        return np.empty((0, 2), np.int64)
-    pairs = _read_array(frame, "collisions/object_ids", (-1, 2), np.int64)
-    if "collisions/states" not in frame:
-        return pairs
-    states = _read_texts(frame, "collisions/states")
-    if len(states) != len(pairs):
-        where = _locate(frame, "collisions")
-        raise RecordError(f"{where} has {len(states)} states of {len(pairs)} pairs")
-    return pairs[[state != "exit" for state in states]]
+def _read_ids(frame: h5py.Group, group: str, *shape: int) -> np.ndarray:
+    """Return the ids that a group of contacts lists; early files lack the groups."""
+    if group not in frame:
+        return np.empty((0, *shape), np.int64)
+    return _read_array(frame, f"{group}/object_ids", (-1, *shape), np.int64)
 
 
 def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
@@ -272,11 +269,11 @@ def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, 
 
 
 def _read_image(parent: h5py.Group, key: str) -> Image.Image:
-    return decode_image(_read_values(parent, key).tobytes(), _locate(parent, key))
+    return decode_image(_read_array(parent, key).tobytes(), _locate(parent, key))
 
 
 def _read_texts(parent: h5py.Group, key: str) -> list[str]:
-    values = _read_values(parent, key).astype("S").ravel()
+    values = _read_array(parent, key).astype("S").ravel()
     return np.strings.decode(values, errors="replace").tolist()
 
 
@@ -299,62 +296,47 @@ def _locate(parent: h5py.Group, key: str) -> str:
     return f"{parent.file.filename}: {parent.name.rstrip('/')}/{key}"
 
 
-def _find_names(parent: h5py.Group, key: str) -> list[str]:
-    return [name for name in (key, f"{key}_cam0") if name in parent]
+def _has(parent: h5py.Group, key: str) -> bool:
+    return key in parent or f"{key}_cam0" in parent
 
 
 def _find(parent: h5py.Group, key: str) -> Any:
-    """Return a group or dataset below `parent`, with or without the suffix of later versions.
-
-    Raises:
-        RecordError: It is missing or damaged.
-    """
-    names = _find_names(parent, key)
-    if not names:
+    """Return a group or dataset below `parent`, with or without the suffix of later versions."""
+    if not _has(parent, key):
         raise RecordError(f"{_locate(parent, key)} is missing")
     # `get` returns None if the header is damaged.
-    if (child := parent.get(names[0])) is None:
+    child = parent.get(key if key in parent else f"{key}_cam0")
+    if child is None:
         raise RecordError(f"{_locate(parent, key)} is damaged", "damaged-file")
     return child
 
 
-def _read_values(parent: h5py.Group, key: str) -> np.ndarray:
-    """Return a dataset's values. Raises RecordError if it is missing, or if its type is damaged."""
-    try:
-        return np.asarray(_find(parent, key)[()])
-    except (TypeError, ValueError) as error:
-        raise RecordError(f"{_locate(parent, key)} is damaged: {error}", "damaged-file") from error
-
-
 def _read_series(
-    frames: list[h5py.Group],
-    key: str,
-    shape: tuple[int, ...],
-    dtype: type = np.float32,
-    optional: bool = False,
+    frames: list[h5py.Group], key: str, shape: tuple[int, ...], optional: bool = False
 ) -> np.ndarray:
     """Return a dataset of all frames as an array (F, *shape); with `optional`, the first frame may
-    lack it, for which NaN stands in all frames."""
-    if optional and not _find_names(frames[0], key):
-        return np.full((len(frames), *shape), np.nan, dtype)
-    return np.stack([_read_array(frame, key, shape, dtype, optional) for frame in frames])
+    lack it, for which NaN stands in all frames, and non-finite values stay."""
+    if optional and not _has(frames[0], key):
+        return np.full((len(frames), *shape), np.nan, np.float32)
+    return np.stack([_read_array(frame, key, shape, optional=optional) for frame in frames])
 
 
 def _read_array(
     parent: h5py.Group,
     key: str,
-    shape: tuple[int, ...],
+    shape: tuple[int, ...] | None = None,
     dtype: type = np.float32,
     optional: bool = False,
 ) -> np.ndarray:
-    """Return a dataset as an array of `shape`, in which -1 stands for any length; with `optional`,
-    non-finite values stay.
-
-    Raises:
-        RecordError: The dataset is missing, does not fit the shape, or has non-finite values.
-    """
-    values = _read_values(parent, key)
-    lengths = list(zip(values.shape, shape, strict=False))
+    """Return a dataset as an array of `shape`, in which -1 stands for any length, or as it is. With
+    `optional`, non-finite values stay."""
+    try:
+        values = np.asarray(_find(parent, key)[()])
+    except (TypeError, ValueError) as error:
+        raise RecordError(f"{_locate(parent, key)} is damaged: {error}", "damaged-file") from error
+    if shape is None:
+        return values
+    lengths = zip(values.shape, shape, strict=False)
     # Other numbers of axes are reshaped: a matrix may be flat, and an empty list has one axis.
     if values.ndim == len(shape) and any(-1 != wanted != found for found, wanted in lengths):
         raise RecordError(f"{_locate(parent, key)}: shape {values.shape}, expected {shape}")

@@ -66,15 +66,12 @@ def read_release(
     workers: Workers,
     strict: bool,
 ) -> tuple[dict[str, list[str]], dict[str, int]]:
-    """Write the scenes at the paths `splits` of a release below `folder`; see `make_scenes`.
-
-    An invalid record is logged and left out, unless `strict` is set.
-    """
+    """Write the scenes at the paths `splits` of a release below `folder`; see `make_scenes`."""
     jobs, split_of = {}, {}
     for split, paths in splits.items():
         for path in paths:
             part = part_path(folder, [str(path), split, *_stamps(path, Path(cfg.folder))])
-            if _problem_of(part):
+            if part.exists() and "problem" in json.loads(part.read_bytes()):
                 # The problem may have been fixed since, such as a missing video beside the record.
                 part.unlink()
             jobs[part] = partial(_read_one, cfg, path, split, folder, part)
@@ -83,10 +80,10 @@ def read_release(
     scene_ids: dict[str, list[str]] = {split: [] for split in SPLITS}
     problems, factors = [], []
     for part, split in split_of.items():
-        if problem := _problem_of(part):
-            problems.append(problem)
+        outcome = json.loads(part.read_bytes())
+        if "problem" in outcome:
+            problems.append(outcome["problem"])
         else:
-            outcome = json.loads(part.read_bytes())
             scene_ids[split].append(outcome["scene_id"])
             factors += outcome["factors"]
     if factors:
@@ -117,11 +114,6 @@ def _stamps(path: Path, folder: Path) -> list[tuple[int, int]]:
     file = path if path.exists() else path.parent
     files = sorted({file, *file.parent.glob(f"{file.stem}.*"), *folder.glob("*.yaml")})
     return [(each.stat().st_size, each.stat().st_mtime_ns) for each in files]
-
-
-def _problem_of(part: Path) -> str | None:
-    """Return why a record was left out; None if it was read, or not yet."""
-    return json.loads(part.read_bytes()).get("problem") if part.exists() else None
 
 
 def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: Path) -> None:

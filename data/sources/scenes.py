@@ -38,15 +38,8 @@ Element = TypeVar("Element")
 def make_scenes(
     cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool
 ) -> tuple[dict[str, list[str]], dict[str, int]]:
-    """Write every missing scene below `folder`.
-
-    Returns:
-        Scene ids by split, in a stable order, and the number of invalid records.
-
-    Raises:
-        UserError: a split would be empty, the release is missing, or `strict` is set and a record
-            is invalid.
-    """
+    """Write every missing scene below `folder`. Return scene ids by split, in a stable order, and
+    the number of invalid records, which stop a build if `strict` is set."""
     if cfg.simulator != "bullet":
         videos = split_scenes(cfg, list_release(cfg))
         splits = {split: [*chain.from_iterable(own)] for split, own in videos.items()}
@@ -75,9 +68,6 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
 
     A scene's split depends only on its index, the seed and the test share, so that a scene has the
     same split in a smaller and in a larger benchmark.
-
-    Raises:
-        UserError: a split would be empty.
     """
     splits: dict[str, list[Element]] = {split: [] for split in SPLITS}
     for first in range(0, len(scenes), SPLIT_BLOCK):
@@ -115,12 +105,11 @@ def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> N
     """Simulate a scene and, for counterfactual queries, the scene without one of its objects."""
     sample = sample_scene(cfg.world, cfg.seed, index)
     scene = record_scene(path.stem, split, sample, cfg.world)
-    if getattr(cfg.retrieval.counterfactual, split):
-        removed = removed_object(scene, cfg.seed)
-        if removed is not None:
-            name = counterfactual_id(scene.scene_id, removed)
-            other = simulate_without(name, split, sample.bodies, removed, cfg.world)
-            save_scene(other, path.with_name(f"{name}.npz"))
+    has_queries = getattr(cfg.retrieval.counterfactual, split)
+    if has_queries and (removed := removed_object(scene, cfg.seed)) is not None:
+        name = counterfactual_id(scene.scene_id, removed)
+        other = simulate_without(name, split, sample.bodies, removed, cfg.world)
+        save_scene(other, path.with_name(f"{name}.npz"))
     # This file is saved last, because it marks the job as done.
     save_scene(scene, path)
 
@@ -128,10 +117,8 @@ def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> N
 def simulate_without(
     name: str, split: str, bodies: list[Body], removed: int, world: WorldConfig
 ) -> Scene:
-    """Simulate a scene again without object `removed`.
-
-    Objects that the removed object never affects, directly or through others, move bit-identically.
-    """
+    """Simulate a scene again without object `removed`. Objects that it never affects, directly or
+    through others, move bit-identically."""
     rest = bodies[:removed] + bodies[removed + 1 :]
     return record_scene(name, split, Sample(rest, shared_simulator().simulate(rest, world)), world)
 

@@ -24,11 +24,8 @@ HEADER, FOOTER = 12, 4
 
 
 def record_ranges(path: Path) -> list[range]:
-    """Return the range of bytes in the file that contains the data of each record.
-
-    If a record reaches beyond the end of the file, its range is the last one: the records after it
-    cannot be located.
-    """
+    """Return the range of bytes in the file that contains the data of each record. The last one may
+    reach beyond the end of the file: the records after it cannot be located."""
     size, start, ranges = path.stat().st_size, 0, []
     with open(path, "rb") as file:
         while start < size:
@@ -40,11 +37,7 @@ def record_ranges(path: Path) -> list[range]:
 
 
 def read_example(path: Path, number: int) -> dict[str, Any]:
-    """Return the features of record `number` by name; `feature_values` converts them.
-
-    Raises:
-        RecordError: The record does not exist, is cut off or is damaged.
-    """
+    """Return the features of record `number` by name; `feature_values` converts them."""
     from google.protobuf.message import DecodeError
 
     where = f"{path}: record {number}"

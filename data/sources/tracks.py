@@ -2,13 +2,12 @@
 one file of names.
 
     <folder>/street.mp4     a video; `VIDEO_SUFFIXES` lists the endings
-             street.txt     its tracks: a box per line, in one of the layouts of MOTChallenge
+             street.txt     its tracks, as `data.sources.motchallenge` reads them
              tracks.yaml    names and attributes of the objects
 
-The text file has one of two layouts of MOTChallenge; the number of its columns decides (see
-`data.sources.motchallenge`). Its frames are those that the video shows, in order and without regard
-to a rotation that the container asks for. tracks.yaml names each object by its video and its
-id, or the objects of a class together, in lower-case words without digits:
+The frames of the text file are those that the video shows, in order and without regard to a
+rotation that the container asks for. tracks.yaml names each object by its video and its id, or the
+objects of a class together, in lower-case words without digits:
 
     classes: {1: pedestrian}
     videos:
@@ -32,7 +31,7 @@ from typing import Annotated
 
 import numpy as np
 from PIL import Image
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from data.records import FRAMES, Scene, SceneObject
 from data.sources.motchallenge import Track, read_tracks
@@ -57,23 +56,19 @@ Word = Annotated[str, Field(pattern=r"^[a-z]+( [a-z]+)*$")]
 
 
 # The layout of tracks.yaml.
-class Entry(Layout):
-    model_config = ConfigDict(extra="forbid")
-
-
-class ObjectNames(Entry):
+class ObjectNames(Layout, extra="forbid"):
     noun: Word | None = None
     material: Word | None = None
     color: Word | None = None
     size: Word | None = None
 
 
-class VideoNames(Entry):
+class VideoNames(Layout, extra="forbid"):
     fps: Annotated[float, Field(gt=0)] | None = None
     objects: dict[int, ObjectNames] = Field(default_factory=dict)
 
 
-class Names(Entry):
+class Names(Layout, extra="forbid"):
     classes: dict[int, Word] = Field(default_factory=dict)
     videos: dict[str, VideoNames] = Field(default_factory=dict)
 
@@ -124,7 +119,11 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     image, velocities = np.zeros((2, len(times), len(shown), 2))
     in_view, fraction, radii = np.zeros(image.shape[:2], bool), np.zeros(image.shape[:2]), []
     for k, track in enumerate(shown.values()):
-        image[:, k], velocities[:, k] = track.at(times), _velocities(track, times, fps)
+        image[:, k] = track.at(times)
+        # The velocity is 0 before and after the boxes.
+        early, late = np.clip([times - SPAN, times + SPAN], track.frames[0], track.frames[-1])
+        elapsed = np.maximum(late - early, 1)[:, None] / fps
+        velocities[:, k] = (track.at(late) - track.at(early)) / elapsed
         boxes = np.isin(track.frames, times)
         in_view[track.frames[boxes] - first, k] = True
         fraction[in_view[:, k], k] = track.visibility[boxes]
@@ -155,13 +154,6 @@ def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, 
     first = int(scene.scene_id.rpartition("-")[2])
     images = load_frames(folder / str(scene.footage), [first + frame for frame in frames])
     return {index - first: image for index, image in images.items()}
-
-
-def _velocities(track: Track, frames: np.ndarray, fps: float) -> np.ndarray:
-    """Return the velocity of a centre at F frames, (F, 2) px/s; 0 before and after its boxes."""
-    first, last = np.clip([frames - SPAN, frames + SPAN], track.frames[0], track.frames[-1])
-    elapsed = np.maximum(last - first, 1)[:, None] / fps
-    return (track.at(last) - track.at(first)) / elapsed
 
 
 def _to_plane(vectors: np.ndarray, height: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 from PIL import Image
-from pydantic import BaseModel, ConfigDict, ValidationError, conlist
+from pydantic import BaseModel, ValidationError, conlist
 from pydantic_core import from_json
 
 from conf.errors import UserError
@@ -40,11 +40,8 @@ an object's velocities up to which a factor explains the difference."""
 
 
 class RecordError(UserError):
-    """A scene's record in a release that does not have the published layout or cannot be read.
-
-    The message states the file, what it contains and what was expected. A caller either skips and
-    counts the record, or stops.
-    """
+    """A scene's record in a release that does not have the published layout or cannot be read. The
+    message states the file, what it contains and what was expected."""
 
     def __init__(self, message: str, code: str = "invalid-record") -> None:
         super().__init__(message, code)
@@ -61,10 +58,8 @@ class RescaledVelocities(UserWarning):
         self.factor = factor
 
 
-class Layout(BaseModel):
+class Layout(BaseModel, strict=True, allow_inf_nan=False):
     """The keys of a JSON or YAML object that a reader uses; other keys are ignored."""
-
-    model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
 
 AnyLayout = TypeVar("AnyLayout", bound=Layout)
@@ -72,11 +67,8 @@ Vector = conlist(float, min_length=3, max_length=3)
 
 
 def read_layout(path: Path, layout: type[AnyLayout]) -> AnyLayout:
-    """Return the content of a JSON or YAML file.
-
-    Raises:
-        RecordError: The file is missing or damaged, or does not have the layout.
-    """
+    """Return the content of a JSON or YAML file. Raises RecordError if it is missing or damaged, or
+    does not have the layout."""
     kind = "YAML" if path.suffix == ".yaml" else "JSON"
     try:
         content = (yaml.safe_load if kind == "YAML" else from_json)(path.read_bytes())
@@ -111,12 +103,7 @@ def check_unique_scenes(
 ) -> list[Path]:
     """Check that a release has scenes and none of them twice, and return `paths`, one per scene.
 
-    Args:
-        id_of: Function that returns the scene id of a path.
-        contents: A description of the expected contents of the folder, for error messages.
-
-    Raises:
-        UserError: The folder does not exist, contains no scene, or contains a scene twice.
+    `id_of` returns the scene id of a path, and `contents` describes what the folder should contain.
     """
     if not folder.is_dir():
         raise UserError(
@@ -127,10 +114,9 @@ def check_unique_scenes(
         raise UserError(f"{folder} contains no scene: expected {contents}", code="empty-release")
     first: dict[str, Path] = {}
     for path in paths:
-        other = first.setdefault(id_of(path), path)
-        if other is not path:
+        if (other := first.setdefault(name := id_of(path), path)) is not path:
             raise UserError(
-                f"{folder} contains scene {id_of(path)} twice, as {other} and as {path}: "
+                f"{folder} contains scene {name} twice, as {other} and as {path}: "
                 "choose a folder that contains each scene once",
                 code="duplicate-scene",
             )
@@ -140,11 +126,8 @@ def check_unique_scenes(
 def finite_array(values: Any, shape: tuple[int, ...], optional: bool = False) -> np.ndarray:
     """Return numbers as an array of `shape`, in which -1 stands for any length.
 
-    Args:
-        optional: Let non-finite numbers pass: they stand for what is not recorded.
-
-    Raises:
-        ValueError: The values do not fit the shape, or not all of them are finite numbers.
+    With `optional`, non-finite numbers may stand for what is not recorded. Raises ValueError if
+    they do not fit the shape, or not all of them are finite numbers.
     """
     try:
         array = np.asarray(values, np.float64).reshape(shape)
@@ -179,11 +162,7 @@ def first_landings(touches: Iterable[tuple[int, int]]) -> tuple[Landing, ...]:
 
 
 def decode_image(image: bytes | Path, where: str) -> Image.Image:
-    """Decode an image (encoded bytes or a file) to RGB. An alpha channel is ignored, not blended.
-
-    Raises:
-        RecordError: The image cannot be decoded.
-    """
+    """Decode an image (bytes or a file) to RGB. An alpha channel is ignored, not blended."""
     try:
         return Image.open(io.BytesIO(image) if isinstance(image, bytes) else image).convert("RGB")
     except (OSError, SyntaxError, ValueError) as error:
@@ -196,12 +175,10 @@ def reconcile_velocities(scene: Scene, path: Path) -> Scene:
     """Return a scene whose velocities agree with its positions and its frame rate.
 
     Velocities of another unit of time are multiplied by the factor that explains the difference,
-    with the warning `RescaledVelocities`. Where an object lacks velocities, they are the central
-    differences of its positions or of its orientations: if some are non-finite, or if all are zero
-    although it moves, as a simulator records them for what it does not simulate as a rigid body.
-
-    Raises:
-        RecordError: No constant factor explains the difference, or a quaternion has no direction.
+    with the warning `RescaledVelocities`; without such a factor, the record is invalid. Where an
+    object lacks velocities, they are the central differences of its positions or of its
+    orientations: if some are non-finite, or if all are zero although it moves, as a simulator
+    records them for what it does not simulate as a rigid body.
     """
     norms = np.linalg.norm(scene.quaternions, axis=-1)
     if (wrong := np.argwhere(np.abs(norms - 1) > 0.01)).size:

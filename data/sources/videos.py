@@ -62,11 +62,7 @@ def describe_video(path: Path) -> Video:
 
 
 def load_frames(path: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
-    """Return frames of a video as RGB images, by frame index.
-
-    Raises:
-        RecordError: The video is missing or damaged, or lacks one of the frames.
-    """
+    """Return frames of a video as RGB images, by frame index."""
     wanted = set(frames)
     if not wanted:
         return {}
