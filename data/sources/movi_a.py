@@ -17,6 +17,7 @@ is small and 1.4 if it is large, the sizes of Kubric's CLEVR objects.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -50,11 +51,12 @@ FOLDER_CONTENTS = (
     "movi_a-train.tfrecord-00000-of-00512 and so on"
 )
 FRAMES, FPS = 24, 12
-SHAPES = ("cube", "cylinder", "sphere")
-MATERIALS = ("metal", "rubber")
-COLORS = ("blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow")
-SIZES = ("small", "large")
-APPEARANCE = {"shape": SHAPES, "material": MATERIALS, "color": COLORS, "size": SIZES}
+WORDS = {
+    "shape": ("cube", "cylinder", "sphere"),
+    "material": ("metal", "rubber"),
+    "color_label": ("blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow"),
+    "size_label": ("small", "large"),
+}
 """Words of each attribute, in the order in which TensorFlow Datasets numbers them."""
 RADII = {"small": 0.35, "large": 0.7}
 """Half of the width of objects without a recorded box, by size label."""
@@ -87,10 +89,13 @@ class States(Layout):
 
 
 class Instance(States):
-    shape: Literal[SHAPES]
-    material: Literal[MATERIALS]
-    color: Literal[COLORS] = Field(alias="color_label")
-    size: Literal[SIZES] = Field(alias="size_label")
+    shape: Literal[WORDS["shape"]]
+    material: Literal[WORDS["material"]]
+    color_label: Literal[WORDS["color_label"]]
+    size_label: Literal[WORDS["size_label"]]
+
+    def describe(self) -> SceneObject:
+        return SceneObject(self.shape, self.material, self.color_label, self.size_label)
 
 
 class Video(Layout):
@@ -119,18 +124,12 @@ def list_scenes(folder: Path) -> list[Path]:
     """Return one path per scene, in order: its metadata.json, or the path of its shard followed by
     the number of its record (`movi_a-train.tfrecord-00000-of-00512/00003`)."""
     # The metadata.json that TensorFlow Datasets writes beside dataset_info.json is not a scene's.
-    folders = [
-        path
-        for path in folder.rglob("metadata.json")
-        if not path.with_name("dataset_info.json").exists()
-    ]
-    records = [
-        shard / f"{number:05d}"
-        for shard in folder.rglob("movi_a-*.tfrecord-*")
-        for number in range(len(record_ranges(shard)))
-    ]
+    found = sorted(folder.rglob("metadata.json"))
+    paths = [path for path in found if not path.with_name("dataset_info.json").exists()]
+    for shard in sorted(folder.rglob("movi_a-*.tfrecord-*")):
+        paths += [shard / f"{number:05d}" for number in range(len(record_ranges(shard)))]
     id_of = partial(_scene_id, folder=folder)
-    return check_unique_scenes(folder, sorted(folders) + sorted(records), id_of, FOLDER_CONTENTS)
+    return check_unique_scenes(folder, paths, id_of, FOLDER_CONTENTS)
 
 
 def _scene_id(path: Path, folder: Path) -> str:
@@ -141,27 +140,29 @@ def _scene_id(path: Path, folder: Path) -> str:
 
 
 def read_scene(path: Path, folder: Path, split: str) -> Scene:
-    """Return the scene at a path of `list_scenes`.
-
-    Visible fractions are unknown (NaN); an object is in view if it has a visible pixel.
-    """
-    is_folder = path.name == "metadata.json"
-    footage = path.parent if is_folder else path
-    if is_folder:
-        metadata = read_layout(path, Metadata)
+    """Return the scene at a path of `list_scenes`. Visible fractions are unknown (NaN), and an
+    object is in view if it has a visible pixel."""
+    if path.name == "metadata.json":
+        footage, metadata = path.parent, read_layout(path, Metadata)
         contacts = read_layout(footage / "events.json", Events).collisions
     else:
-        metadata, contacts = _read_record(path)
+        footage, (metadata, contacts) = path, _read_record(path)
     _list_images(footage)  # raises an error if an image is missing
     instances, size = metadata.instances, tuple(metadata.metadata.resolution)
 
     def array(key: str) -> np.ndarray:
         return np.stack([getattr(each, key) for each in instances], dtype=np.float32).swapaxes(0, 1)
 
-    # The first frame at or after each contact, if it is one of the video.
-    times = np.ceil(np.float32([contact.frame for contact in contacts])) - 1
-    frames = np.maximum(times, 0).astype(int).tolist()
-    touches = [each for each in zip(frames, contacts, strict=True) if each[0] < FRAMES]
+    touches, landed = [], []
+    for contact in contacts:
+        # The first frame at or after the contact.
+        frame = max(math.ceil(np.float32(contact.frame)) - 1, 0)
+        objects = [k for k in contact.instances if 0 <= k < len(instances)]
+        is_low = abs(contact.position[2]) < FLOOR_TOLERANCE
+        if frame < FRAMES:
+            touches.append((frame, contact.instances))
+            if len(objects) == 1 and is_low and abs(contact.contact_normal[2]) > MIN_VERTICAL:
+                landed.append((frame, objects[0]))
     quaternions = np.roll(array("quaternions"), -1, axis=-1)  # from w x y z to x y z w
     upright = np.isnan(quaternions).any(axis=-1, keepdims=True)
     # The corner that is nearest to the first one ends an edge of the same box.
@@ -171,8 +172,8 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     scene = Scene(
         scene_id=_scene_id(path, folder),
         split=split,
-        objects=tuple(SceneObject(i.shape, i.material, i.color, i.size) for i in instances),
-        collisions=find_contacts([(f, c.instances) for f, c in touches], len(instances), FPS),
+        objects=tuple(each.describe() for each in instances),
+        collisions=find_contacts(touches, len(instances), FPS),
         positions=array("positions"),
         quaternions=np.where(upright, [0, 0, 0, 1], quaternions),
         velocities=array("velocities"),
@@ -183,21 +184,11 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
         image_size=size,
         fps=FPS,
         # All objects start in the air.
-        landings=first_landings(
-            (frame, k) for frame, contact in touches for k in _on_floor(contact, len(instances))
-        ),
+        landings=first_landings(landed),
         footage=footage.relative_to(folder).as_posix(),
-        radii=tuple(radius if radius > 0 else RADII[each.size] for each, radius in sizes),
+        radii=tuple(radius if radius > 0 else RADII[each.size_label] for each, radius in sizes),
     )
     return reconcile_velocities(scene, path)
-
-
-def _on_floor(contact: Contact, count: int) -> list[int]:
-    """Return which of `count` objects touches the floor: one or none."""
-    objects = [k for k in contact.instances if 0 <= k < count]
-    is_low = abs(contact.position[2]) < FLOOR_TOLERANCE
-    is_level = abs(contact.contact_normal[2]) > MIN_VERTICAL
-    return objects if len(objects) == 1 and is_low and is_level else []
 
 
 def _read_record(path: Path) -> tuple[Metadata, list[Contact]]:
@@ -231,10 +222,10 @@ def _read_record(path: Path) -> tuple[Metadata, list[Contact]]:
         for key in ("width", "height", "num_frames", "num_instances")
     )
     instances = rows("instances", States, count)
-    for key, words in APPEARANCE.items():
-        name, word_of = Instance.model_fields[key].alias or key, dict(enumerate(words))
-        for row, [number] in zip(instances, column(f"instances/{key}_label", count), strict=True):
-            row[name] = word_of.get(number, number)
+    for key, words in WORDS.items():
+        labels = column(f"instances/{key.removesuffix('_label')}_label", count)
+        for row, [number] in zip(instances, labels, strict=True):
+            row[key] = dict(enumerate(words)).get(number, number)
     contacts = rows("events/collisions", Contact, len(values("events/collisions/frame")))
     for contact in contacts:
         # The latest time that is truncated to this integer.
@@ -246,8 +237,7 @@ def _read_record(path: Path) -> tuple[Metadata, list[Contact]]:
 
 def load_images(scene: Scene, folder: Path, frames: Iterable[int]) -> dict[int, Image.Image]:
     """Return frames of a scene as RGB images, by frame index."""
-    footage = folder / str(scene.footage)
-    images = _list_images(footage)
+    images = _list_images(footage := folder / str(scene.footage))
     return {frame: decode_image(images[frame], f"{footage}: frame {frame}") for frame in frames}
 
 
@@ -260,7 +250,6 @@ def _list_images(footage: Path) -> list[Path] | list[bytes]:
             raise RecordError(f"{footage} has {len(images)} frames, expected {FRAMES}")
         return images
     files = [footage / f"rgba_{frame:05d}.png" for frame in range(FRAMES)]
-    for file in files:
-        if not file.exists():
-            raise RecordError(f"{file} is missing", "missing-file")
+    if missing := [file for file in files if not file.exists()]:
+        raise RecordError(f"{missing[0]} is missing", "missing-file")
     return files

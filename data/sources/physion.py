@@ -90,11 +90,9 @@ def _stimulus(path: Path, folder: Path) -> str:
 
 
 def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
-    """Return the scene of a trial.
-
-    An object's shape is the name of its model. Visible fractions are unknown (NaN); an object is in
-    view if the segmentation image contains its colour. `fps` is for files without frame rate.
-    """
+    """Return the scene of a trial. An object's shape is the name of its model. Visible fractions
+    are unknown (NaN); an object is in view if the segmentation image contains its colour. `fps` is
+    for files without frame rate."""
     with _open(path) as file:
         frames = _list_frames(file)
         ids = _read_array(file, "static/object_ids", (-1,), np.int64).tolist()
@@ -105,8 +103,8 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
             fps = float(_read_array(file, "static/framerate", ()))
             if fps <= 0:
                 raise RecordError(f"{path}: /static/framerate is {fps:g}, expected above 0")
-        colors = _read_array(file, "static/object_segmentation_colors", (len(ids), 3))
         vectors = (len(ids), 3)
+        colors = _read_array(file, "static/object_segmentation_colors", vectors)
         positions = _read_series(frames, "objects/positions", vectors)
         rotations = _read_series(frames, "objects/rotations", (len(ids), 4))
         velocities, angular_velocities, centres = (

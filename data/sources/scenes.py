@@ -47,10 +47,10 @@ def make_scenes(
     names = [scene_prefix(cfg) + f"s{cfg.seed}-{k:06d}" for k in range(cfg.scenes)]
     scene_ids = split_scenes(cfg, names)
     split_of = {name: split for split, ids in scene_ids.items() for name in ids}
-    paths = {name: scene_path(folder, name) for name in names}
+    paths = [scene_path(folder, name) for name in names]
     jobs = {
-        paths[name]: partial(_simulate_one, cfg, index, split_of[name], paths[name])
-        for index, name in enumerate(names)
+        path: partial(_simulate_one, cfg, index, split_of[path.stem], path)
+        for index, path in enumerate(paths)
     }
     workers.write_files(jobs, "simulating scenes", "scene")
     return scene_ids, {}

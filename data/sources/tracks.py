@@ -26,6 +26,7 @@ are not recorded.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -86,12 +87,11 @@ def list_scenes(folder: Path) -> list[Path]:
 
 
 def _clip_starts(video: Path) -> list[int]:
-    try:
-        count = len(describe_video(video).times)
-    except RecordError:
-        # `read_scene` raises the error: one damaged video does not stop the others.
-        return [0]
-    return [first for first in range(0, count, CLIP) if count - first >= SHORTEST_CLIP] or [0]
+    # `read_scene` raises the error of a damaged video, so that it does not stop the others.
+    with suppress(RecordError):
+        last = len(describe_video(video).times) - SHORTEST_CLIP
+        return [*range(0, last + 1, CLIP)] or [0]
+    return [0]
 
 
 def _scene_id(path: Path) -> str:
