@@ -37,7 +37,7 @@ from data.items.scores import compare_item, order_target_first
 from data.parallel import Workers
 from data.records import FAMILIES, MATCHED_ANCHOR, RetrievalQuery, Scene, SelectionItem
 from data.seeded_order import named_rng
-from data.store import PARTS, load_scene, part_path, scene_path
+from data.store import PARTS, SCENES_FOLDER, hash_files, load_scene, part_path, scene_path
 from data.versions import component_versions
 
 COUNTERFACTUAL = "counterfactual"
@@ -62,7 +62,11 @@ def make_items_and_queries(
     quotas = {name: _with_reserve(cfg, name, quota) for name, quota in cell_quotas(cfg).items()}
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
     is_balanced = cfg.distractors == "balanced"
-    recipe = cfg.distractors, cfg.selection.observation
+    recipe = cfg.item_recipe, cfg.suite, cfg.distractors, cfg.selection.observation
+    if cfg.simulator != "bullet":
+        # A release may have changed since a killed build, while its scenes keep their ids.
+        every = [f"{SCENES_FOLDER}/{name}.npz" for ids in scene_ids.values() for name in ids]
+        recipe = *recipe, hash_files(folder, every)
     inputs = [component_versions(asdict(cfg)), scene_ids, *recipe, *settings]
     paths = {
         name: part_path(folder, [*inputs, name, asdict(quota)]) for name, quota in quotas.items()
