@@ -213,7 +213,12 @@ def _is_query_cell(name: str) -> bool:
     return name == COUNTERFACTUAL or name.startswith("builder ")
 
 
-@lru_cache(maxsize=CACHED_SCENES)
 def load_cached(folder: Path, scene_id: str) -> Scene:
-    """Load a scene of a store or a partial build, and keep it in memory."""
-    return load_scene(scene_path(folder, scene_id))
+    """Load a scene of a store or a partial build, and keep it in memory until its file changes."""
+    path = scene_path(folder, scene_id)
+    return _load(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=CACHED_SCENES)
+def _load(path: Path, modified: int) -> Scene:
+    return load_scene(path)

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig, TeacherConfig
-from data.build import ensure_benchmark
+from data.build import build, ensure_benchmark
 from data.checks.baselines import constant_velocity_error
 from data.frames.frame_cache import FrameReader
 from data.items.queries import BUILDERS
@@ -22,7 +22,7 @@ from data.parallel import Workers
 from data.sources import tracks
 from data.sources.scenes import make_scenes
 from data.sources.validation import RecordError
-from data.store import Store, load_scene, save_scene
+from data.store import Store, load_scene, open_store, save_scene
 from teacher.narrate import narrate_store
 from teacher.narrator import write_rationale
 from teacher.predicates.extraction import extract_facts
@@ -256,18 +256,26 @@ def test_a_bad_video_is_left_out_and_the_others_are_read(videos: Path, tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("changed", ["road1.txt", "tracks.yaml"])
-def test_files_that_changed_after_a_kill_are_read_again(
-    videos: Path, tmp_path: Path, changed: str
+def test_build_resumed_after_files_changed_equals_a_fresh_one(
+    videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str
 ) -> None:
     folder = shutil.copytree(videos, tmp_path / "videos")
-    make_scenes(config(folder), tmp_path / "store", Workers(1), False)
+    with monkeypatch.context() as patch:
+        patch.setattr("data.build.make_databases", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            build(config(folder), tmp_path / "resumed", Workers(1))
     path = folder / changed
     path.write_text(path.read_text().replace(",20,8,6,", ",30,8,6,").replace("red", "blue"))
-    for name in ("store", "fresh"):
-        make_scenes(config(folder), tmp_path / name, Workers(1), False)
-    resumed, fresh = ({p.name: p.read_bytes() for p in (tmp_path / name).glob("scenes/*.npz")}
-                      for name in ("store", "fresh"))  # fmt: skip
+    for name in ("resumed", "fresh"):
+        build(config(folder), tmp_path / name, Workers(1))
+    resumed, fresh = (
+        open_store(tmp_path / name).manifest["files"] for name in ("resumed", "fresh")
+    )
     assert resumed == fresh
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 @pytest.mark.slow
