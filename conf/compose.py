@@ -70,6 +70,10 @@ REMOVED_KEYS: dict[str, str] = {
     "retriever.late.pool": "leave it out: every vector is kept",
     "train.mine_every": "leave it out: hard negatives are the benchmark's",
     "train.mine_margin": "leave it out: hard negatives are the benchmark's",
+    "benchmark.retrieval.standard": "leave it out: the test queries of retrieval.builders are the "
+    "standard test",
+    "frames_gb": "use frames=none: frames are then rendered when they are needed",
+    "parallel": "leave it out: workers are processes of this machine",
 }
 """Keys that no longer exist, each with the advice that ends the key's error message."""
 

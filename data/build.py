@@ -32,7 +32,7 @@ from data.oracle.displacement import visible_positions
 from data.parallel import Workers
 from data.records import COUNTERFACTUAL, SPLITS, Scene, SelectionItem
 from data.render.blender import check_blender
-from data.sources.scenes import keep_test_scenes, make_scenes
+from data.sources.scenes import make_scenes
 from data.store import (
     FRAMES_FOLDER,
     MANIFEST,
@@ -122,7 +122,6 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         if partial is None:
             return
         scene_ids, left_out = make_scenes(cfg, partial, workers, strict)
-        scene_ids = keep_test_scenes(cfg, scene_ids)
         items, queries, dropped = make_items_and_queries(cfg, partial, scene_ids, workers)
         save_rows([asdict(i) for i in items], partial / "selection.parquet")
         scene_of = functools.partial(load_cached, partial)

@@ -35,9 +35,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
         )
         rows += results.retrieval_results(store.name, name, ranks[name], queries, cfg.seed)
 
-    scene_alone = standard_test.rank_scene_alone(queries, database)
-    name = results.SCENE_ALONE
-    rows += results.retrieval_results(store.name, name, scene_alone, queries, cfg.seed)
+    rows += standard_test.score_scene_alone(store.name, queries, database, cfg.seed)
     differences = results.compare_retrievers(ranks, queries, cfg.seed)
     extra = [tables.rank_differences_table(differences)] if differences else []
     exact_search.write_ranks(run.folder, ranks, queries)

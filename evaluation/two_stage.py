@@ -78,6 +78,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         measures = route_rows[0].measures
         metrics |= {f"{key}_{m}": v.value for m, v in measures.items() if m != "tie_rate"}
 
+    rows += standard_test.score_scene_alone(store.name, queries, database, cfg.seed)
     text_counts = {mode: text_matching.count_texts(found) for mode, found in responses.items()}
     extra = [tables.parsing_table(text_counts)]
     entries = {"build": store.identity, "texts": text_counts}

@@ -25,9 +25,10 @@ WINDOW_HORIZONS = (8, 16, 24)
 WINDOW_DIFFICULTIES = ("easy", "hard")
 STANDIN = "standin_"
 """Start of the names of the suites whose scenes are simulated instead of read from a release."""
-QUERIES_PER_SCENE = {"4": 1, "5": 1, "6": 1}
-"""Maximum number of queries of a builder about a scene (paper, retrieval construction); 3 for the
-other builders."""
+QUERIES_PER_SCENE = {"1": 3, "2": 3, "3": 3, "4": 1, "5": 1, "6": 1}
+"""Maximum number of queries of each builder about a scene (paper, retrieval construction)."""
+COUNTERFACTUAL_SECONDS = (1, 2, 3, 4)
+"""Seconds from the end of the prefix to the target of the counterfactual queries about a scene."""
 MODEL_SIZE = 336
 """Side (px) of the square image in which displacements are measured: the models' input size."""
 SCENE_FRAMES, SCENE_FPS = 128, 25
@@ -59,7 +60,7 @@ class SelectionConfig(Settings):
     G1_A, is divided evenly among those of its six cells that have no quota of their own."""
     observation: dict[str, int] = field(default_factory=dict)
     """Number of observed frames, by family (event or window) or by subtype, such as {window: 20}.
-    By default, event items have 21 and window items 16. Time items always have 26, a second."""
+    By default, event items have 21 and window items 16. Time items observe a second."""
     matched: Quota = field(default_factory=Quota)
     """Pairs of matched-anchor items. The two questions of a pair ask for the same target, one by an
     event and the other by a time."""
@@ -128,7 +129,8 @@ class BenchmarkConfig(Settings):
     """Share of the scenes in the test split; of the videos, if `simulator` is tracks."""
     test_scenes: int | None = setting(None, least=1)
     """Number of scenes of the test split that the test items, the test queries and the frames of
-    their database come from; the other test scenes are used by nothing. null takes all."""
+    their database come from, chosen at random; nothing uses the other test scenes. null takes
+    all."""
     renderer: str = setting("bullet", RENDERERS)
     """bullet renders on the CPU of any machine; blender renders scenes that look like CLEVRER's and
     needs the extra `blender`."""
@@ -210,18 +212,25 @@ class BenchmarkConfig(Settings):
                 f"{group}renderer=blender: Blender has no {look} of world={self.world.name}; set "
                 f"{group}renderer=bullet"
             )
-        pixel = MODEL_SIZE / min(self.width, self.height)
-        if self.selection.min_displacement < pixel:
-            yield (
-                f"{group}selection.min_displacement={self.selection.min_displacement} must be at "
-                f"least {pixel:.2f}, a pixel of a frame of {self.width} x {self.height} px: "
-                "otherwise candidates could be the same image"
-            )
+        if self.simulator == "bullet":
+            yield from self.find_pixel_problem(self.width, self.height, group)
         yield from self._find_unmet_quotas(group)
         if self.width < 48 or self.width * 2 != self.height * 3:
             yield (
                 f"{group}width={self.width} and {group}height={self.height}: the aspect ratio "
                 "must be 3:2 and the size at least 48 x 32 px, such as 480 x 320"
+            )
+
+    def find_pixel_problem(
+        self, width: int, height: int, group: str = "benchmark."
+    ) -> Iterator[str]:
+        """Describe a minimum displacement below a pixel of a frame of `width` x `height` px."""
+        pixel = MODEL_SIZE / min(width, height)
+        if self.selection.min_displacement < pixel:
+            yield (
+                f"{group}selection.min_displacement={self.selection.min_displacement} must be at "
+                f"least {pixel:.2f}, a pixel of a frame of {width} x {height} px: otherwise "
+                "candidates could be the same image"
             )
 
     def _find_contact_quotas(self, group: str) -> Iterator[str]:
@@ -249,7 +258,7 @@ class BenchmarkConfig(Settings):
             )
 
     def _find_unmet_quotas(self, group: str) -> Iterator[str]:
-        """Describe each test quota that `test_scenes` scenes cannot meet."""
+        """Describe each quota and size that `test_scenes` scenes cannot meet."""
         if self.test_scenes is None:
             return
         track, builders = self.selection, self.retrieval.builders
@@ -259,13 +268,17 @@ class BenchmarkConfig(Settings):
             for cell, quota in getattr(track, family).items()
         }
         quotas["selection.matched"] = (track.matched.test, 1)
-        for name, quota in builders.items():
-            quotas[f"retrieval.builders.{name}"] = (quota.test, QUERIES_PER_SCENE.get(name, 3))
-        for name, (quota, most) in quotas.items():
+        for name, most in QUERIES_PER_SCENE.items():
+            quotas[f"retrieval.builders.{name}"] = (builders.get(name, Quota()).test, most)
+        counterfactual = self.retrieval.counterfactual.test
+        quotas["retrieval.counterfactual"] = (counterfactual, len(COUNTERFACTUAL_SECONDS))
+        limits = {f"{name}.test": limit for name, limit in quotas.items()}
+        limits["retrieval.database"] = (self.retrieval.database, self.world.physics.frames)
+        for name, (quota, most) in limits.items():
             if quota > most * self.test_scenes:
                 yield (
-                    f"{group}test_scenes={self.test_scenes} cannot carry {group}{name}.test="
-                    f"{quota}: a scene gives at most {most}; raise the former or lower the latter"
+                    f"{group}test_scenes={self.test_scenes} cannot carry {group}{name}={quota}: a "
+                    f"scene gives at most {most}; raise the former or lower the latter"
                 )
 
 

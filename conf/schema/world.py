@@ -184,7 +184,8 @@ class StartConfig(Settings):
     height: list[float] = vector(0.5, 1.5)
     """Range of the initial height of the centre above the surface, for objects in the air."""
     max_collisions: int | None = setting(3, least=1)
-    """Maximum number of collisions in a scene; null for any number."""
+    """Maximum number of pairs of objects that collide in a scene; null for any number. A pair may
+    collide again, except if objects slide in."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from check_vector(f"{group}middle", self.middle, "x y")

@@ -42,6 +42,8 @@ def count_records(
         for cell, quota in cell_quotas(cfg).items()
         for split in SPLITS
     }
+    if cfg.test_scenes is not None:
+        cells["scenes/test"], quotas["scenes/test"] = len(scene_ids["test"]), cfg.test_scenes
     track = cfg.retrieval
     sizes = (track.database, track.source, track.counterfactual_source)
     for (name, frames), size in zip(databases.items(), sizes, strict=True):

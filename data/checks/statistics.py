@@ -12,6 +12,7 @@ from tqdm import tqdm
 from data.checks.baselines import score_scene_alone, score_velocity
 from data.checks.shortcuts import SIMPLE, score_logistic_model, score_simple_strategies
 from data.items.scores import CandidateFrames, compare_item
+from data.oracle.contacts import collisions_in
 from data.records import LETTERS, SPLITS, SelectionItem
 from data.store import Store
 
@@ -85,8 +86,11 @@ def measure_shortcuts(
 def describe_scenes(store: Store) -> dict[str, Any]:
     """Count scenes by their numbers of objects and collisions; find quartiles of event frames."""
     scenes = [store.scene(name) for split in SPLITS for name in store.scene_ids(split)]
-    counts = pd.DataFrame({s.scene_id: (len(s.objects), len(s.collisions)) for s in scenes}).T
-    frames = [c.frame for scene in scenes for c in scene.collisions]
+    collisions_of = {s.scene_id: collisions_in(s, 1, s.frames) for s in scenes}
+    counts = pd.DataFrame(
+        {s.scene_id: (len(s.objects), len(collisions_of[s.scene_id])) for s in scenes}
+    ).T
+    frames = [c.frame for own in collisions_of.values() for c in own]
     objects, collisions = (counts[k].value_counts().sort_index().to_dict() for k in (0, 1))
     return {
         "objects": {str(n): scenes for n, scenes in objects.items()},

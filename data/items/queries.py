@@ -17,7 +17,7 @@ from functools import partial
 
 import numpy as np
 
-from conf.schema.benchmark import QUERIES_PER_SCENE
+from conf.schema.benchmark import COUNTERFACTUAL_SECONDS, QUERIES_PER_SCENE
 from data.items.pickers import CellInputs
 from data.items.recipes import spell_seconds
 from data.oracle.contacts import collision_frames, is_next
@@ -39,14 +39,10 @@ OBSERVED = 2
 """Number of seconds that builder 2 observes, and minimum number for builder 1."""
 REST = 0.1
 """Share of a second by which the end of a clip may be later than builder 1 states."""
-EVENTS_PER_SCENE = 3
-"""Maximum number of events of a scene that builder 3 uses."""
 LEAD = 5
 """Number of frames from the end of a prefix of builder 3 to the event."""
 MIN_OBSERVED = 12
 """Minimum number of frames of a prefix of builder 3: the number that a model is shown."""
-HORIZONS = (1, 2, 3, 4)
-"""Seconds from the end of the prefix to the target of a counterfactual query."""
 OFFSETS = (16, 32, 48)
 """Preferred offsets of hard negatives from the target, in frames on either side."""
 DENSE_STEP = 4
@@ -88,7 +84,7 @@ def _clock(scene: Scene) -> Iterator[TimedQuestion]:
 
 def _next_event(scene: Scene) -> Iterator[TimedQuestion]:
     events = [e for e in collision_frames(scene) if is_next(scene, e - LEAD, e)]
-    for event in [e for e in events if e - LEAD + 1 >= MIN_OBSERVED][:EVENTS_PER_SCENE]:
+    for event in [e for e in events if e - LEAD + 1 >= MIN_OBSERVED][: QUERIES_PER_SCENE["3"]]:
         yield NEXT_COLLISION, 0, event - LEAD, event
 
 
@@ -129,17 +125,15 @@ def make_future_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQ
                 target=FrameRef(scene.scene_id, target),
             )
 
-    return fill_query_quota(
-        str(builder), cell, queries_of, QUERIES_PER_SCENE.get(str(builder)) == 1
-    )
+    return fill_query_quota(str(builder), cell, queries_of, QUERIES_PER_SCENE[str(builder)] == 1)
 
 
 def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
     """Make the counterfactual queries, and count those that are dropped; see `fill_query_quota`.
 
-    A query names the removed object and the visible object that its absence displaces most. The
-    first hard negative is the same frame of the factual scene; the others are other frames of the
-    counterfactual scene.
+    A query names the removed object and the object that its absence displaces most, among those
+    that are visible in the prefix and in the target frame. The first hard negative is the same
+    frame of the factual scene; the others are other frames of the counterfactual scene.
     """
 
     def queries_of(scene: Scene) -> Iterator[RetrievalQuery]:
@@ -151,7 +145,7 @@ def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery],
         shifts = removal_displacements(scene, cell.scene_of(other), removed)
         # The question can only name an object that the observation shows.
         shifts[:, ~visible_positions(scene)[1][: stop + 1].any(axis=0)] = 0.0
-        for seconds in HORIZONS:
+        for seconds in COUNTERFACTUAL_SECONDS:
             target = stop + seconds * FPS
             if target >= scene.frames or shifts[target].max() < cell.min_displacement:
                 continue

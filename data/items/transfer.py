@@ -23,7 +23,7 @@ from data.items.recipes import (
     scene_candidates,
     spell_seconds,
 )
-from data.oracle.contacts import collision_frames, first_collisions
+from data.oracle.contacts import collision_frames, first_collisions, is_next
 from data.oracle.events import find_motion_onsets
 from data.records import Scene
 
@@ -36,15 +36,17 @@ CROSS_SCENES = 8
 """Number of other scenes to sample for cross-scene distractors."""
 
 EVENTS: dict[str, dict[str, Callable[[Scene], list[int]]]] = {
-    "movi_a": {"contact": collision_frames},
+    "movi_a": {
+        "contact": lambda scene: [e for e in collision_frames(scene) if is_next(scene, e - GAP, e)]
+    },
     "physion": {
         "A1_contact": lambda scene: [c.frame for c in first_collisions(scene)[:1]],
         "A2_motion": lambda scene: [frame for frame, _ in find_motion_onsets(scene)],
         "A3_landing": lambda scene: [landing.frame for landing in scene.landings],
     },
 }
-"""Functions that return the frames of a scene's events, by suite and subtype. A1 is the first
-contact of a trial."""
+"""Functions that return the frames of a scene's events, by suite and subtype. A contact of MoVi-A
+is the next collision after the prefix, and A1 is the first contact of a trial."""
 CELLS = {
     "movi_a": {"event": tuple(EVENTS["movi_a"]), "time": ("in_1s",), "window": ()},
     "physion": {"event": tuple(EVENTS["physion"]), "time": tuple(TIME_CELLS), "window": ()},

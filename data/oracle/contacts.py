@@ -8,21 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from data.records import FPS, Collision, Scene
-from data.sim.physics import CONTACT_FREE_FRAMES
+from data.records import Collision, Scene
+from data.sim.physics import break_frames
 
 Pair = tuple[int, int]
 
 
-def group_contacts(
-    touching: Mapping[Pair, Iterable[int]], fps: float = FPS
-) -> tuple[Collision, ...]:
+def group_contacts(touching: Mapping[Pair, Iterable[int]], fps: float) -> tuple[Collision, ...]:
     """Group the frames in which pairs touch into contacts, in order of frame.
 
-    A contact ends when more than `CONTACT_FREE_FRAMES` frames of Bullet's scenes, or as much time
-    at another frame rate, follow without touch.
+    A contact ends when more frames without touch follow than `data.sim.physics.break_frames`
+    allows at the frame rate.
     """
-    gap = max(1, round(CONTACT_FREE_FRAMES * fps / FPS))
+    gap = break_frames(fps)
     contacts = []
     for (one, other), frames in touching.items():
         pair = (min(one, other), max(one, other))

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 EXPORT_RECORD, CARD = "export.json", "README.md"
-EXPORT_VERSION = "3"
+EXPORT_VERSION = "4"
 """Changes whenever the same store would give another dataset."""
 GROUP_IMAGES = 512
 """Images in a parquet row group (about 30 MB at 480 x 320 px), which an export keeps in memory."""
@@ -67,7 +67,7 @@ ORIGINS: dict[str, dict[str, str]] = {
         "link": "https://github.com/google-research/kubric/tree/main/challenges/movi",
     },
     "tracks": {
-        "title": "videos with tracks that the builder of this benchmark owns",
+        "title": "videos that the builder of this benchmark supplied",
         "license": "unknown",
         "terms": "ask the builder",
     },

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 SOLVER_ITERATIONS = 20
-CONTACT_FREE_FRAMES = 5
-"""A contact of a pair ends when more frames than this without contact follow."""
+LONGEST_BREAK = 0.2
+"""Seconds without touch that do not end a contact of a pair."""
 TOUCHING = 0.02
 """Distance (simulator units) below which bodies touch at the start."""
 
@@ -291,10 +291,15 @@ def shared_simulator() -> Simulator:
     return Simulator()
 
 
-def has_repeated(touching: Touching) -> bool:
+def break_frames(fps: float) -> int:
+    """Return the maximum number of frames without touch within a contact."""
+    return max(1, round(LONGEST_BREAK * fps))
+
+
+def has_repeated(touching: Touching, fps: float) -> bool:
     """Return whether any pair has a second, separate contact."""
     return any(
-        after - before > CONTACT_FREE_FRAMES + 1
+        after - before > break_frames(fps) + 1
         for frames in touching.values()
         for before, after in pairwise(frames)
     )

@@ -139,7 +139,8 @@ class _Slide:
 
         def is_rejected(contacts: Touching) -> bool:
             collides = any(len(bodies) in pair for pair in contacts)
-            return has_repeated(contacts) or len(contacts) > most or (collides and not is_colliding)
+            is_repeated = has_repeated(contacts, self.world.physics.fps)
+            return is_repeated or len(contacts) > most or (collides and not is_colliding)
 
         result = combined or shared_simulator().simulate(
             extended, self.world, is_rejected=is_rejected

@@ -6,8 +6,9 @@ the same on all lines of a file:
     frame, id, bb_left, bb_top, bb_width, bb_height, conf, class, visibility
     frame, id, bb_left, bb_top, bb_width, bb_height, conf, x, y, z
 
-Frames count from 1, and boxes are in px. A box with conf 0 is ignored; in the layout of results, -1
-states no confidence. A visibility of -1 is unknown. x, y and z are not used.
+Frames count from 1, and boxes are in px. A box is ignored if its conf is at most 0, except that -1
+states no confidence in the layout of results. A visibility is from 0 to 1; -1 is unknown. x, y and
+z are not used.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Box(Layout, strict=False):
     bb_height: Annotated[float, Field(ge=0)]
     conf: float
     category: Whole = Field(np.nan, alias="class")
-    visibility: float = np.nan
+    visibility: Annotated[float, Field(ge=-1, le=1)] = np.nan
 
 
 TRUTH = ["frame", "id", "bb_left", "bb_top", "bb_width", "bb_height", "conf", "class", "visibility"]
@@ -84,7 +85,9 @@ def _parse(path: Path, modified: int) -> dict[int, Track]:
     first_lines: dict[tuple[float, float], int] = {}
     rows: list[tuple[float, ...]] = []
     expected = [*COLUMNS]
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    # A character that is no UTF-8 makes a cell that is no number.
+    text = path.read_text("utf-8-sig", errors="replace")
+    for number, line in enumerate(text.splitlines(), 1):
         if not line.strip():
             continue
         cells = [cell.strip() for cell in line.split(",")]

@@ -25,7 +25,7 @@ from itertools import groupby
 from pathlib import Path
 from types import ModuleType
 
-from conf.errors import UserError
+from conf.errors import SettingsError, UserError
 from conf.files import write_bytes
 from conf.schema import BenchmarkConfig
 from data.parallel import Workers
@@ -78,7 +78,7 @@ def read_release(
             split_of[part] = split
     workers.write_files(jobs, f"reading {cfg.simulator}", "scene")
     scene_ids: dict[str, list[str]] = {split: [] for split in SPLITS}
-    problems, factors = [], []
+    problems, factors, sizes = [], [], set()
     for part, split in split_of.items():
         outcome = json.loads(part.read_bytes())
         if "problem" in outcome:
@@ -86,6 +86,10 @@ def read_release(
         else:
             scene_ids[split].append(outcome["scene_id"])
             factors += outcome["factors"]
+            sizes.add(tuple(outcome["image_size"]))
+    for size in sizes:
+        for problem in cfg.find_pixel_problem(*size):
+            raise SettingsError(problem)
     if factors:
         low, high = (f"{bound:.3g}" for bound in (min(factors), max(factors)))
         log.warning(
@@ -137,5 +141,9 @@ def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: 
     else:
         save_scene(scene, scene_path(folder, scene.scene_id))
         rescaled = [w.message for w in caught if isinstance(w.message, RescaledVelocities)]
-        outcome = {"scene_id": scene.scene_id, "factors": [each.factor for each in rescaled]}
+        outcome = {
+            "scene_id": scene.scene_id,
+            "factors": [each.factor for each in rescaled],
+            "image_size": scene.image_size,
+        }
     write_bytes(part, json.dumps(outcome).encode())

@@ -43,14 +43,16 @@ def make_scenes(
     if cfg.simulator != "bullet":
         videos = split_scenes(cfg, list_release(cfg))
         splits = {split: [*chain.from_iterable(own)] for split, own in videos.items()}
-        return read_release(cfg, splits, folder, workers, strict)
+        scene_ids, left_out = read_release(cfg, splits, folder, workers, strict)
+        return keep_test_scenes(cfg, scene_ids), left_out
     names = [scene_prefix(cfg) + f"s{cfg.seed}-{k:06d}" for k in range(cfg.scenes)]
-    scene_ids = split_scenes(cfg, names)
+    scene_ids = keep_test_scenes(cfg, split_scenes(cfg, names))
     split_of = {name: split for split, ids in scene_ids.items() for name in ids}
-    paths = [scene_path(folder, name) for name in names]
     jobs = {
-        path: partial(_simulate_one, cfg, index, split_of[path.stem], path)
-        for index, path in enumerate(paths)
+        path: partial(_simulate_one, cfg, index, split_of[name], path)
+        for index, name in enumerate(names)
+        if name in split_of
+        for path in [scene_path(folder, name)]
     }
     workers.write_files(jobs, "simulating scenes", "scene")
     return scene_ids, {}
@@ -67,7 +69,8 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
     """Assign a random share of every `SPLIT_BLOCK` scenes to the test split; the order is kept.
 
     A scene's split depends only on its index, the seed and the test share, so that a scene has the
-    same split in a smaller and in a larger benchmark.
+    same split in a smaller and in a larger benchmark, unless a split would be empty: it then gets a
+    scene of the other one.
     """
     splits: dict[str, list[Element]] = {split: [] for split in SPLITS}
     for first in range(0, len(scenes), SPLIT_BLOCK):
@@ -76,29 +79,28 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
         test = set(order[: share[1] - share[0]].tolist())
         for k, scene in enumerate(scenes[first : first + SPLIT_BLOCK]):
             splits["test" if k in test else "train"].append(scene)
-    for split in SPLITS if cfg.test_share < 1 else ("test",):
-        if not splits[split]:
-            what = "video" if cfg.simulator == "tracks" else "scene"
-            raise UserError(
-                f"benchmark.test_share={cfg.test_share} of {len(scenes)} {what}s leaves no {split} "
-                f"{what}: change it, or use more {what}s (benchmark.scenes={cfg.scenes})",
-                code="empty-split",
-            )
+    if cfg.test_share < 1:
+        for split, other in (SPLITS, SPLITS[::-1]):
+            if splits[split]:
+                continue
+            if len(scenes) < 2:
+                what = "video" if cfg.simulator == "tracks" else "scene"
+                raise UserError(
+                    f"benchmark.test_share={cfg.test_share} of a single {what} leaves no {split} "
+                    f"{what}: use more {what}s, or set benchmark.test_share=1",
+                    code="empty-split",
+                )
+            splits[split].append(splits[other].pop())
     return splits
 
 
 def keep_test_scenes(cfg: BenchmarkConfig, scene_ids: dict[str, list[str]]) -> dict[str, list[str]]:
-    """Keep `cfg.test_scenes` random scenes of the test split; the others become the split `spare`,
-    which nothing uses. The order is kept."""
+    """Keep `cfg.test_scenes` random scenes of the test split, in the same order; nothing uses the
+    others."""
     test = scene_ids["test"]
-    if cfg.test_scenes is None or cfg.test_scenes >= len(test):
-        return scene_ids
     order = named_rng(cfg.seed, "test scenes").permutation(len(test))
     chosen = {*order[: cfg.test_scenes].tolist()}
-    return scene_ids | {
-        "test": [name for k, name in enumerate(test) if k in chosen],
-        "spare": [name for k, name in enumerate(test) if k not in chosen],
-    }
+    return scene_ids | {"test": [name for k, name in enumerate(test) if k in chosen]}
 
 
 def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> None:
@@ -131,7 +133,7 @@ def record_scene(name: str, split: str, sample: Sample, world: WorldConfig) -> S
         scene_id=name,
         split=split,
         objects=(objects := tuple(body.object for body in sample.bodies)),
-        collisions=group_contacts(sample.motion.touching),
+        collisions=group_contacts(sample.motion.touching, world.physics.fps),
         image_size=(WIDTH, HEIGHT),
         fps=world.physics.fps,
         landings=sample.motion.landings,

@@ -47,6 +47,8 @@ CLIP = FRAMES
 SHORTEST_CLIP = 24
 """Minimum number of frames of a clip: the prefix and the shortest horizon of a window item. Fewer
 frames at the end of a video are left out."""
+MIN_FPS = 5
+"""Minimum frame rate: the prefix of a time item is a second."""
 SPEED_BOUNDS = (0.2, 0.5, 1.0)
 """Upper bounds of slow, steady and quick speeds, image heights per second: an object crosses the
 height of the image in more than five seconds, more than two, and more than one."""
@@ -106,8 +108,13 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     total, (_, height) = len(video.times), video.size
     if total < SHORTEST_CLIP:
         raise RecordError(f"{file} has {total} frames, expected at least {SHORTEST_CLIP}")
-    if (fps := own.fps or video.fps) is None:
-        raise RecordError(f"{file} has no frame rate: set videos.{file.stem}.fps in {NAMES}")
+    fps = own.fps or video.fps
+    if fps is None or fps < MIN_FPS:
+        found = "no frame rate" if fps is None else f"{fps:g} frames per second"
+        raise RecordError(
+            f"{file} has {found}, expected at least {MIN_FPS} frames per second (the rate of the "
+            f"container; videos.{file.stem}.fps in {NAMES} replaces it)"
+        )
     tracks = read_tracks(text := file.with_suffix(".txt"))
     if unknown := sorted(own.objects.keys() - tracks.keys()):
         where = f"{folder / NAMES}: videos.{file.stem}.objects.{unknown[0]}"

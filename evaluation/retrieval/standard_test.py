@@ -21,7 +21,7 @@ from data.checks.baselines import count_frames_of_scene
 from data.checks.queries import check_test
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
-from evaluation.metrics.results import RetrievalResult
+from evaluation.metrics.results import SCENE_ALONE, RetrievalResult, retrieval_results
 from evaluation.reporting import figures, tables
 from evaluation.reporting.table import Table
 from evaluation.retrieval.exact_search import Ranks, exact_ranks
@@ -50,11 +50,15 @@ def rank_targets(
     return exact_ranks(queries, targets, database, preset.widths)
 
 
-def rank_scene_alone(queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]) -> Ranks:
-    """Rank as a retriever that only recognises the scene: its frames tie above all others."""
+def score_scene_alone(
+    benchmark: str, queries: Sequence[RetrievalQuery], database: Sequence[FrameRef], seed: int
+) -> list[RetrievalResult]:
+    """Return the results of a ranker that only recognises the scene: its frames tie above all
+    others."""
     tied = count_frames_of_scene(queries, database)[None] - 1
     found = np.ones(len(queries), bool)
-    return Ranks((None,), np.zeros_like(tied), tied, found, len(database), 0, 0.0)
+    ranks = Ranks((None,), np.zeros_like(tied), tied, found, len(database), 0, 0.0)
+    return retrieval_results(benchmark, SCENE_ALONE, ranks, queries, seed)
 
 
 def write_report(

@@ -170,6 +170,7 @@ def test_quotas_add_up_to_the_papers_totals():
     tested = [q.test for _, q in sorted(retrieval.builders.items())]
     assert (benchmark.test_scenes, sum(tested)) == (387, 2_002)
     assert (retrieval.database, retrieval.source) == (10_000, 30_000)
+    assert retrieval.database / benchmark.test_scenes == pytest.approx(26, abs=0.2)
     without = retrieval.counterfactual
     assert (without.train + without.test, retrieval.counterfactual_source) == (18_225, 26_995)
 

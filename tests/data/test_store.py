@@ -182,9 +182,16 @@ def test_split_of_a_scene_is_independent_of_the_number_of_scenes(scenes) -> None
     assert len(more["test"]) == 100
 
 
-def test_empty_split_is_refused() -> None:
-    with raises_user_error("empty-split", contains="benchmark.test_share=0.01"):
-        split_scenes(small(test_share=0.01), list("abcd"))
+@pytest.mark.parametrize("share", [0.01, 0.2, 0.99])
+@pytest.mark.parametrize("seed", range(5))
+def test_no_split_is_empty(share: float, seed: int) -> None:
+    for count in range(2, 8):
+        splits = split_scenes(small(test_share=share, seed=seed), names := [*range(count)])
+        assert splits["train"]
+        assert splits["test"]
+        assert sorted(splits["train"] + splits["test"]) == names
+    with raises_user_error("empty-split", contains=f"benchmark.test_share={share}"):
+        split_scenes(small(test_share=share, seed=seed), ["a"])
 
 
 @pytest.mark.parametrize("part", ["selection.parquet", "scenes"])

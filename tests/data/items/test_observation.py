@@ -19,6 +19,8 @@ from conf.schema.benchmark import divide_window_quotas
 from data.build import check_quota_names, ensure_items
 from data.frames.frame_cache import FrameReader
 from data.parallel import Workers
+from data.records import original_scene_id
+from data.sources.scenes import scene_prefix, split_scenes
 from data.store import DATABASES
 from tests.user_errors import raises_user_error
 
@@ -81,26 +83,44 @@ def test_displacements_below_a_pixel_are_refused() -> None:
 def test_test_scenes_that_cannot_carry_a_quota_are_refused() -> None:
     cfg = config(time={"in_2s": Quota(0, 12)}, event={"contact_match": Quota(0, 9)})
     cfg.retrieval.builders = {"1": Quota(0, 30), "5": Quota(0, 11)}
+    cfg.retrieval.counterfactual = Quota(0, 41)
+    cfg.retrieval.database = 1281
     cfg.test_scenes = 10
     problems = [*cfg.find_problems("benchmark.")]
-    assert len(problems) == 2
-    assert "benchmark.selection.time.in_2s.test=12" in problems[0]
-    assert "benchmark.retrieval.builders.5.test=11" in problems[1]
+    refused = (
+        "selection.time.in_2s.test=12", "retrieval.builders.5.test=11",
+        "retrieval.counterfactual.test=41", "retrieval.database=1281",
+    )  # fmt: skip
+    assert len(problems) == len(refused)
+    for name, problem in zip(refused, problems, strict=True):
+        assert f"benchmark.{name}: a scene gives at most" in problem
 
 
 @pytest.mark.slow
-def test_spare_scenes_are_used_by_nothing(tmp_path: Path) -> None:
+def test_test_scenes_that_are_not_chosen_are_not_made(tmp_path: Path) -> None:
     cfg = config(time={"in_1s": Quota(4, 3)}, event={"contact_cross": Quota(4, 3)})
     cfg = replace(cfg, scenes=40, test_share=0.5, test_scenes=5)
+    split = split_scenes(cfg, [scene_prefix(cfg) + f"s0-{k:06d}" for k in range(40)])
     cfg.retrieval = RetrievalTrackConfig(
         builders={"1": Quota(4, 4)}, hard_negatives=1, database=60, source=80
     )
     store = ensure_items(cfg, tmp_path, Workers(1))
-    assert [len(store.scene_ids(s)) for s in ("train", "test", "spare")] == [20, 5, 15]
+    assert store.scene_ids("train") == split["train"]
+    assert len(store.scene_ids("test")) == 5
+    assert {*store.scene_ids("test")} < {*split["test"]}
+    files = {path.stem for path in (store.folder / "scenes").iterdir()}
+    assert {original_scene_id(name) for name in files} == {
+        *store.scene_ids("train"), *store.scene_ids("test"),
+    }  # fmt: skip
+    fewer = replace(cfg, name="fewer", test_scenes=21)
+    shortfalls = ensure_items(fewer, tmp_path, Workers(1)).manifest["shortfalls"]
+    assert shortfalls["scenes/test"] == "20 of 21"
     candidates = (c.scene_id for item in store.selection() for c in item.candidates)
     queries = (f.scene_id for q in store.retrieval() for f in (q.target, *q.hard_negatives))
     frames = (f.scene_id for name in DATABASES for f in store.database(name))
-    assert not {*candidates, *queries, *frames} & {*store.scene_ids("spare")}
+    assert {original_scene_id(name) for name in (*candidates, *queries, *frames)} <= {
+        *store.scene_ids("train"), *store.scene_ids("test"),
+    }  # fmt: skip
     assert {f.scene_id for f in store.database()} <= {*store.scene_ids("test")}
 
 

@@ -280,6 +280,7 @@ def test_counterfactual_targets_differ_from_the_factual_scene(
         assert asked != k
         assert f"where would the {q.asked_object} be" in q.question
         assert shifts[q.target.frame, asked] >= min_displacement
+        assert other.in_view[q.target.frame, asked - (asked > k)]
         assert shifts[: q.prefix_stop].max() == 0
         assert (q.target.frame - q.prefix_stop) % FPS == 0
         factual, *wrong_time = q.hard_negatives

@@ -11,9 +11,10 @@ from conf.schema import WorldConfig
 from data.items.pickers import Timing
 from data.items.queries import BUILDERS
 from data.items.recipes import EVENT_CELLS, MATCHED, make_recipe
+from data.items.transfer import make_transfer_recipe
 from data.oracle.contacts import first_collisions
-from data.records import Scene
-from data.sim.physics import CONTACT_FREE_FRAMES, Touching
+from data.records import FPS, Scene
+from data.sim.physics import Touching
 from data.sim.sampling import sample_scene
 from data.sources.scenes import record_scene
 from teacher.predicates.extraction import extract_facts
@@ -35,12 +36,16 @@ def touched(request: pytest.FixtureRequest) -> tuple[Scene, Touching]:
     return record_scene("scene", "train", sample, world), sample.motion.touching
 
 
-def touches_anew(touching: Touching, first: int, last: int) -> bool:
-    """Whether a pair touches at frames `first` to `last` that did not touch in the frames before,
-    as far as a contact may be interrupted."""
-    gap = CONTACT_FREE_FRAMES + 1
+def longest_step(scene: Scene) -> int:
+    """The largest difference of two frames of a contact with touch: 0.2 s lie between them."""
+    return round(0.2 * scene.fps) + 1
+
+
+def touches_anew(touching: Touching, step: int, first: int, last: int) -> bool:
+    """Whether a pair touches at frames `first` to `last` that did not touch in the `step` frames
+    before."""
     return any(
-        first <= frame <= last and not any(frame - gap <= other < frame for other in frames)
+        first <= frame <= last and not any(frame - step <= other < frame for other in frames)
         for frames in touching.values()
         for frame in frames
     )
@@ -53,7 +58,7 @@ def test_every_touch_belongs_to_one_contact(touched: tuple[Scene, Touching]) -> 
         frames = {*touching.get(pair, ())}
         assert {f for c in own for f in range(c.frame, c.end + 1)} >= frames
         assert {f for c in own for f in (c.frame, c.end)} <= frames
-        assert all(b.frame - a.end > CONTACT_FREE_FRAMES + 1 for a, b in pairwise(own))
+        assert all(b.frame - a.end > longest_step(scene) for a, b in pairwise(own))
     assert {c.objects for c in first_collisions(scene)} == touching.keys()
 
 
@@ -63,11 +68,20 @@ def test_targets_of_events_are_at_the_next_collision(touched: tuple[Scene, Touch
     for subtype, (framing, *_) in EVENT_CELLS.items():
         if framing == "future":
             timings += make_recipe("event", subtype, {}).timings(scene)
-    timings += [Timing(*q[1:4], event=q[3]) for k in (3, 5) for q in BUILDERS[k](scene)]
+    for recipe, subtype in (("movi_a", "contact"), ("physion", "A1_contact")):
+        timings += make_transfer_recipe(recipe, recipe, "event", subtype).timings(scene)
+    # Builder 6 asks for the frame half a second after the next collision.
+    later = {3: 0, 5: 0, 6: FPS - FPS // 2}
+    timings += [
+        Timing(start, stop, target - later[builder], event=target - later[builder])
+        for builder in later
+        for _, start, stop, target in BUILDERS[builder](scene)
+    ]
+    step = longest_step(scene)
     for timing in timings:
         assert timing.event == timing.target
-        assert not touches_anew(touching, timing.stop + 1, timing.target - 1)
-        assert touches_anew(touching, timing.target, timing.target)
+        assert not touches_anew(touching, step, timing.stop + 1, timing.target - 1)
+        assert touches_anew(touching, step, timing.target, timing.target)
 
 
 def test_pairs_that_will_not_meet_do_not_touch_later(touched: tuple[Scene, Touching]) -> None:

@@ -69,7 +69,7 @@ def test_collision_of_two_spheres_conserves_momentum() -> None:
         Body(spheres[1], (0.0, 0.0), 0, (0.0, 0.0)),
     ]
     motion = shared_simulator().simulate(bodies, CLEVRER, frames=40)
-    (hit,) = group_contacts(motion.touching)
+    (hit,) = group_contacts(motion.touching, FPS)
     # The gap is 1 unit minus two radii of 0.2, and the speed is about 2 units per second.
     assert hit.frame / FPS == pytest.approx(0.6 / 2, abs=0.06)
     before = motion.velocities[hit.frame - 1].sum(axis=0)
@@ -78,12 +78,12 @@ def test_collision_of_two_spheres_conserves_momentum() -> None:
 
 
 def test_contacts_within_the_gap_are_one_collision() -> None:
-    assert not has_repeated({(0, 1): [10, 11, 16]})
-    assert has_repeated({(0, 1): [10, 17]})
-    (one,) = group_contacts({(1, 0): [16, 10, 11]})
+    assert not has_repeated({(0, 1): [10, 11, 16]}, FPS)
+    assert has_repeated({(0, 1): [10, 17]}, FPS)
+    (one,) = group_contacts({(1, 0): [16, 10, 11]}, FPS)
     assert one == Collision(10, (0, 1), 16)
     two = Collision(10, (0, 1), 10), Collision(17, (0, 1), 17)
-    assert group_contacts({(0, 1): [10, 17]}) == two
+    assert group_contacts({(0, 1): [10, 17]}, FPS) == two
     # As many seconds at another frame rate.
     assert len(group_contacts({(0, 1): [10, 13]}, fps=12)) == 1
     assert len(group_contacts({(0, 1): [10, 14]}, fps=12)) == 2
@@ -162,7 +162,7 @@ def test_heavier_object_is_moved_less() -> None:
             Body(SceneObject("sphere", "metal", "blue"), (0.0, 0.0), 0),
         ]
         motion = shared_simulator().simulate(bodies, world, frames=30)
-        (hit,) = group_contacts(motion.touching)
+        (hit,) = group_contacts(motion.touching, FPS)
         speeds.append(motion.velocities[hit.frame + 1, 1, 1])
     assert speeds[0] > speeds[1] + 0.2 > speeds[2] + 0.4
 

@@ -90,7 +90,7 @@ def test_metal_pushes_rubber_away_in_the_world_of_masses() -> None:
             Body(SceneObject("sphere", resting, "blue"), (0.0, 0.0), 0),
         ]
         motion = shared_simulator().simulate(bodies, world, frames=30)
-        (hit,) = group_contacts(motion.touching)
+        (hit,) = group_contacts(motion.touching, FPS)
         before, after = (motion.velocities[hit.frame + k, 0, 1] for k in (-1, 1))
         assert (after > before / 3) == (striking == "metal")
 

@@ -72,6 +72,13 @@ def test_an_invalid_record_stops_a_strict_build(movi, tmp_path) -> None:
     assert not (tmp_path / "movi").exists()
 
 
+def test_displacements_below_a_pixel_of_a_release_are_refused(movi, tmp_path) -> None:
+    """Its frames are 256 px wide and high, so that a pixel is 1.31 px of 336."""
+    selection = SelectionConfig(time={"in_1s": Quota(0, 6)}, min_displacement=1.3)
+    with raises_user_error("invalid-setting", contains=("1.31", "256 x 256")):
+        ensure_items(config(movi, selection=selection), tmp_path, Workers(1))
+
+
 def test_scaled_velocities_are_logged_once(tmp_path, caplog) -> None:
     release = tmp_path / "release"
     for k in range(4):

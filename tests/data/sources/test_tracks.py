@@ -102,6 +102,10 @@ def test_the_rate_and_nouns_of_classes_may_be_given(tmp_path: Path) -> None:
     scene = read(tmp_path)
     assert scene.fps == 12.5
     assert [o.noun_phrase for o in scene.objects] == ["cyclist", "dog"]
+    names["videos"]["street"]["fps"] = 4.9
+    (tmp_path / "tracks.yaml").write_text(yaml.safe_dump(names))
+    with raises_user_error("invalid-record", contains=("4.9 frames", "at least 5", "street.fps")):
+        read(tmp_path)
 
 
 def test_a_scene_is_saved_without_contacts(tmp_path: Path) -> None:
@@ -124,6 +128,8 @@ LINE_DEFECTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "frame 0": ("0,1,0,0,8,6,1,1,1", ("line 5", "frame is '0'")),
     "half a frame": ("4.5,1,0,0,8,6,1,1,1", ("line 5", "frame is '4.5'")),
     "a negative width": ("5,1,0,0,-8,6,1,1,1", ("line 5", "bb_width is '-8'")),
+    "a visibility above 1": ("5,1,0,0,8,6,1,1,1.5", ("line 5", "visibility is '1.5'")),
+    "a character that is no UTF-8": ("5,1,0,0,8,6,1,1,\udcff", ("line 5", "visibility")),
     "a repeated box": ("2,1,0,0,8,6,1,1,1", ("line 5", "frame 2", "id 1", "line 3")),
     "a frame beyond the video": ("41,1,20,20,8,6,1,1,1", ("line 5", "frame 41", "40 frames")),
     "a switch of identities": ("3,1,80,50,8,6,1,1,1", ("line 5", "id 1", "frame 3", "diagonal")),

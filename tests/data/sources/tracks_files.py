@@ -45,7 +45,8 @@ def write_tracked_video(
     """Write a video, its tracks (those of `box_lines`, unless others are given), and add its names
     to tracks.yaml. Return the path of the tracks."""
     write_video(folder / f"{name}.mp4", frames, fps)
-    (folder / f"{name}.txt").write_text("\n".join(lines or box_lines(frames)) + "\n")
+    text = "\n".join(lines or box_lines(frames)) + "\n"
+    (folder / f"{name}.txt").write_text(text, errors="surrogateescape")
     path = folder / "tracks.yaml"
     content = yaml.safe_load(path.read_text()) if path.exists() else {"videos": {}}
     content["videos"][name] = {"objects": NAMES}

@@ -27,7 +27,7 @@ from evaluation import two_stage
 from evaluation.embedders.embedder import Embedder, open_embedders
 from evaluation.embedders.joint_encoder import load_encoder
 from evaluation.metrics.ranking import query_metrics
-from evaluation.metrics.results import retrieval_results
+from evaluation.metrics.results import SCENE_ALONE, retrieval_results
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.retrieval.standard_test import load_standard_test
 from evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
@@ -160,7 +160,8 @@ def measure(tmp_path, micro, store, clip) -> Callable[..., tuple[dict, dict]]:
         )  # fmt: skip
         metrics = two_stage.main.__wrapped__(replace(cfg, **settings), run)
         report = json.loads((run.folder / "report.json").read_text())
-        assert all(row.pop("seconds") is not None for row in report["rows"])
+        timed = {row["name"] for row in report["rows"] if row.pop("seconds") is not None}
+        assert {row["name"] for row in report["rows"]} == {*timed, SCENE_ALONE}
         return metrics, report
 
     return run_command
@@ -188,7 +189,7 @@ def test_a_students_texts_serve_every_matcher(
     measures = ("recall@1", "recall@10", "recall@50", "mrr", "median_rank")
     assert set(metrics) == {f"{route}_{measure}" for route in routes for measure in measures}
     names = dict.fromkeys(row["name"] for row in report["rows"])
-    assert list(names) == [f"sft {ROUTES[r].title}, clip" for r in routes]
+    assert list(names) == [*(f"sft {ROUTES[r].title}, clip" for r in routes), SCENE_ALONE]
     assert {(r["queries"], r["frames"]) for r in report["rows"] if r["builder"] is None} == {
         (len(queries), len(database))
     }
