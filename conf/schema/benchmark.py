@@ -27,7 +27,7 @@ STANDIN = "standin_"
 """Start of the names of the suites whose scenes are simulated instead of read from a release."""
 QUERIES_PER_SCENE = {"1": 3, "2": 3, "3": 3, "4": 1, "5": 1, "6": 1}
 """Maximum number of queries of each builder about a scene (paper, retrieval construction)."""
-COUNTERFACTUAL_SECONDS = (1, 2, 3, 4)
+COUNTERFACTUAL_SECONDS = (0.5, 1, 2, 3, 4)
 """Seconds from the end of the prefix to the target of the counterfactual queries about a scene."""
 MODEL_SIZE = 336
 """Side (px) of the square image in which displacements are measured: the models' input size."""

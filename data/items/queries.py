@@ -146,7 +146,7 @@ def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery],
         # The question can only name an object that the observation shows.
         shifts[:, ~visible_positions(scene)[1][: stop + 1].any(axis=0)] = 0.0
         for seconds in COUNTERFACTUAL_SECONDS:
-            target = stop + seconds * FPS
+            target = stop + int(seconds * FPS)
             if target >= scene.frames or shifts[target].max() < cell.min_displacement:
                 continue
             absent, asked = (

@@ -162,8 +162,8 @@ def time_fields(timing: Timing) -> dict[str, Any]:
     }
 
 
-def spell_seconds(count: int) -> str:
-    return "1 second" if count == 1 else f"{count} seconds"
+def spell_seconds(count: float) -> str:
+    return {0.5: "half a second", 1: "1 second"}.get(count) or f"{count} seconds"
 
 
 def frames_after_prefix(

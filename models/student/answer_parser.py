@@ -1,18 +1,19 @@
 """Read the chosen letter from a model's response to a selection item.
 
-Only the text after the last `</think>` is read. If it contains records (JSON objects with the key
-`choice` or `forced_choice`), the letter is read from these only; otherwise from lines such as
-"Answer: B"; and without such lines, the text must be nothing but a letter, such as "(B)" or "Option
-b". The parser never guesses: several letters, or a letter in passing, are no answer.
+A response is cleaned, and its thoughts are removed. Records (JSON objects with the key `choice` or
+`forced_choice`) come first. Without them, the sentences are read in order: a statement, such as
+"Answer: B" or "I choose B", gives a letter; a later statement may correct it, and a later sentence
+may take it back or name a rival. Without a statement, a letter on a line of its own counts, and so
+does the conclusion of the last sentence. The parser never guesses: two letters without a
+correction, or a letter in passing, are no answer. docs/evaluation.md lists what counts.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import string
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -46,90 +47,171 @@ class ParsedAnswer:
     record: str | None = field(default=None, compare=False)
 
 
-_INVISIBLE = re.compile("[\u200b-\u200f\u2060\ufeff]")
-_THOUGHT_START = re.compile(r"[<◁]think(?:ing)?[>▷]", re.IGNORECASE)
-_THOUGHT_END = re.compile(r"[<◁]/think(?:ing)?[>▷]", re.IGNORECASE)
+def _compile(pattern: str) -> re.Pattern[str]:
+    """Compile a pattern without regard to case, in which "~" stands for white space."""
+    return re.compile(pattern.replace("~", r"\s{1,9}"), re.IGNORECASE)
 
-_RECORD_START = re.compile(r"""\{\s*["']""")
-_CURLY_START = re.compile(r"\{\s*[“”‘’]")
-_STRAIGHT = str.maketrans("“”‘’", "\"\"''")
-_BARE_START = re.compile(r"\{\s*(?:forced[ _-]?)?choice\s*:", re.IGNORECASE)
-_BARE_KEY = re.compile(r"([{,]\s{0,20})([a-z_]\w{0,40})(?=\s{0,20}:)", re.IGNORECASE)
-# The only key of an object that contains the record.
-_WRAPPER = re.compile(
-    r"""\{\s*["'][a-z_ ]{0,20}(?:answer|response|result|output|record)["']\s*:\s*\{""",
-    re.IGNORECASE,
+
+# Cleaning.
+_INVISIBLE = re.compile(
+    "\x1b\\[[\\d;]{0,9}m|[\0\xad\u061c\u200b-\u200f\u202a-\u202e\u2060-\u2069\ufe0e\ufe0f\ufeff]"
 )
-_ANSWER_TAG = re.compile(r"<answer>([^<>\n]{0,200})</answer>", re.IGNORECASE)
-# Text between two records that announces the second one as a correction of the first.
-_CORRECTION = re.compile(
-    r"\b(?:wait|actually|correction|corrected|on second thought|revised|"
-    r"(?:i made|there is|there was) an? (?:mistake|error)|let me (?:correct|fix|revise))\b",
-    re.IGNORECASE,
+_SYMBOLS = str.maketrans(
+    dict.fromkeys("✓✔✅☑", " yes ") | dict.fromkeys("✗✘❌✖", " no ") | dict.fromkeys("“”", '"')
+    | dict.fromkeys("‘’", "'") | {"→": "->", "⇒": "->", "🅰": "A", "🅱": "B"}
+)  # fmt: skip
+_LOOK_ALIKE = re.compile(r"(?<![^\W_])[ΑАΒВС](?![^\W_])")
+_LATIN = str.maketrans("ΑАΒВС", "AABBC")
+_TURN_END = _compile(r"</s>|<\|?(?:im_end|eot_id|end_of_turn|end.of.sentence|endoftext|end)\|?>")
+_TEMPLATE_TOKEN = _compile(r"<\|(?:im_)?start\|>\s*(?:assistant)?|<\|[^|<>\n]{1,30}\|>|<s>")
+_THOUGHT = r"(?:\w{1,9}:)?(?:think(?:ing)?|thoughts?|reasoning|reflection|analysis|scratch_?pad)"
+_THOUGHT_START = _compile(
+    rf"[<◁]{_THOUGHT}(?:\s[^<>]{{0,80}})?[>▷]|\[THINK\]|<\|(?:begin_of_|start_)?th(?:ought|inking)\|>"
+    r"|```(?:thinking|thoughts?|reasoning)\b|<\|channel\|>\s{0,9}(?:analysis|commentary)\b"
 )
+_THOUGHT_END = _compile(
+    rf"[<◁]/{_THOUGHT}[>▷]|\[/THINK\]|<\|(?:end_of_|end_|/)th(?:ought|inking)\|>|<\|channel\|>\s{{0,9}}final\b"
+)
+_FENCED_THOUGHT = _compile(r"```(?:thinking|thoughts?|reasoning)\b[^`]*```")
+
+# Records.
+_COMMENT = re.compile(r'("(?:[^"\\\n]|\\.)*")|(?<![:\w/])//[^\n]*|/\*.{0,500}?\*/', re.DOTALL)
+_RECORD_START = _compile(r"""\{\s*(?:["']|(?:forced[ _-]?)?choice\s*:)""")
 _STRING = r""""(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*'"""
-_JUNK = r"""[^a-z0-9"']{0,4}"""
-_CHOICE = rf"(?:{_JUNK.join('forced')}{_JUNK})?{_JUNK.join('choice')}"
-_KEY = rf"""["']{_JUNK}{_CHOICE}{_JUNK}["'][^a-z0-9"':]{{0,4}}:\s*"""
-# A value is a string, a list, or unquoted text. Bounding the length of the latter makes the time
-# linear. If text follows a string directly or on a new line, a quote or a comma is missing.
 _VALUE = (
-    rf"""(?:{_STRING})(?=\s*(?:[,}}\]"']|$))|\[[^\[\]{{}}]*\]|(?!,|(?:{_STRING})(?:\w|\s*[\n:]))"""
-    rf"""(?:[^\n{{}}"'\[\]]|{_STRING}){{1,200}}?(?=,\s*["'}}]|[\n}}])"""
+    rf"""(?:{_STRING}|\[[^\[\]{{}}]*\]|[^"'\[\]{{}},\n]){{1,200}}?"""
+    r"""(?=\s*(?:[,}\n]|$|["']\w+["']\s*:))"""
 )
+_WRAPPER = r"[a-z_ ]{0,20}(?:answer|response|result|output|record|arguments|parameters)"
 _TOKEN = re.compile(
-    rf"""(?P<choice>{_KEY}(?:(?P<nested>(?={{))|(?P<value>{_VALUE}))?)"""
-    rf"""|(?P<string>{_STRING})|(?P<open>[{{\[])|(?P<close>[}}\]])|(?P<unclosed>["'])""",
-    re.IGNORECASE | re.DOTALL,
+    r"""(?:(?P<quote>["'])|(?<![\w"']))(?:(?P<key>(?:forced[ _-]?)?choice)|"""
+    rf"""(?P<other>(?:final_?)?(?:answer|choice)|letter)|(?P<wrapper>{_WRAPPER}))"""
+    rf"""(?(quote)(?P=quote))\s*:\s*(?:(?P<nested>(?={{))|(?(wrapper)(?!))(?P<value>{_VALUE})?)"""
+    rf"""|{_STRING}|[{{}}]|["']""",
+    re.IGNORECASE,
 )
 
-_ANSWER_LINE = re.compile(
-    r"(?:^|[.!?;]\s)[ \t*_#>`\-]*(?:(?:so|thus|hence|therefore),?\s+)?(?:(?:the|my)\s+)?"
-    r"(?:(?:final|correct|best|forced)[ \t_]+)*(?:answer|choice)[*_`]*"
-    r"(?:\s*(?:\bis\b\s*:?|[:=])|[ \t]*(?=\n))(?P<value>\s*[^\n]*)",
-    re.IGNORECASE | re.MULTILINE,
+# Statements: the words that announce a letter, those before it, and those after it.
+_NOUN = r"(?:option|candidate|image|choice|frame|letter|picture|panel|photo|number|answer)"
+_REVISED = r"(?:revised|corrected|updated|new|real|true|actual)"
+_OWN = (
+    rf"(?:(?:{_REVISED}|final|correct|best|right|forced|own|single|likely|closest|chosen|selected)"
+    r"[\s_]+)"
+)
+_FOREIGN = (
+    r"(?:答案|正解|答え|回答|정답|réponse|respuesta|antwort|ответ|risposta|resposta|odpowiedź|cevap|jawaban|"
+    r"đáp~án)(?:~\w+)?"
+)
+_IS = (
+    r"(?:\b(?:is|are|was|remains?|becomes?|lautet|est|es|ist|è"
+    r"|(?:would|should|must|will|has~to|have~to|would~have~to|seems~to|appears~to)~be)\b|是|为|は|은|는)"
+)
+_HEAD = _compile(
+    rf"(?:\b(?:{_OWN}{{0,4}}(?:answer|ans|choice|final|pick|selection|selected|verdict|conclusion|"
+    rf"guess|output|result)|{_OWN}{{1,4}}(?:match|{_NOUN}))\b|{_FOREIGN})[*_`]*(?:\s?\([^()\n]{{0,60}}\)|,[^,:\n]{{1,60}},"
+    r"|~(?:to|for|of|in|here|by|with|based|among|i|one)\b[^.:;?!=\n]{0,60}?){0,2}"
+    rf"[*_`]*\s{{0,3}}(?:{_IS}\s{{0,3}}:?|[:=]|[-–—/]>?(?!\w)|\.{{1,9}}(?=\s?\w\b)|=>)"
+    r"|\b(?:i|we)(?:'d|'ll|~(?:would|will|must|have~to|had~to|therefore|thus)){0,3}"
+    r"~(?:choose|chose|pick|select|go(?:~with)?|opt~for|vote~for|settle~on|answer(?:~with)?)\b\s{0,3}:?"
+    r"|\bchang(?:e|ed|ing)~(?:my~answer|my~choice|it|that)~to\b|[选選](?:择|択)?\s{0,3}:?"
+)
+_HEADING = _compile(rf"^[\s*_#>-]*(?:the~|my~)?{_OWN}{{0,4}}(?:answer|choice)[\s*_#:`]*$")
+_CORRECTING = _compile(
+    rf"\b(?:{_REVISED}|actually|instead|reflection|second~thought|after~all|chang\w+|must|forced|"
+    r"wait|correction|mistake|error|meant|sorry|let~me)\b"
+)
+_REVISING = _compile(rf"\b(?:{_REVISED}|actually|instead|on~reflection|after~all|chang\w+|must)\b")
+_REOPENING = _compile(
+    r"\W*(?:wait|scratch~that|on~second~thought|on~reflection|let~me~correct|correction)\b"
+)
+_REPORTED = _compile(
+    r"\b(?:some(?:one|body)?|others?|reader|people|they|he|she|you|your|whether|if|unless|suppose|"
+    r"assuming|otherwise|wrote|writes|says|said|reads|caption|claim\w*|thinks|another|user|might|"
+    r"could|may|seems?|tempt\w+|not|never|doubt|such~as|e\.?g|for~(?:example|instance)|example|"
+    r"format|template|instructions?|like~this|in~the~form|(?:first|second|third|initial|previous|"
+    r"earlier|original|other|alternative|naive|wrong|incorrect|next|no|any|every|each)~"
+    rf"(?:guess|pick|selection|{_NOUN}))(?=\W|$)|n't\b|^\W*had\b"
+)
+_OWN_WORDS = _compile(r"\b(?:requested|required|if~i~(?:must|have~to|had~to))\b")
+_BEFORE_LETTER = (
+    r"(?:(?:(?:i|we|it|this|that|the|is|it's|that's|must|has|have|be|to|should|would|i'd|say|think|"
+    r"believe|guess|go|going|choose|pick|select|with|for|probably|most|more|likely|clearly|because|"
+    r"definitely|certainly|surely|indeed|fits|matches|shows|which|therefore|thus|hence|so|now|simply|just|only|best|correct|"
+    rf"right|final|closest|my|one|either|both|{_NOUN})\b|[^\x00-\x7f]{{1,9}})[\s:,.#=-]*){{0,12}}"
+)
+_STATEMENT = _compile(
+    rf"[\s\-•.:,=>#]*(?:[^,\d]{{1,60}},\s)??{_BEFORE_LETTER}(?P<letter>[a-z0-9])(?![a-z0-9_])(?!'\w)\s*(?P<rest>.*)$"
+)
+_POSITION = _compile(
+    r"\b(?:(?P<ordinal>first|second|third|fourth)~(?:image|picture|candidate|option|frame|panel)"
+    r"|(?:image|picture|candidate|option|frame|panel)[ #]{1,2}(?P<number>[1-4]))\b"
+)
+_ORDINALS = {"first": "A", "second": "B", "third": "C", "fourth": "D"}
+_AFTER_A = _compile(
+    r"$|[^\w\s]|[^\x00-\x7f]|(?:or|and|vs|to|yes|no|because|since|as|due|which|that|where|if|shows?|"
+    r"match\w*|fits?|is|was|seems|looks|agrees|with|near|at|in|on|by|xx)\b"
+)
+_NAMED = re.compile(
+    r"(?<![a-zA-Z0-9_'])([B-HJ-Z]|A(?!\s+(?!(?:or|and|vs|to|is|as)\b)[a-z]))(?![\w'])"
+)
+_AND_OR = _compile(
+    rf"(?:[\W_]|或|和|また?は|또는|или|\b(?:or|and|oder|ou|vs|to|possibly|maybe|perhaps|likely|probably|clearly|definitely|also|either|both|but|the|{_NOUN})\b)*"
+)
+_ALONE = _compile(rf"(?:{_AND_OR.pattern}(?<![\w'])[a-z0-9](?![\w'])){{1,4}}[\s.,;!?)。]*")
+_EXCUSE = _compile(
+    r"\b(?:because|since|as|due|though|although|while|whereas|unlike|instead|rather|not|no|than|"
+    r"second~choice|runner|wrong|incorrect|earl(?:y|ier)|lat(?:e|er)|ruled?\sout|too|cannot|never|neither|reject\w*|"
+    r"eliminat\w*|exclud\w*)\b|n't\b"
+)
+_REASON = _compile(r"\W*(?:because|since|as|due|though|although|while)\b")
+_FALSE = r"(?:wrong|incorrect|false|impossible|rejected|excluded|eliminated|ruled~out|implausible)"
+_NOT = r"(?:not|never|cannot|can't|doesn't|isn't|won't|hardly)"
+_WITHDRAWAL = _compile(
+    rf"^\W*(?:(?:wait|but|so|no|oh|actually)\b\W*){{0,3}}(?:which|this|that|it|that's|it's|SELF)\b\W*(?:\w+~){{0,2}}?(?:"
+    rf"{_FALSE}\b|{_NOT}~(?:(?:be|quite|really)~)?(?:fit|match|work|hold|follow|right|correct|true|"
+    rf"valid|possible|plausible|it\b|the~answer))|^\W*(?:{_FALSE}|not~(?!SELF\b|[A-D]\b)\w+)\W*$|no[,.]~none\b"
+    r"|^\W*(?:(?:oh|ah|hmm+|wait|but|actually|well|sorry|no|nope)\b\W*)+$"
+    r"|\b(?:i~doubt|so~i~thought|scratch~that|take~(?:it|that)~back|never~mind|"
+    r"chang\w+~my~(?:answer|choice|mind)|disregard|ignore|typo|placeholder|withdraw|retract)\b"
+    rf"|\bSELF~(?:is|was|must~be)~(?:\w+~)?(?:{_FALSE}|{_NOT})\b|^\W*(?:if|unless|provided)\b"
+)
+_REFUSAL = _compile(
+    r"^(?:none|null|n/?a|nil|no|neither|unknown|unsure|abstain|refused?|declined?|pass)\W*$"
+    r"|(?:can\s?not|can't|unable~to|impossible~to|not~able~to|could~not)~(?:be~)?(?:reliably~)?"
+    r"(?:determine|tell|answer|decide|choose|select|pick|identify|say|assist|help|comply)"
+    r"|refuse~to|(?:not~enough|insufficient)~(?:information|evidence|data)"
+    r"|\bnone~of\b|\bor~none\b|\bno~(?:correct|valid|suitable|clear)~\w+"
+)
+_WEAK_REFUSAL = _compile(
+    r"\bsorry\b|(?:hard~to|do(?:~not|n't))~(?:determine|tell|answer|decide|know|see)"
+)
+_RIVAL = _compile(
+    rf"\b(?:i~meant~|(?:it|this|that|edit|correction)(?:(?:'s|~is|~must~be|~has~to~be|~should~be|~(?:could|may|"
+    rf"might)(?:~\w+){{0,3}}?~be)~|\s?:\s?))(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])(?=\W*$|[,;])"
+    r"|(?<![\w'])(?P<subject>[A-D]):?~(?:(?:also|still)~)?(?:(?:fits|matches|agrees)\b|(?:is|seems"
+    r"|looks)~(?:(?:just|equally|also|as|more|the|a|far|much|too)~){0,3}(?:likely|plausible|"
+    r"possible|probable|right|correct|better|best|closest|answer|match)\b)"
+)
+_CONCLUSION = _compile(
+    rf"\b(?:match|matches|image|one|frame|candidate|option|state|future|it|this)\b[^.:;\n]{{0,40}}?~"
+    rf"(?:is|must~be|has~to~be)~(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])\W*$"
+    r"|(?<![\w'])(?P<subject>[A-D])~(?:is|must~be)~the~(?:one|only|correct|right|best|match|closest)\b"
+)
+_VERDICT = _compile(rf"\W*(?:{_NOUN}~)?(?P<letter>[A-D])\b[\s).,:=*_-]+(?P<verdict>\w.*)")
+_YES = _compile(r"\b(?:yes|match(?:es)?|fits|correct|right|true|best)\b")
+_NO = _compile(r"\b(?:no|not|wrong|incorrect|false|mismatch|reject\w*|too)\b|n't\b")
+_TAG = _compile(
+    r"<(?P<tag>(?:final_?)?(?:answer|choice))(?:\s[^<>]{0,80})?>(?P<value>[^<>]{0,200})</(?P=tag)>"
+)
+_SINGLE = re.compile(r"(?<![\w'])[a-zA-Z0-9](?![\w'])")
+_STRUCK = re.compile(r"~~[^~\n]*~~")
+_BOXED = re.compile(
+    r"\\boxed\s?\{(?:\\\w{1,9}\s?\{)?\s?([A-D])\s?\}|<\|begin_of_box\|>\s?([A-D])\b"
 )
 _LATEX = re.compile(r"\\(?:boxed|text(?:bf|rm|tt)?|math(?:bf|rm|tt)|displaystyle)(?![a-z])")
-_MARKUP = re.compile(r"[*_`\"“”()\[\]{}<>$\\]+|(?<!\w)'|'(?!\w)")
-_STATEMENT = re.compile(
-    r"(?:the\s+)?(?:(?:correct|best|right|final)\s+)?"
-    r"(?:(?:option|candidate|image|choice|frame|letter|answer)(?:\s+is)?[\s:#.\-]\s*)?"
-    r"(?P<letter>[^\W_])(?!\w)\s*(?P<rest>$|(?:[.,:;!?/|&+=。]|[\-–—](?!\w)|because\b|since\b).*)",
-    re.IGNORECASE | re.DOTALL,
-)
-# Neither the pronoun "I" nor the article "A" names a candidate.
-_NAMED_LETTER = re.compile(
-    r"(?<![\w'])[A-HJ-Za-d](?![\w'])(?!(?<=[Aa])\s+(?!(?:or|and|vs|to)\b)[a-z])"
-)
-_ANY_LETTER = re.compile(r"(?<![^\W_])[a-z](?![^\W_])", re.IGNORECASE)
-_ONLY_LETTERS = re.compile(
-    r"(?:\b(?:[a-z]|or|and|vs|to|either|both|but|maybe|possibly|perhaps|option)\b|[\W_])*",
-    re.IGNORECASE,
-)
-_REFUSAL = re.compile(
-    r"^(?:none|null|n/?a|nil|no|neither|unknown|unsure|abstain|refused?|declined?|pass)$"
-    r"|(?:can\s?not|can'?t|unable to|impossible to|hard to|not able to|do(?: not|n'?t)|could not)"
-    r"\s+(?:be\s+)?(?:reliably\s+)?(?:determine|tell|answer|decide|choose|select|pick|identify|say|"
-    r"know|see\b|view|assist|help|provide|comply)"
-    r"|\bsorry\b|refuse to|(?:not enough|insufficient) (?:information|evidence|data)|\bnone of\b"
-    r"|\bor none\b|\bno (?:correct|valid|suitable|clear|single) "
-    r"(?:answer|option|choice|candidate|image)",
-    re.IGNORECASE,
-)
-# Text after a letter, in the same sentence or in the next line, that withdraws it.
-_WITHDRAWAL = re.compile(
-    r"\bwait\b|\b(?:that|this|it)(?:['’]s| is) (?:wrong|incorrect|not right)"
-    r"|^\W*(?:(?:which|that|this|it)\s+)?(?:(?:is|was|seems|looks|would be)\s+)?"
-    r"(?:no|nope|not|wrong|incorrect|false|impossible|rejected|excluded|eliminated|ruled out|"
-    r"not (?:it|right|correct|possible|valid|the answer))(?:\W*$|\s*[.,;:!?])",
-    re.IGNORECASE,
-)
-_SECOND_THOUGHT = re.compile(
-    r"[ \t*_#>`\-]*(?:(?:oh|no|nope|hmm+|but|sorry|wait|actually|correction|scratch that|"
-    r"on second thought)\b[\s,.!:;*_\-–—]*)+"
-    r"(?:(?:it|that)(?:['’]s| is)\b|i meant\b|make (?:it|that)\b|the answer is\b)?",
-    re.IGNORECASE,
-)
+_BRACKETED = re.compile(r"""[(\[{*_`"'<$]\s?([A-D])\s?[)\]}*_`"'>$]""")
+_MARKUP = re.compile(r"[*_`\"()\[\]{}<>$\\]+|(?<!\w)'|'(?!\w)")
+_SENTENCE = re.compile(r"(?<=[.!?;])\s+|\n+")
 
 
 def parse_choice(raw: str, truncated: bool = False) -> ParsedAnswer:
@@ -144,105 +226,93 @@ def parse_choice(raw: str, truncated: bool = False) -> ParsedAnswer:
     text = strip_thought(_INVISIBLE.sub("", unicodedata.normalize("NFKC", raw)))
     if text is None:
         return ParsedAnswer(None, Reason.CUT_OFF)
-    repaired = _quote(text)
-    choices, records, flag, prose = _read_records(repaired)
-    if repaired != text:
-        if choices:
-            flag = flag or Reason.MALFORMED
-        else:
-            choices, records, flag, prose = _read_records(text)
-    prose = _ANSWER_TAG.sub(r"\nAnswer: \1\n", prose)
+    text = _LOOK_ALIKE.sub(lambda found: found[0].translate(_LATIN), text.translate(_SYMBOLS))
+    text = next(filter(str.strip, _TURN_END.split(text)), "")
+    choices, others, record, flag, (whole, rest) = _read_records(text)
     if choices:
-        answer = _agreed([_read_statement(choice) for choice in choices])
-        record = records[0] if len(records) == 1 and flag is None else None
+        answer = _agreed(map(_read_value, choices))
+        other = _agreed(map(_read_value, others)).letter
+        if answer.letter:
+            answer = _read_prose(rest, answer)
+        if answer.letter and other not in (None, answer.letter):
+            answer = ParsedAnswer(None, Reason.SEVERAL)
         broken = answer.reason in (None, Reason.MALFORMED) and flag
-        return ParsedAnswer(answer.letter, broken or answer.reason, record)
+        return ParsedAnswer(answer.letter, broken or answer.reason, None if flag else record)
     if flag is Reason.CUT_OFF:
         return ParsedAnswer(None, flag)
     # With "xx" appended, a last word that may have been cut off cannot be read as a letter.
-    answer = _read_prose(f"{prose}xx" if truncated else prose)
-    if truncated and answer.reason is Reason.NO_ANSWER:
-        return ParsedAnswer(None, Reason.CUT_OFF)
-    return answer
+    answer = _read_prose(whole + ("xx" if truncated else ""))
+    if answer.reason is Reason.NO_ANSWER:
+        answer = _agreed(map(_read_value, others))
+    is_cut = truncated and answer.reason is Reason.NO_ANSWER
+    return ParsedAnswer(None, Reason.CUT_OFF) if is_cut else answer
 
 
 def strip_thought(text: str) -> str | None:
-    """Return the text after the last `</think>`, or None if a later `<think>` is not closed."""
-    response = _THOUGHT_END.split(text)[-1]
+    """Return the text after the last end of a thought, such as `</think>`, or before it if nothing
+    follows; None if a later thought is not closed."""
+    *before, response = _THOUGHT_END.split(_FENCED_THOUGHT.sub("", text))
+    if before and not response.strip():
+        response = _THOUGHT_START.split(before[-1])[0]
     return None if _THOUGHT_START.search(response) else response
 
 
-def _quote(text: str) -> str:
-    """Return the text with straight quotes, or with quoted keys, if a record lacks them."""
-    if _CURLY_START.search(text):
-        text = text.translate(_STRAIGHT)
-    return _BARE_KEY.sub(r'\1"\2"', text) if _BARE_START.search(text) else text
+def _read_records(text: str) -> tuple[list, list, str | None, Reason | None, tuple[str, str]]:
+    """Return the choices of all records (None for an unreadable one), the values of other keys, the
+    only record, what is wrong with the records, and the texts before and after the last record.
 
-
-def _read_records(text: str) -> tuple[list[str | None], list[str], Reason | None, str]:
-    """Return the choices of all records (None for an unreadable one), the complete records with a
-    choice, what is wrong with the records (None if nothing is), and the text outside of records.
-
-    A record that repeats the template of the prompt, in which the choice lists all letters, does
-    not count beside another record, and neither does a record that the following text corrects.
+    A record that the text before it calls an example, or that the text after it corrects, does not
+    count.
     """
-    choices, records, prose, flag, position = [], [], [], None, 0
-    while match := _RECORD_START.search(text, position):
-        between = text[position : match.start()]
-        prose.append(between)
-        values, end = _read_record(text, match.start())
-        if values and choices and (_CORRECTION.search(between) or _is_template(choices)):
+    choices, others, records, prose, flag, position = [], [], [], "", None, 0
+    plain = _COMMENT.sub(lambda found: found[1] or "", text) if "{" in text else text
+    if '"{\\"' in plain:  # a record within a string, as the arguments of tool calls are written
+        plain = plain.replace('"{\\"', '{"').replace('}"', "}").replace('\\"', '"')
+    while match := _RECORD_START.search(plain, position):
+        between, start = plain[position : match.start()], match.start()
+        found, end = _read_record(plain, start)
+        position, prose = end or len(plain), f"{prose}\n{between}"
+        flag = flag if end else Reason.CUT_OFF
+        if _is_reported(between.strip()[-200:], ""):
+            continue
+        values = [value for is_key, value in found if is_key]
+        others += [value for is_key, value in found if not is_key]
+        if not values:
+            continue
+        if choices and (_CORRECTING.search(between) or _read_value(choices[0]).letter is None):
             choices, records = [], []
         choices += values
-        position = len(text) if end is None else end
-        if end is None:
-            flag = Reason.CUT_OFF
-        elif values:
-            records.append(text[match.start() : end])
-            flag = flag or (None if _is_json(records[-1]) else Reason.MALFORMED)
-    return choices, records, flag, "\n".join([*prose, text[position:]])
+        records.append(plain[start:position])
+        flag = flag or (None if text == plain and _is_json(records[-1]) else Reason.MALFORMED)
+    only = records[0] if len(records) == 1 else None
+    return choices, others, only, flag, (f"{prose}\n{plain[position:]}", plain[position:])
 
 
-def _read_record(text: str, start: int) -> tuple[list[str | None], int | None]:
-    """Return the choices in the record that begins at `start` (None for an unreadable choice), and
-    the record's end (None if it is cut off).
+def _read_record(text: str, start: int) -> tuple[list[tuple[bool, str | None]], int | None]:
+    """Return the values in the record that begins at `start` with whether they are choices (None
+    for an unreadable one), and the record's end (None if it is cut off).
 
-    A record counts only if it has a choice at its outermost level; in {"answer": {...}}, this is
-    the level of the inner object. Then choices at deeper levels are returned too, because another
-    record may begin inside a record that was broken off.
+    A record has a choice at its outermost level, or in an object that contains the record. Then
+    choices at deeper levels count too: another record may begin inside one that was broken off.
     """
-    choices: list[tuple[int, str | None]] = []
-    depth, end = 0, None
+    found, depth, outermost, is_record = [], 0, 1, False
     for token in _TOKEN.finditer(text, start):
-        if token["unclosed"]:
+        if token[0] in "\"'":
             break
-        if token["choice"]:
-            unreadable = token["value"] is None and token["nested"] is None
-            choices.append((depth, None if unreadable else _unquote(token["value"] or "")))
-        depth += bool(token["open"]) - bool(token["close"])
+        value, is_key = token["value"], token["key"] is not None
+        is_cut = value and token.end() == len(text) and value.strip()[-1] not in "\"']"
+        if (token["wrapper"] or is_key) and token["nested"] is not None:
+            outermost = max(outermost, depth + 1)
+            is_record |= is_key and depth == 1
+        elif not is_cut and (is_key or (token["other"] and value and depth <= outermost)):
+            found.append((is_key or (depth > 1 and is_record), value))
+            is_record |= is_key and depth <= outermost
+        depth += (token[0] == "{") - (token[0] == "}")
         if depth == 0:
-            end = token.end()
             break
-    outermost = 2 if _WRAPPER.match(text, start) else 1
-    has_choice = any(depth == outermost for depth, _ in choices)
-    return [value for _, value in choices] if has_choice else [], end
-
-
-def _is_template(choices: Sequence[str | None]) -> bool:
-    """Return whether each choice lists all letters, such as "A|B|C|D", and nothing else."""
-    return all(
-        choice is not None
-        and _ONLY_LETTERS.fullmatch(choice)
-        and {found.upper() for found in _ANY_LETTER.findall(choice)} == {*LETTERS}
-        for choice in choices
-    )
-
-
-def _unquote(value: str) -> str:
-    try:
-        return json.loads(value, strict=False) if value.startswith('"') else value
-    except ValueError:
-        return value
+    if not is_record:
+        found = [each for each in found if not each[0]]
+    return found, token.end() if depth == 0 else None
 
 
 def _is_json(text: str) -> bool:
@@ -253,69 +323,190 @@ def _is_json(text: str) -> bool:
     return True
 
 
-def _read_prose(prose: str) -> ParsedAnswer:
-    """Read answer lines, such as "Answer: B"; without these, a text that is only a letter."""
-    lines = [*_ANSWER_LINE.finditer(prose)]
-    if not lines:
-        return _read_lone_letter(prose)
-    answer = _agreed([_read_statement(line["value"]) for line in lines])
-    if answer.reason is Reason.NO_ANSWER and not lines[-1]["value"].strip():
+def _read_prose(prose: str, answer: ParsedAnswer | None = None) -> ParsedAnswer:
+    """Read the statements of a text in order, after an answer that was given before it."""
+    prose = _TAG.sub(r"\nAnswer: \g<value>\n", _STRUCK.sub(" ", prose))
+    boxed = {one or two for one, two in _BOXED.findall(prose)}
+    prose = re.sub(r"\bans\.", "answer:", _TEMPLATE_TOKEN.sub(" ", prose), flags=re.IGNORECASE)
+    sentences = [s for s in map(_strip_markup, _SENTENCE.split(prose)) if re.search(r"\w|=>", s)]
+    is_given, rank, k, is_next, is_reopened, is_cut = answer is not None, 0, 0, True, False, False
+    plain: list[str] = []
+    while k < len(sentences):
+        sentence, previous, k = sentences[k], sentences[k - 1] if k else "", k + 1
+        heads = [*_HEAD.finditer(sentence)] or [*_HEADING.finditer(sentence)]
+        stops = [head.start() for head in heads[1:]] + [len(sentence)]
+        for head, stop in zip(heads, stops, strict=False):
+            words, value = sentence[: head.end()][-200:], sentence[head.end() : stop]
+            if _is_reported(words, "" if head.start() > 3 else previous):
+                continue
+            if not value.strip(" :.") and stop == len(sentence):
+                value, k = _read_block(sentences, k)
+                is_cut = not value
+            stated = _read_value(value)
+            if stated.reason is Reason.NO_ANSWER:
+                continue
+            replaces = answer and re.search(rf"\bnot {answer.letter}\b", value)
+            is_revised = is_reopened or replaces or _REVISING.search(words)
+            own = 2 if is_revised else int("final" in words.lower())
+            if answer is None or own > rank or own == 2:
+                answer = stated
+            elif stated != answer:
+                answer = ParsedAnswer(None, Reason.SEVERAL)
+            rank, is_next, is_reopened = max(rank, own), True, False
+        plain += [] if heads else [sentence]
+        if not heads and answer and answer.letter:
+            is_reopened |= bool(_REOPENING.match(sentence))
+            answer, is_next = _react(answer, sentence, is_next), False
+    if answer is None and is_cut:
         return ParsedAnswer(None, Reason.CUT_OFF)
-    next_line = prose[lines[-1].end() :].strip().partition("\n")[0]
-    return _apply_second_thought(answer, next_line) if answer.letter else answer
+    if answer or is_given:
+        return answer
+    return _agreed(map(ParsedAnswer, boxed)) if boxed else _read_without_statement(plain)
 
 
-def _apply_second_thought(answer: ParsedAnswer, line: str) -> ParsedAnswer:
-    """Discard the letter of an answer if the next line withdraws it or names another letter."""
-    opening = _SECOND_THOUGHT.match(line)
-    rest = line[opening.end() :] if opening else line
-    if (opening and not rest.strip()) or _WITHDRAWAL.fullmatch(
-        rest.strip(f"{string.punctuation} ")
+def _read_block(sentences: list[str], k: int) -> tuple[str, int]:
+    """Return what follows a heading at the sentences from `k` on, and where it ends: the next
+    sentence, or the letter with the only positive verdict in a list of verdicts."""
+    verdicts: dict[str, str] = {}
+    stop = k
+    while stop < len(sentences):
+        joined = " ".join(sentences[stop : stop + 2])
+        found = _VERDICT.match(sentences[stop])
+        if found is None and re.fullmatch(r"\W*[A-D]\W*", sentences[stop]):
+            found = _VERDICT.match(joined)
+            stop += found is not None
+        text = found["verdict"] if found else ""
+        if (
+            found is None
+            or found["letter"] in verdicts
+            or not (_YES.search(text) or _NO.search(text))
+        ):
+            break
+        verdicts[found["letter"]] = found["verdict"]
+        stop += 1
+    if len(verdicts) > 1:
+        right = [
+            key for key, text in verdicts.items() if _YES.search(text) and not _NO.search(text)
+        ]
+        return " or ".join(right) or "none", stop
+    return (sentences[k], k + 1) if k < len(sentences) else ("", k)
+
+
+def _react(answer: ParsedAnswer, sentence: str, is_next: bool) -> ParsedAnswer:
+    """Return the answer after a later sentence, which may take it back or name a rival."""
+    sentence = sentence[:400]
+    own = re.sub(rf"(?<![\w']){answer.letter}(?![\w'])", "SELF", sentence)
+    taken_back = _WITHDRAWAL.search(own)
+    if (taken_back and (is_next or "SELF" in taken_back[0])) or (
+        is_next and _REFUSAL.search(sentence)
     ):
         return ParsedAnswer(None, Reason.REFUSAL)
-    corrected = _read_statement(rest).letter if opening else None
-    return answer if corrected in (None, answer.letter) else ParsedAnswer(None, Reason.SEVERAL)
+    named = {
+        found["said"] or found["subject"]
+        for rule in (_RIVAL, _CONCLUSION)
+        for found in rule.finditer(sentence)
+    }
+    named |= {*_positions(sentence)} if not _EXCUSE.search(sentence) else set()
+    alone = _NAMED.findall(sentence)
+    if alone and _AND_OR.fullmatch(_NAMED.sub("", sentence)) and not sentence.endswith(":"):
+        named |= {*alone}
+    if _EXCUSE.search(sentence) and not alone:
+        named = set()
+    return answer if named <= {answer.letter} else ParsedAnswer(None, Reason.SEVERAL)
 
 
-def _read_lone_letter(text: str) -> ParsedAnswer:
-    """Read a text that is nothing but a letter, such as "(B)" or "Option b"."""
-    value = _strip_markup(text)
-    if len(value.split()) > 5:
-        return ParsedAnswer(None, Reason.REFUSAL if _REFUSAL.search(value) else Reason.NO_ANSWER)
-    answer = _read_statement(value)
-    if answer.letter and _STATEMENT.fullmatch(value)["rest"].strip(" .,;!?。"):
+def _read_without_statement(sentences: list[str]) -> ParsedAnswer:
+    """Read a list of verdicts, a letter alone on the first or the last line, or the conclusion of
+    the last sentence."""
+    if not sentences:
         return ParsedAnswer(None, Reason.NO_ANSWER)
+    value, stop = _read_block(sentences, 0)
+    if stop == len(sentences) > 2:
+        return _read_value(value)
+    first, last = sentences[0], sentences[-1]
+    is_single = len(sentences) == 1
+    found = [_read_value(line) for line in {first, last} if _ALONE.fullmatch(line)]
+    said = [*_CONCLUSION.finditer(last), *(_RIVAL.finditer(last) if is_single else ())]
+    if not found and not _is_reported(last, ""):
+        found = [ParsedAnswer((each["said"] or each["subject"]).upper()) for each in said]
+    if not found and any(map(_REFUSAL.search, sentences)):
+        return ParsedAnswer(None, Reason.REFUSAL)
+    answer = _agreed(found)
+    for sentence in sentences[1:-1]:
+        answer = _react(answer, sentence, is_next=False) if answer.letter else answer
     return answer
 
 
-def _read_statement(value: str | None) -> ParsedAnswer:
-    """Read a short statement, such as "B", "option (C)" or "B, because the cube has turned"; None
-    stands for an unreadable statement."""
+def _read_value(value: str | None) -> ParsedAnswer:
+    """Read what follows the head of a statement, such as "B", "option (C)" or "B, because the cube
+    has turned"; None stands for an unreadable value."""
     if value is None:
         return ParsedAnswer(None, Reason.MALFORMED)
-    value = _strip_markup(value)
-    match = _STATEMENT.fullmatch(value)
-    if len(_named_letters(value, match)) > 1:
-        return ParsedAnswer(None, Reason.SEVERAL)
-    refused = _REFUSAL.search(value) or (match and _WITHDRAWAL.search(match["rest"]))
-    if match is None or refused:
+    if "\\u" in value and _is_json(value):
+        value = str(json.loads(value))
+    value = _strip_markup(value)[:400]
+    match, positions = _STATEMENT.match(value), _positions(value)
+    letter = match and match["letter"]
+    if match and not (letter.isupper() and letter != "A") and not _AFTER_A.match(match["rest"]):
+        match = None
+    if (
+        match
+        and (letter in "Xx" or letter.islower())
+        and (letter in "Xx" or match["rest"][:1].isalpha())
+    ):
+        match = None
+    if match is None or (letter.isdigit() and positions):
+        if positions and not _EXCUSE.search(value):
+            return _agreed(map(ParsedAnswer, positions))
+        refused = _REFUSAL.search(value) or _WEAK_REFUSAL.search(value)
         return ParsedAnswer(None, Reason.REFUSAL if refused else Reason.NO_ANSWER)
-    letter = match["letter"].upper()
+    letter, rest = letter.upper(), match["rest"]
+    if {letter, *_NAMED.findall(rest)} == {*LETTERS} and _AND_OR.fullmatch(_SINGLE.sub("", rest)):
+        return ParsedAnswer(None, Reason.NO_ANSWER)  # the template of the prompt
+    if _has_rival(letter, rest) or not {*positions} <= {letter}:
+        return ParsedAnswer(None, Reason.SEVERAL)
+    own = re.sub(rf"(?<![\w']){letter}(?![\w'])", "SELF", rest)
+    refused = _REFUSAL.search(own.strip(" ,.;?!")) and not _REASON.match(own)
+    if _WITHDRAWAL.search(own) or _WITHDRAWAL.search(f"it {own}") or refused:
+        return ParsedAnswer(None, Reason.REFUSAL)
     return ParsedAnswer(letter) if letter in LETTERS else ParsedAnswer(None, Reason.BAD_LETTER)
 
 
-def _named_letters(value: str, match: re.Match[str] | None) -> set[str]:
-    pattern = _ANY_LETTER if _ONLY_LETTERS.fullmatch(value) else _NAMED_LETTER
-    named = {letter.upper() for letter in pattern.findall(value)}
-    return named | {match["letter"].upper()} if match else named
+def _has_rival(letter: str, rest: str) -> bool:
+    """Return whether the text after a letter names another one that is not only compared with."""
+    for found in _NAMED.finditer(rest):
+        between = rest[: found.start()]
+        if found[0] != letter and (_AND_OR.fullmatch(between) or not _EXCUSE.search(rest)):
+            return True
+    return bool(re.match(r"\W*(?:or|and|,|/|\|)\W*[a-d]\b(?!\s\w)", rest, re.IGNORECASE))
+
+
+def _positions(text: str) -> list[str]:
+    """Return the letters of the images that a text names by position."""
+    return [
+        _ORDINALS[found["ordinal"].lower()]
+        if found["ordinal"]
+        else LETTERS[int(found["number"]) - 1]
+        for found in _POSITION.finditer(text)
+    ]
+
+
+def _is_reported(words: str, previous: str) -> bool:
+    """Return whether a statement is an example, a condition or somebody else's, by the words up to
+    the letter and the sentence before."""
+    text = re.split(r"\b(?:but|so|however)\b|;", words, flags=re.IGNORECASE)[-1]
+    if re.search(r"(?::|like|as|e\.?g\.?,?)\s*$", previous):
+        text = previous[-200:]
+    return bool(_REPORTED.search(text) and not _OWN_WORDS.search(text))
 
 
 def _strip_markup(value: str) -> str:
-    """Remove quotes, brackets, LaTeX and markdown; apostrophes inside words stay."""
-    return " ".join(_MARKUP.sub(" ", _LATEX.sub(" ", value)).split())
+    """Remove quotes, brackets, LaTeX and markdown; a letter in brackets is followed by a comma."""
+    value = _BRACKETED.sub(r" \1, ", _LATEX.sub(" ", value))
+    return " ".join(_MARKUP.sub(" ", value).split())
 
 
-def _agreed(answers: Sequence[ParsedAnswer]) -> ParsedAnswer:
+def _agreed(answers: Iterable[ParsedAnswer]) -> ParsedAnswer:
     """Combine several answers into one; those with the reason `NO_ANSWER` are ignored."""
     distinct = {answer for answer in answers if answer.reason is not Reason.NO_ANSWER}
     if len(distinct) > 1:

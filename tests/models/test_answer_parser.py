@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+from pathlib import Path
 
 import pytest
 
@@ -54,7 +55,8 @@ CASES = [
     # records
     (FULL, "B", None),
     (f"```json\n{FULL}\n```", "B", None),
-    (f"Here it is: {FULL} I hope this helps. Answer: A", "B", None),
+    (f"Here it is: {FULL} I hope this helps. Answer: B", "B", None),
+    (f"Here it is: {FULL} I hope this helps. Answer: A", None, SEV),
     (FULL + FULL, "B", None),
     ('{"Forced Choice": "Option D"}', "D", None),
     ('{"choice": ["B"]}', "B", None),
@@ -91,7 +93,7 @@ CASES = [
     # records of real models that are not strict JSON, or not at the outermost level
     ('{"response": {"forced_choice": "B", "confidence": 0.8}}', "B", None),
     ('{"final answer": {"choice": "C"}}', "C", None),
-    ("{“forced_choice”: “C”, “confidence”: 0.7}", "C", MAL),
+    ("{“forced_choice”: “C”, “confidence”: 0.7}", "C", None),
     ('{forced_choice: "A", confidence: 0.9}', "A", MAL),
     ('{"forced_choice": "D", // it rolls\n "confidence": 0.5}', "D", MAL),
     ('{"forced_choice": "D", /* best */ "confidence": 0.5}', "D", MAL),
@@ -103,7 +105,7 @@ CASES = [
     ("<answer> Option C </answer>", "C", None),
     # near misses of these stay without an answer
     ('{"forced_choice": "A"}\nAlso possible: {"forced_choice": "C"}', None, SEV),
-    ('{"forced_choice": "A|B|C|D"}', None, SEV),
+    ('{"forced_choice": "A|B|C|D"}', None, NO),
     ('{"candidates": {"choice": "B"}}', None, NO),
     ("{choice of A: maybe}", None, NO),
     ("<answer>B or C</answer>", None, SEV),
@@ -113,7 +115,7 @@ CASES = [
     ("Answer: either B or C", None, SEV),
     ("Answer: B, possibly C", None, SEV),
     ("Answer: A\nAnswer: B", None, SEV),
-    ("Answer: A|B|C|D", None, SEV),
+    ("Answer: A|B|C|D", None, NO),
     ("Answer: E\nAnswer: B", None, SEV),
     ('{"choice": ["A", "B"]}', None, SEV),
     ('{"choice": A or B}', None, SEV),
@@ -128,7 +130,7 @@ CASES = [
     # letters that are not offered
     ("E", None, BAD),
     ("Answer: 2", None, BAD),
-    ('{"choice": "Image 3"}', None, BAD),
+    ('{"choice": "Image 3"}', "C", None),
     # nothing, or an echo of the template
     ("", None, NO),
     ("{}", None, NO),
@@ -142,9 +144,9 @@ CASES = [
     ('{"choice": null}', None, REF),
     ('{"choice": "<letter>"}', None, NO),
     ('{"choice": "B" or "C"}', None, SEV),
-    ('{"choice": {"letter": "B"}}', None, NO),
+    ('{"choice": {"letter": "B"}}', "B", None),
     ('{"second_choice": "B"}', None, NO),
-    ('{\n  "answer": "B"\n}', None, NO),
+    ('{\n  "answer": "B"\n}', "B", None),
     # records with a key that resembles a choice, or with errors around the choice
     ('{"forced_choice": " (a) "}', "A", None),
     (FULL.replace('"B",', '"B"', 1), "B", MAL),
@@ -171,28 +173,38 @@ CASES = [
     # reasoning in the tags of other chat templates
     ("<thinking>\nAnswer: B", None, CUT),
     ("◁think▷Answer: B◁/think▷Answer: C", "C", None),
-    # letters of other scripts that look like A to D are other letters
-    ("Answer: В", None, BAD),
-    ('{"forced_choice": "С"}', None, BAD),
+    # letters of other scripts that look like A to D
+    ("Answer: В", "B", None),
+    ('{"forced_choice": "С"}', "C", None),
     # damaged text in which the letter may belong to something else
     ('{"rat"ales": {"choice": "C"', None, CUT),
     ('{"ch|ce": ", {"choice": "B"}', None, CUT),
-    ('{"choic-e": "A", "choice": "B"}', None, SEV),
     ('{"choice": ,"A", "choice": "B"}', None, SEV),
     ('{"forced_choice": "A", "choice":C"}', None, SEV),
-    ('{"forced_choice": "A"\nchoice": "D"]', None, CUT),
     ('{"choice":]"B"}', None, MAL),
-    ('{"forced_choice": "B, but impos{"choice":sible"}', None, MAL),
-    ('Answer: B{"choice": since it rolls]', None, MAL),
+    ('Answer: B{"choice": since it rolls]', None, CUT),
     ('{"forced_choice": "A: rejected"!}', None, REF),
     ("Answer: B\nThat is wrong-.", None, REF),
-    ("Answer: A, n*", None, SEV),
-    ("Answer: A. I", None, SEV),
+    ("Answer: A, n*", "A", None),
+    ("Answer: A. I", "A", None),
     # other JSON
     ("null", None, REF),
     ("\x00", None, NO),
     ("</think>", None, NO),
 ]
+
+
+RAW_ANSWERS = [
+    json.loads(line) for line in Path(__file__).with_name("answers.jsonl").read_text().splitlines()
+]
+
+
+@pytest.mark.parametrize("kind", sorted({each["kind"] for each in RAW_ANSWERS}))
+def test_raw_answers_of_each_kind(kind):
+    """Raw answers as models write them, with the letter that a careful reader takes from them."""
+    own = [each for each in RAW_ANSWERS if each["kind"] == kind]
+    wrong = [each for each in own if parse_choice(each["raw"]).letter != each["right"]]
+    assert not wrong
 
 
 @pytest.mark.parametrize(("raw", "letter", "reason"), CASES)
@@ -253,7 +265,7 @@ def test_texts_that_state_no_choice_have_no_letter():
     """Random prose and JSON mention letters and candidates, but choose none."""
     rng = random.Random(0)
     words = ["A", "B", "Candidate C", "D", "cube", "a", "the", "best", "option", "choice", "late"]
-    keys = ["confidence", "second_choice", "distribution", "rationales", "answer", "my choices"]
+    keys = ["confidence", "second_choice", "distribution", "rationales", "about", "my choices"]
     for _ in range(1000):
         prose = " ".join(rng.choices(words, k=rng.randint(6, 30)))
         value = {k: rng.choice([prose, 0.5, "A", {"forced_choice": "B"}]) for k in keys}

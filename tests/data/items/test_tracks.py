@@ -282,7 +282,7 @@ def test_counterfactual_targets_differ_from_the_factual_scene(
         assert shifts[q.target.frame, asked] >= min_displacement
         assert other.in_view[q.target.frame, asked - (asked > k)]
         assert shifts[: q.prefix_stop].max() == 0
-        assert (q.target.frame - q.prefix_stop) % FPS == 0
+        assert q.target.frame - q.prefix_stop in (12, 25, 50, 75, 100)
         factual, *wrong_time = q.hard_negatives
         assert factual == FrameRef(q.scene_id, q.target.frame)
         assert {n.scene_id for n in wrong_time} == {other.scene_id}
