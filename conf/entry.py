@@ -37,19 +37,29 @@ HYDRA_MODES = ("run", "multirun", "cfg", "info", "shell_completion")
 """Hydra's command-line options, without `--`, that exclude each other."""
 
 
-def command(name: str, schema: type) -> Callable[[Main], Callable[[], None]]:
+def command(name: str, schema: type, ranks: bool = False) -> Callable[[Main], Callable[[], None]]:
     """Return a decorator that turns `main(cfg, run)` into the command `python -m name`.
 
     The undecorated `main` receives its settings as an instance of `schema` and returns metrics. The
     metrics are written to metrics.json in the run's folder, and this file marks the run as
     finished. If `main` returns None, no file is written and the run stays unfinished. The
     decorator's result takes no arguments; its attribute `__wrapped__` is the undecorated `main`.
+
+    Args:
+        ranks: Whether `main` can be run by several ranks of a launcher such as torchrun.
     """
 
     def decorate(main: Main) -> Callable[[], None]:
         @functools.wraps(main)
         def start() -> None:
             with report_failures():
+                if world_size() > 1 and not ranks:
+                    raise UserError(
+                        f"{name} uses one process, but RANK and WORLD_SIZE={world_size()} are set: "
+                        "run it with python, not with torchrun or another launcher of several "
+                        "ranks, and unset these variables",
+                        code="unsupported-ranks",
+                    )
                 _start(name, schema, main)
 
         return start

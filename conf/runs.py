@@ -26,14 +26,16 @@ log = logging.getLogger(__name__)
 RESULT_NEUTRAL_KEYS = {
     "run", "store", "checkpoints", "workers", "train.workers", "host", "port", "public",
     "train.report_to", "teacher_server.url", "sampling_server.url", "sampling_server.model",
+    "train.micro_batch", "train.mini_batch", "train.sampling_batch", "train.reuse_features",
+    "train.gradient_checkpointing", "batch", "matcher.batch",
     *(
         f"{servers}.{setting}"
         for servers in ("server", "teacher", "teacher_server", "sampling_server")
         for setting in ("concurrency", "timeout", "unreachable_timeout")
     ),
 }  # fmt: skip
-"""Keys that do not change the result of a run. Their values may differ when a run is resumed, and
-they are not part of the run's name."""
+"""Keys that do not change the result of a run, or only by rounding. Their values may differ when a
+run is resumed, and they are not part of the run's name."""
 
 LOCK = ".lock"
 """Name of the file that is locked while a process uses a folder."""

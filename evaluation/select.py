@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from conf.entry import Run, command
 from conf.errors import UserError
+from conf.runs import rank
 from conf.schema import SelectCommand, SftCommand
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-@command("evaluation.select", SelectCommand)
+@command("evaluation.select", SelectCommand, ranks=True)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from models.trained_runs import check_modes, modes_of_regime, resolve_model
 
@@ -45,6 +46,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from evaluation.metrics.results import variant_name
     from evaluation.metrics.selection import Choices, build_selection_report
     from evaluation.reporting.selection_report import write_report
+    from models.distributed import end_ranks
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = FrameReader(store, student.image_size)
@@ -69,6 +71,9 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
             answers[mode, control] = response_log.collect_responses(items, mode, respond, responses)
             keys[mode, control] = responses.keys[mode]
 
+    end_ranks()
+    if rank() > 0:
+        return {}
     choices = [
         Choices.from_answers(model.name, *variant, responses)
         for variant, responses in answers.items()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from conf.errors import UserError
 from conf.runs import rank, world_size
@@ -14,7 +14,11 @@ from conf.runs import rank, world_size
 if TYPE_CHECKING:
     import torch
     from accelerate import PartialState
+    from torch import distributed
     from torch.nn import Parameter
+
+
+Input, Output = TypeVar("Input"), TypeVar("Output")
 
 
 @contextmanager
@@ -28,15 +32,55 @@ def main_first() -> Iterator[None]:
         return
     from torch import distributed
 
+    with _patient_group() as group:
+        if rank() > 0:
+            distributed.barrier(group)
+        yield
+        if rank() == 0:
+            distributed.barrier(group)
+
+
+@contextmanager
+def _patient_group() -> Iterator[distributed.ProcessGroup]:
+    """Yield a group of all ranks whose operations may wait for days. The timeout of the default
+    group suits training steps."""
+    from torch import distributed
+
     _get_state()
-    # The timeout of the default group suits training steps; preparations may take longer.
     group = distributed.new_group(backend="gloo", timeout=timedelta(days=30))
-    if rank() > 0:
-        distributed.barrier(group)
-    yield
-    if rank() == 0:
-        distributed.barrier(group)
+    yield group
     distributed.destroy_process_group(group)
+
+
+def map_over_ranks(
+    function: Callable[[Input], Output], inputs: Sequence[Input]
+) -> Iterator[Output]:
+    """Yield the result of a function for each input, in order. The ranks compute one result each at
+    a time, and all of them yield all results. All ranks must have the same inputs."""
+    if world_size() == 1:
+        yield from map(function, inputs)
+        return
+    from torch import distributed
+
+    with _patient_group() as group:
+        for first in range(0, len(inputs), world_size()):
+            own = inputs[first + rank() : first + rank() + 1]
+            results: list[list[Output]] = [[] for _ in range(world_size())]
+            distributed.all_gather_object(results, [*map(function, own)], group)
+            for result in results:
+                yield from result
+
+
+def share_from_main(value: Input) -> Input:
+    """Return the main rank's value on all ranks."""
+    if world_size() == 1:
+        return value
+    from torch import distributed
+
+    shared = [value]
+    with _patient_group() as group:
+        distributed.broadcast_object_list(shared, 0, group)
+    return shared[0]
 
 
 def rank_device() -> torch.device:
@@ -65,7 +109,8 @@ def average_gradients(parameters: Iterable[Parameter]) -> None:
 
     _get_state()
     parameters = [*parameters]
-    present = torch.tensor([float(p.grad is not None) for p in parameters])
+    device = parameters[0].device
+    present = torch.tensor([float(p.grad is not None) for p in parameters], device=device)
     distributed.all_reduce(present)
     trained = [p for p, ranks in zip(parameters, present.tolist(), strict=True) if ranks]
     gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in trained]

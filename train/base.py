@@ -17,7 +17,7 @@ from conf.schema import TinyBaseCommand
 log = logging.getLogger(__name__)
 
 
-@command("train.base", TinyBaseCommand)
+@command("train.base", TinyBaseCommand, ranks=True)
 def main(cfg: TinyBaseCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics

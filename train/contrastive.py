@@ -17,7 +17,7 @@ from conf.trackers import check_trackers
 log = logging.getLogger(__name__)
 
 
-@command("train.contrastive", ContrastiveCommand)
+@command("train.contrastive", ContrastiveCommand, ranks=True)
 def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics
@@ -78,10 +78,9 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     use_fast_layers(model)
 
     trainer = build_trainer(cfg, run, store, model, training, validation, rank_batch, checkpoint)
-    memory_settings = (
-        "train.mini_batch, retriever.image_size or retriever.frames, set train.reuse_features=false"
-    )
-    best_step = run_training(trainer, run, checkpoint, memory_settings)
+    lower = "lower train.mini_batch, set train.reuse_features=false"
+    shrink = "retriever.image_size or retriever.frames"
+    best_step = run_training(trainer, run, checkpoint, lower, shrink)
 
     if rank() == 0:
         model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)

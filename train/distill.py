@@ -11,7 +11,7 @@ from conf.schema import DistillCommand
 from conf.trackers import check_trackers
 
 
-@command("train.distill", DistillCommand)
+@command("train.distill", DistillCommand, ranks=True)
 def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics
@@ -68,8 +68,7 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     trainer = build_trainer(
         cfg, trained, run, model, teacher, processor, training, validation, checkpoint
     )
-    memory_settings = "train.batch or train.micro_batch"
-    return train_and_save(trainer, processor, run, checkpoint, precision, memory_settings)
+    return train_and_save(trainer, processor, run, checkpoint, precision, "train.batch")
 
 
 if __name__ == "__main__":

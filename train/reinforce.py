@@ -15,7 +15,7 @@ from conf.schema import ReinforceCommand
 from conf.trackers import check_trackers
 
 
-@command("train.reinforce", ReinforceCommand)
+@command("train.reinforce", ReinforceCommand, ranks=True)
 def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics
@@ -59,8 +59,8 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     trainer = build_trainer(
         cfg, run, trained.student, model, processor, training, validation, checkpoint
     )
-    memory_settings = "train.batch, train.responses or train.micro_batch"
-    return train_and_save(trainer, processor, run, checkpoint, precision, memory_settings)
+    shrink = "train.batch or train.responses"
+    return train_and_save(trainer, processor, run, checkpoint, precision, shrink)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from conf.trackers import check_trackers
 log = logging.getLogger(__name__)
 
 
-@command("train.sft", SftCommand)
+@command("train.sft", SftCommand, ranks=True)
 def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics
@@ -70,10 +70,9 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         check_adapters(checkpoint, model, student.lora.rank, student.model)
 
     trainer = build_trainer(cfg, run, model, processor, training, validation, checkpoint)
-    memory_settings = (
-        "train.micro_batch, student.image_size or student.frames, set train.reuse_features=false"
-    )
-    best_step = training_loop.run_training(trainer, run, checkpoint, memory_settings)
+    lower = "lower train.micro_batch, set train.reuse_features=false"
+    shrink = "student.image_size or student.frames"
+    best_step = training_loop.run_training(trainer, run, checkpoint, lower, shrink)
 
     weights = training_loop.gather_weights(trainer)
     if rank() == 0:

@@ -141,6 +141,9 @@ class DistillTrainConfig(StudentTrainConfig):
     """Number of passes over the training items. Each pass samples one response to each item."""
     temperature: float = setting(1.0, above=0)
     """Temperature at which responses are sampled."""
+    sampling_batch: int | None = setting(None, least=1)
+    """Number of responses that a rank samples at once; changes memory and speed, not the result.
+    null samples all responses of a step."""
     beta: float = setting(1.0, least=0, most=1)
     """Divergence of the student from the teacher: 1 is the reverse Kullback-Leibler divergence, 0
     the forward one, and between them the generalised Jensen-Shannon divergence with this weight of
@@ -189,6 +192,9 @@ class ReinforceTrainConfig(TrainConfig):
     result."""
     temperature: float = setting(1.0, above=0)
     """Temperature at which responses are sampled."""
+    sampling_batch: int | None = setting(None, least=1)
+    """Number of responses that a rank samples at once; changes memory and speed, not the result.
+    null samples all responses of a step."""
     validation_items: int = setting(16, least=1)
     """Number of items of held-out training scenes on which the rewards are measured."""
     rewards: RewardWeights = field(default_factory=RewardWeights)

@@ -123,7 +123,8 @@ class Embedder:
             from models.memory import explain_out_of_memory
 
             with explain_out_of_memory(
-                f"with {len(batch)} inputs in a batch", "lower batch, in a separate run (run=NAME)"
+                f"with {len(batch)} inputs in a batch",
+                "run the same command with a lower batch, which goes on after the finished inputs",
             ):
                 rows = encode(encoder, batch)
             self._check_widths(rows.shape[1])

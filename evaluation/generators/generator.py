@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Protocol
 
+from conf.errors import UserError
+from conf.runs import world_size
 from conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageCommand
 from data.frames.frame_cache import FrameReader
 from data.records import SelectionItem
@@ -54,11 +56,18 @@ def open_generator(
         trained: The settings of the student's run; for a base, `cfg`.
 
     Raises:
-        UserError: The weights of the student's local base have changed since the training; no
-            server responds; `server.model` is missing, unknown to the servers or an adapter without
-            its run; or the servers serve different models under this name.
+        UserError: The weights of the student's local base have changed since the training; several
+            ranks of a launcher would use a server; no server responds; `server.model` is missing,
+            unknown to the servers or an adapter without its run; or the servers serve different
+            models under this name.
     """
     if cfg.server.url is not None:
+        if world_size() > 1:
+            raise UserError(
+                "server.url with several ranks: one process sends all requests, so run the command "
+                "with python, not with torchrun or another launcher",
+                code="unsupported-ranks",
+            )
         from evaluation.generators.openai_server import ServedModel
 
         return ServedModel(cfg, folder, trained.student)

@@ -19,12 +19,13 @@ from evaluation.generators.response_log import SampleOf, SaveResponses, Subject,
 from evaluation.generators.response_schema import build_record_schema
 from models import loading
 from models.compat import keep_freed_memory
+from models.distributed import map_over_ranks
 from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
 from models.memory import explain_out_of_memory
 from models.resolved_settings import check_base
 from models.student.collator import Collator
 from models.student.generation import generate, sampling_processors
-from models.student.responses import THOUGHT_TAG, response_token_limit
+from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.trained_runs import product_folder, run_title
 
 
@@ -72,7 +73,7 @@ class LocalModel:
     def respond(
         self, mode: str, sample_of: SampleOf, subjects: list[Subject], save: SaveResponses
     ) -> None:
-        """Generate the responses in batches.
+        """Generate the responses in batches, which the ranks of a launcher share.
 
         In constrained mode, a grammar restricts the tokens to those of a valid record.
         """
@@ -80,7 +81,8 @@ class LocalModel:
         collator = Collator(processor, student.max_length, student.thinking)
         limit = response_token_limit(mode, student.max_new_tokens, student.thinking)
         grammar = compile_record_grammar(model, processor) if mode == "constrained" else None
-        for batch in batched(subjects, self._batch):
+
+        def respond_to_batch(batch: list[Subject]) -> list[tuple[Subject, GeneratedText]]:
             seeds = [response_seed(self._seed, subject, mode) for subject in batch]
             logits_processors = sampling_processors(student, seeds)
             if grammar is not None:
@@ -88,7 +90,8 @@ class LocalModel:
                 logits_processors.insert(0, LogitsProcessor(grammar))
             inputs = collator([sample_of(subject) for subject in batch])
             with explain_out_of_memory(
-                f"with {len(batch)} prompts in a batch", "lower batch, in a separate run (run=NAME)"
+                f"with {len(batch)} prompts in a batch",
+                "run the same command with a lower batch, which goes on after the finished answers",
             ):
                 texts = generate(
                     model, processor, inputs, limit, self._precision, logits_processors
@@ -96,7 +99,10 @@ class LocalModel:
             if grammar is not None:
                 # `generate` adds the tag of the prompt, but the grammar has allowed no thought.
                 texts = [replace(t, text=t.text.removeprefix(THOUGHT_TAG)) for t in texts]
-            save(list(zip(batch, texts, strict=True)))
+            return list(zip(batch, texts, strict=True))
+
+        for responses in map_over_ranks(respond_to_batch, [*batched(subjects, self._batch)]):
+            save(responses)
 
 
 def compile_record_grammar(model: nn.Module, processor: ProcessorMixin) -> xgrammar.CompiledGrammar:

@@ -13,8 +13,10 @@ from typing import Any
 from tqdm import tqdm
 
 from conf.files import read_json_lines
+from conf.runs import rank
 from data.records import FrameRef, RetrievalQuery, SelectionItem
 from evaluation.generators.response_schema import Record, read_record
+from models.distributed import share_from_main
 from models.fingerprints import settings_key
 from models.student.answer_parser import parse_choice
 from models.student.prompts import Sample
@@ -140,7 +142,10 @@ class ResponseLog:
         self.responses |= {(r.item_id, r.mode): r for r in responses}
 
     def _write(self, lines: list[str]) -> None:
-        """Append lines and flush them to the disk, so that they survive a crash of the machine."""
+        """Append lines and flush them to the disk, so that they survive a crash of the machine. The
+        main rank writes."""
+        if rank() > 0:
+            return
         with open(self._path, "a", encoding="utf-8") as file:
             file.writelines(f"{line}\n" for line in lines)
             file.flush()
@@ -151,10 +156,14 @@ def collect_responses(
     subjects: Sequence[Subject], mode: str, respond: Respond, log: ResponseLog, unit: str = "item"
 ) -> list[ModelResponse]:
     """Generate the responses that are missing from the log, and return the response to each
-    subject. `unit` is what the progress bar counts."""
-    missing = [s for s in subjects if (s.name, mode) not in log.responses]
+    subject. `unit` is what the progress bar counts. The ranks of a launcher share the work; only
+    the main rank returns responses."""
+    names = share_from_main([s.name for s in subjects if (s.name, mode) not in log.responses])
+    subject_of = {subject.name: subject for subject in subjects}
+    missing = [subject_of[name] for name in names]
     done = len(subjects) - len(missing)
-    with tqdm(total=len(subjects), initial=done, desc=mode, unit=unit) as bar:
+    is_main = rank() == 0
+    with tqdm(total=len(subjects), initial=done, desc=mode, unit=unit, disable=not is_main) as bar:
 
         def save(generated: list[tuple[Subject, GeneratedText]]) -> None:
             log.append([score_response(subject, mode, text) for subject, text in generated])
@@ -162,7 +171,7 @@ def collect_responses(
 
         if missing:
             respond(missing, save)
-    return [log.responses[s.name, mode] for s in subjects]
+    return [log.responses[s.name, mode] for s in subjects] if is_main else []
 
 
 def response_seed(seed: int, subject: Subject, mode: str) -> int:

@@ -18,6 +18,7 @@ SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "worke
         (["+exp=cot"], "exp-cot"),
         (["train.lr=1e-3", "+exp=cot"], "exp-cot+train.lr-1e-3"),
         (["store=/big", "workers=8", "checkpoints=c"], "default"),
+        (["train.micro_batch=1", "train.gradient_checkpointing=true", "batch=4"], "default"),
         (["student.model=Qwen/Qwen3 VL"], "student.model-Qwen-Qwen3-VL"),
     ],
 )
@@ -57,6 +58,26 @@ def test_other_settings_are_refused_with_both_values(tmp_path):
     (run.folder / "metrics.jsonl").touch()
     with raises_user_error("other-settings", contains="train.lr was 1.0 and is now 2.0"):
         open_run(run, SETTINGS | {"train": {"lr": 2.0}}, "train.sft")
+
+
+MEMORY_SETTINGS = {
+    "sft": {"micro_batch": 1, "gradient_checkpointing": True, "reuse_features": False},
+    "contrastive": {"mini_batch": 1, "gradient_checkpointing": True, "reuse_features": False},
+    "distill": {"micro_batch": 1, "gradient_checkpointing": True, "sampling_batch": 2},
+    "reinforce": {"micro_batch": 1, "gradient_checkpointing": True, "sampling_batch": 2},
+}
+"""Settings by trainer that change memory and speed alone, and other values of them."""
+
+
+@pytest.mark.parametrize("trainer", MEMORY_SETTINGS)
+def test_settings_of_memory_may_change_when_a_run_resumes(tmp_path, trainer):
+    run = Run("r", tmp_path / "r")
+    before = dict.fromkeys(MEMORY_SETTINGS[trainer], 8) | {"lr": 1.0}
+    open_run(run, SETTINGS | {"train": before, "batch": 8}, f"train.{trainer}")
+    (run.folder / "metrics.jsonl").touch()
+    after = MEMORY_SETTINGS[trainer] | {"lr": 1.0}
+    open_run(run, SETTINGS | {"train": after, "batch": 1}, f"train.{trainer}")
+    assert len(json.loads((run.folder / "run.json").read_text())["earlier_starts"]) == 1
 
 
 @pytest.mark.parametrize("name", ["run.json", "config.yaml"])

@@ -29,12 +29,13 @@ MESSAGE_PREFIX = f"{UserError.__module__}.{UserError.__qualname__}: "
 
 
 def run_training(
-    trainer: Trainer, run: Run, checkpoint: Path | None, memory_settings: str
+    trainer: Trainer, run: Run, checkpoint: Path | None, lower: str, shrink: str
 ) -> int | None:
     """Train from the start or a checkpoint, and keep the journal and the curves.
 
     Args:
-        memory_settings: The settings that the error for running out of memory advises to lower.
+        lower: What to do if memory runs out, without changing the result of the run.
+        shrink: Settings that also save memory if they are lowered, but change the result.
 
     Returns:
         If train.best_metric is set, the step of the best checkpoint, whose weights the trainer's
@@ -47,7 +48,8 @@ def run_training(
     add_callbacks(trainer, run)
     check_fsdp(trainer, checkpoint)
     advice = (
-        f"lower {memory_settings}, or set train.gradient_checkpointing=true, in another run "
+        f"{lower} or set train.gradient_checkpointing=true, and run the same command, which goes "
+        f"on from the last checkpoint; if this is not enough, lower {shrink} in another run "
         "(run=NAME)"
     )
     with explain_errors("while training", advice):

@@ -123,15 +123,16 @@ def train_and_save(
     run: Run,
     checkpoint: Path | None,
     precision: str,
-    memory_settings: str,
+    shrink: str,
 ) -> dict[str, float]:
     """Train a student, save it in the run's folder, and return the run's metrics.
 
     Args:
         trainer: A trainer with a `response_sampler`.
-        memory_settings: The settings that the error for running out of memory advises to lower.
+        shrink: Settings that save memory if they are lowered, but change the result.
     """
-    best_step = run_training(trainer, run, checkpoint, memory_settings)
+    lower = "lower train.micro_batch or train.sampling_batch,"
+    best_step = run_training(trainer, run, checkpoint, lower, shrink)
     if rank() == 0:
         loading.save_student(trainer.model, processor, run.folder / "student", precision)
     trainer.response_sampler.close()

@@ -12,6 +12,7 @@ from transformers import ProcessorMixin, SuppressTokensLogitsProcessor
 
 from conf.errors import UserError
 from conf.schema import DistillTrainConfig, ReinforceTrainConfig, StudentConfig
+from data.parallel import batched
 from models.memory import explain_out_of_memory
 from models.student.collator import Collator
 from models.student.generation import generate, sampling_processors
@@ -40,6 +41,7 @@ class ResponseSampler:
             student, temperature=train.temperature, top_p=1.0, top_k=0, thinking=False
         )
         self._collate = Collator(processor, student.max_length)
+        self._batch = train.sampling_batch
         # The model would expect pixels for such a token in a response.
         self._never = [processor.image_token_id, processor.video_token_id]
         self._unparsed = 0
@@ -53,16 +55,21 @@ class ResponseSampler:
             UserError: Memory runs out.
         """
         model.eval()
-        inputs = self._collate(prompts)
+        size = self._batch or len(prompts)
+        when = f"while sampling {min(size, len(prompts))} responses at once"
+        advice = "lower train.sampling_batch, and run the same command: the run goes on"
+        with explain_out_of_memory(when, advice):
+            chunks = zip(batched(prompts, size), batched(seeds, size), strict=True)
+            return [text for chunk in chunks for text in self._sample_at_once(model, *chunk)]
+
+    def _sample_at_once(
+        self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]
+    ) -> list[GeneratedText]:
+        inputs, limit = self._collate(prompts), self._sampling.max_new_tokens
         logits_processors = sampling_processors(self._sampling, seeds)
         device = next(model.parameters()).device
         logits_processors.insert(0, SuppressTokensLogitsProcessor(self._never, device=device))
-        when = f"while sampling {len(prompts)} responses"
-        with explain_out_of_memory(when, "lower train.batch in another run (run=NAME)"):
-            limit = self._sampling.max_new_tokens
-            return generate(
-                model, self._processor, inputs, limit, self._precision, logits_processors
-            )
+        return generate(model, self._processor, inputs, limit, self._precision, logits_processors)
 
     def close(self) -> None:
         """Release what the sampler uses besides the model."""

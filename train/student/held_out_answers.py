@@ -14,20 +14,27 @@ from transformers import ProcessorMixin
 
 from conf.runs import rank
 from conf.schema import StudentConfig, StudentTrainConfig
+from data.parallel import batched
+from models.distributed import is_sharded, map_over_ranks
 from models.memory import explain_out_of_memory
 from models.student.answer_parser import parse_choice
 from models.student.collator import Collator
 from models.student.generation import generate
-from models.student.responses import response_token_limit
+from models.student.prompts import Sample
+from models.student.responses import GeneratedText, response_token_limit
 from train.common.journal import ANSWERS
 from train.student.lazy_samples import StudentDataset
 
 log = logging.getLogger(__name__)
 
 
+BATCH = 4
+"""Number of answers that are generated at once. The ranks share the batches."""
+
+
 class HeldOutAnswers:
-    """Generates a student's answers to the first validation samples of a mode, in one batch, and
-    appends them to the run's samples.jsonl. Decoding is greedy and uses no random numbers.
+    """Generates a student's answers to the first validation samples of a mode, and appends them to
+    the run's samples.jsonl. Decoding is greedy and uses no random numbers.
 
     Args:
         train: Settings whose precision is bf16 or fp32, not auto.
@@ -56,12 +63,19 @@ class HeldOutAnswers:
         """
         train, student = self._train, self._student
         first = [samples[k] for k in range(min(train.generated_items, len(samples)))]
-        inputs = self._collator([replace(sample, response=None) for sample in first])
         limit = response_token_limit(mode, student.max_new_tokens)
-        when = f"while generating {len(first)} answers after step {step}"
-        lower = "lower train.generated_items, or set it to 0, in another run (run=NAME)"
-        with explain_out_of_memory(when, lower):
-            texts = generate(model, self._processor, inputs, limit, train.precision)
+        when = f"while generating {BATCH} answers after step {step}"
+        lower = "lower student.max_new_tokens, or set train.generated_items=0, in another run"
+
+        def answer(batch: list[Sample]) -> list[GeneratedText]:
+            inputs = self._collator([replace(sample, response=None) for sample in batch])
+            with explain_out_of_memory(when, lower):
+                return generate(model, self._processor, inputs, limit, train.precision)
+
+        # Under FSDP, all ranks take part in each forward pass.
+        map_batches = map if is_sharded() else map_over_ranks
+        batches = [*batched(first, BATCH)]
+        texts = [text for answers in map_batches(answer, batches) for text in answers]
         rows = []
         for sample, generated in zip(first, texts, strict=True):
             parsed = parse_choice(generated.text, truncated=generated.truncated)

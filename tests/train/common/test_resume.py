@@ -105,6 +105,40 @@ def test_a_student_resumes_after_its_first_epoch(
 
 
 @pytest.mark.slow
+def test_a_student_resumes_with_other_settings_of_memory(few_steps, tmp_path) -> None:
+    """It resumes within its first epoch, with smaller micro-batches and recomputed activations."""
+    settings = few_steps(batch=4, micro_batch=4, validation_items=2, generated_items=0)
+    less = {"micro_batch": 1, "gradient_checkpointing": True}
+    check_resumed_run(sft.main, settings, less, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_retriever_resumes_with_other_settings_of_memory(
+    contrastive_settings, saved_base, tmp_path
+) -> None:
+    base = {"architecture": None, "model": saved_base, "lora": LoraConfig(rank=4)}
+    cfg = replace(contrastive_settings.retriever, **base)
+    train_settings = replace(contrastive_settings.train, mini_batch=4, reuse_features=True)
+    settings = replace(contrastive_settings, retriever=cfg, train=train_settings)
+    less = {"mini_batch": 2, "reuse_features": False, "gradient_checkpointing": True}
+    check_resumed_run(contrastive.main, settings, less, tmp_path)
+
+
+def check_resumed_run(main, settings, less: dict, tmp_path: Path) -> None:
+    """Compare an uninterrupted run with one that resumes at its middle with other settings."""
+    whole, resumed = train(main, settings, tmp_path / "whole"), tmp_path / "resumed"
+    first = min(whole.glob("checkpoint-*"), key=lambda path: int(path.name[11:]))
+    shutil.copytree(first, resumed / first.name)
+    train(main, replace(settings, train=replace(settings.train, **less)), resumed)
+    (path,) = {p.relative_to(whole) for p in whole.glob("*/adapter_model.safetensors")} - {
+        p.relative_to(whole) for p in whole.glob("checkpoint-*/*")
+    }
+    one, two = load_file(whole / path), load_file(resumed / path)
+    for name, weight in one.items():
+        torch.testing.assert_close(weight, two[name], atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.slow
 def test_a_run_with_one_evaluation_resumes_from_its_middle(sft_settings, tmp_path) -> None:
     train_settings = replace(sft_settings.train, max_steps=4, evaluations=1)
     settings = replace(sft_settings, train=train_settings)
