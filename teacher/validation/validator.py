@@ -17,7 +17,7 @@ from teacher.validation.claim_extraction import extract_claims
 if TYPE_CHECKING:
     from conf.schema import TeacherConfig
 
-VALIDATOR_VERSION = "7"
+VALIDATOR_VERSION = "8"
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
 WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")
 """A word; hyphens and apostrophes join words, so "top-left" counts as one."""

@@ -12,6 +12,8 @@ PIECES = (
     *("x", "to ", "no ", "thous and ", ". ", ", ", "\n", "\t", " ", "1", "1,", "%", "½", "٣"),
     *("\u0301", "t\u0301", "1\u0301", "\u200b", "a\u200b", "t\u200bw\u200b", "\u00ad", "\ufeff"),
     *("\u0915\u093e", "\u093f", "三", "二球", "ふた", "ส", "\ufdfa", "\u3300", "\U0001d7d8", "🕒"),
+    *("the other ", "the wider ", "a few more ", "any number of ", "a red metal ", "width "),
+    *("as far as the cube is ", "rests a cube ", "gap of ", "away ", "second ", "第", "一", "几"),
     *("\ud800", "\U0010ffff", "\x00", "é", "ß", "İ", "т", "🇹🇼"),
 )
 """Pieces to repeat: markup that is never closed, disguised numbers, and words that are numbers only
