@@ -11,6 +11,23 @@ from typing import Any
 from conf.errors import UserError
 
 
+def expand_path(path: str) -> str:
+    """Return a path in which a leading `~` or `~user` is replaced by the home folder. Libraries
+    differ in whether they replace it."""
+    return os.path.expanduser(path)
+
+
+def refuse_broken_link(path: str | Path) -> None:
+    """Raises UserError if a path leads through a link whose target does not exist."""
+    for each in (*reversed(Path(path).parents), Path(path)):
+        if each.is_symlink() and not os.path.exists(each):
+            raise UserError(
+                f"{each} is a link to {os.readlink(each)}, which does not exist: create the "
+                "target, or delete the link",
+                code="broken-link",
+            )
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file so that a killed process leaves either the complete file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)

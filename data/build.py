@@ -14,7 +14,7 @@ from typing import Any
 
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
-from conf.files import read_json, write_bytes, write_json
+from conf.files import read_json, refuse_broken_link, write_bytes, write_json
 from conf.runs import compare_settings, flatten, lock_file
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.checks.counts import count_records, summarize_store
@@ -117,6 +117,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         UserError: the benchmark would contain no item and no query.
     """
     check_quota_names(cfg)
+    refuse_broken_link(folder)
     log.info("building benchmark %s in %s", cfg.store_name, folder)
     with lock_partial_build(cfg, folder) as partial:
         if partial is None:
