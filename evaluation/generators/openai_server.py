@@ -22,6 +22,7 @@ from models.student.prompts import Clip, Sample
 from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.trained_runs import product_folder, run_title
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
+from teacher.servers.proxies import open_client, proxy_hint
 from teacher.servers.responses import TRUNCATED, Response
 from teacher.servers.server import (
     API_KEY_VARIABLE,
@@ -110,6 +111,7 @@ class ServedModel:
             canary = build_messages(blank_sample(first))
             shared_fields = request_fields(student, mode, first.clip)
             async with ServerPool(server, shared_fields, canary) as pool:
+                thoughts: list[Subject] = []
 
                 async def respond(subject: Subject) -> None:
                     messages, fields = await loop.run_in_executor(preparer, prepare, subject)
@@ -123,9 +125,18 @@ class ServedModel:
                             "the cause and run the same command again, which resumes",
                             code="no-response",
                         ) from error
+                    if response.reasoning and not response.text and response.flaw != TRUNCATED:
+                        thoughts.append(subject)
                     save([(subject, restore_thought(response, starts_in_thought))])
 
                 await run_limited(subjects, server.concurrency, respond)
+        if thoughts:
+            log.warning(
+                "%d of %d responses in %s mode are thoughts without an answer, although they are "
+                "complete: if the model does not think, start the server without a reasoning "
+                "parser (--reasoning-parser), which takes responses for thoughts",
+                len(thoughts), len(subjects), mode,
+            )  # fmt: skip
 
 
 def blank_sample(sample: Sample) -> Sample:
@@ -176,9 +187,7 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
     origins = {}
     for url in server.urls:
         try:
-            with openai.OpenAI(
-                base_url=url, api_key=get_api_key(), max_retries=0, timeout=10
-            ) as client:
+            with open_client(openai.OpenAI, url, get_api_key(), timeout=10) as client:
                 models = {m.id: m.model_extra or {} for m in client.models.list()}
         except openai.AuthenticationError as error:
             raise authentication_error(url, error) from error
@@ -197,6 +206,7 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
     if not origins:
         lines = [
             f"{url} does not list its models ({_describe(error)}): {_advise(error)}"
+            f"{proxy_hint(url)}"
             for url, error in problems.items()
         ]
         raise UserError("\n".join(lines), code="no-server")

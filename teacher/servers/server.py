@@ -13,6 +13,7 @@ import openai
 
 from conf.errors import UserError
 from conf.schema import ServersConfig
+from teacher.servers.proxies import open_client, proxy_hint
 from teacher.servers.responses import Response, ScoredPrompt, parse_completion
 
 Messages = list[dict[str, Any]]
@@ -90,9 +91,7 @@ class ServerClient:
     def __init__(self, url: str, cfg: ServersConfig) -> None:
         self.url = url
         self.cfg = cfg
-        self.client = openai.AsyncOpenAI(
-            base_url=url, api_key=get_api_key(), max_retries=0, timeout=cfg.timeout
-        )
+        self.client = open_client(openai.AsyncOpenAI, url, get_api_key(), cfg.timeout)
         self.in_flight = self.pauses = 0
         self.problem: str | None = None
         self.available_at = self.checked_at = -math.inf
@@ -110,7 +109,7 @@ class ServerClient:
             completion = await self.client.chat.completions.create(
                 model=self.cfg.model, messages=messages, n=n, **fields
             )
-            return parse_completion(completion, n)
+            return parse_completion(completion, n, is_constrained(fields))
 
         return await self._translate_errors(request)
 
@@ -193,14 +192,17 @@ class ServerClient:
             raise RateLimitedError("rate-limited (HTTP 429)", _retry_after(error)) from error
         except openai.APIStatusError as error:
             if error.status_code >= 500 or error.status_code in RETRYABLE_STATUSES:
-                raise RequestError(f"HTTP {error.status_code}") from error
+                hint = proxy_hint(self.url)
+                raise RequestError(f"HTTP {error.status_code}{hint}") from error
             raise RefusedError(error.message) from error
         except (openai.APITimeoutError, TimeoutError) as error:
             raise RequestError(
                 f"no response within {cfg.GROUP}.timeout={cfg.timeout:g} seconds"
+                f"{proxy_hint(self.url)}"
             ) from error
         except openai.APIConnectionError as error:
-            raise RequestError(str(error.__cause__ or error)) from error
+            cause = error.__cause__ or error
+            raise RequestError(f"{cause}{proxy_hint(self.url)}") from error
         except (openai.APIResponseValidationError, *MALFORMED_REPLY_ERRORS) as error:
             raise MalformedReplyError(f"{type(error).__name__}: {error}") from error
 
@@ -214,6 +216,11 @@ class ServerClient:
             f"{served}. Check that the URL belongs to an OpenAI-compatible server and ends in /v1",
             code="unknown-model",
         )
+
+
+def is_constrained(fields: RequestFields) -> bool:
+    """Return whether the fields of a request constrain its response to a grammar or a schema."""
+    return "response_format" in fields or "structured_outputs" in fields.get("extra_body", {})
 
 
 def _retry_after(error: openai.APIStatusError) -> float | None:
