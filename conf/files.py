@@ -66,7 +66,7 @@ def read_json(path: Path) -> dict[str, Any]:
         UserError: The file is damaged or missing.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(path.read_text(encoding="utf-8-sig"))
         if isinstance(value, dict):
             return value
         problem = "it is no JSON object"
@@ -83,7 +83,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_json_if_valid(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; an empty one if the file is damaged or missing."""
     try:
-        return dict(json.loads(path.read_text()))
+        return dict(json.loads(path.read_text(encoding="utf-8-sig")))
     except (OSError, ValueError, TypeError):
         return {}
 
@@ -91,7 +91,7 @@ def read_json_if_valid(path: Path) -> dict[str, Any]:
 def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the objects in a file of JSON lines; skip damaged lines, such as a last line that a
     killed process wrote only in part."""
-    with open(path, encoding="utf-8", errors="replace") as file:
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
         for line in file:
             try:
                 row = json.loads(line)
