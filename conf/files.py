@@ -28,6 +28,12 @@ def refuse_broken_link(path: str | Path) -> None:
             )
 
 
+def is_writable(path: Path) -> bool:
+    """Return whether this user may write a file or a folder, or create it if it is missing."""
+    existing = next(each for each in (path, *path.absolute().parents) if each.exists())
+    return os.access(existing, os.W_OK)
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file so that a killed process leaves either the complete file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -23,6 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from conf.errors import UserError
+from conf.files import is_writable
 from data.parallel import batched
 from models.fingerprints import settings_key
 
@@ -61,8 +61,7 @@ class EmbeddingCache:
 
     def _connect(self, root: Path) -> sqlite3.Connection:
         """Open the file, or a temporary copy of it if it cannot be written."""
-        existing = next(folder for folder in (root, *root.absolute().parents) if folder.exists())
-        if all(os.access(path, os.W_OK) for path in (existing, self.path) if path.exists()):
+        if is_writable(root) and is_writable(self.path):
             root.mkdir(parents=True, exist_ok=True)
             return sqlite3.connect(self.path, timeout=60)
         log.warning("%s cannot be written: this evaluation keeps its embeddings to itself", root)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -147,7 +148,7 @@ def test_a_store_that_cannot_be_written_keeps_its_files(tmp_path, monkeypatch, h
     if has_file:
         filled(folder)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    monkeypatch.setattr(cache.os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "access", lambda *_: False)
     embeddings = EmbeddingCache(folder, "frame", SETTINGS)
     model = Model()
     embeddings.complete(INPUTS | {"new/1": 9001}, model, 64)
