@@ -13,6 +13,7 @@ import numpy as np
 import openai
 
 from conf.errors import UserError
+from conf.proxies import proxy_hint
 from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageCommand
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import build_record_schema
@@ -22,7 +23,6 @@ from models.student.prompts import Clip, Sample
 from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.trained_runs import product_folder, run_title
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
-from teacher.servers.proxies import open_client, proxy_hint
 from teacher.servers.responses import TRUNCATED, Response
 from teacher.servers.server import (
     API_KEY_VARIABLE,
@@ -30,7 +30,7 @@ from teacher.servers.server import (
     Messages,
     RequestFields,
     authentication_error,
-    get_api_key,
+    open_client,
 )
 
 log = logging.getLogger(__name__)
@@ -187,7 +187,7 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
     origins = {}
     for url in server.urls:
         try:
-            with open_client(openai.OpenAI, url, get_api_key(), timeout=10) as client:
+            with open_client(openai.OpenAI, url, timeout=10) as client:
                 models = {m.id: m.model_extra or {} for m in client.models.list()}
         except openai.AuthenticationError as error:
             raise authentication_error(url, error) from error

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 import openai
 
 from conf.errors import UserError
+from conf.proxies import proxy_hint
 from conf.schema import ServersConfig
-from teacher.servers.proxies import open_client, proxy_hint
 from teacher.servers.responses import Response, ScoredPrompt, parse_completion
 
 Messages = list[dict[str, Any]]
@@ -21,6 +21,7 @@ Messages = list[dict[str, Any]]
 RequestFields = dict[str, Any]
 """Fields of a chat completion request; those outside OpenAI's API are in `extra_body`."""
 Reply = TypeVar("Reply")
+Client = TypeVar("Client", openai.OpenAI, openai.AsyncOpenAI)
 
 MALFORMED_REPLY_ERRORS = (AttributeError, IndexError, TypeError, ValueError)
 """Errors that the openai client or `parse_completion` raises for a reply that does not follow the
@@ -45,6 +46,25 @@ def get_api_key() -> str:
             code="invalid-api-key",
         )
     return key or "none"
+
+
+def open_client(kind: type[Client], url: str, timeout: float) -> Client:
+    """Return a client of a server that repeats no request.
+
+    Raises:
+        UserError: The environment names a proxy for the server that cannot be used, or an API key
+            with invalid characters.
+    """
+    options = {"base_url": url, "api_key": get_api_key(), "max_retries": 0, "timeout": timeout}
+    try:
+        return kind(**options)
+    except Exception as error:  # That of a missing package, or of an address that is none.
+        if hint := proxy_hint(url):
+            raise UserError(f"{url} cannot be reached ({error}){hint}", code="proxy") from error
+        # The proxy is that of other hosts.
+        is_async = kind is openai.AsyncOpenAI
+        transport = openai.DefaultAsyncHttpxClient if is_async else openai.DefaultHttpxClient
+        return kind(**options, http_client=transport(trust_env=False))
 
 
 def authentication_error(url: str, error: openai.APIStatusError) -> UserError:
@@ -91,7 +111,7 @@ class ServerClient:
     def __init__(self, url: str, cfg: ServersConfig) -> None:
         self.url = url
         self.cfg = cfg
-        self.client = open_client(openai.AsyncOpenAI, url, get_api_key(), cfg.timeout)
+        self.client = open_client(openai.AsyncOpenAI, url, cfg.timeout)
         self.in_flight = self.pauses = 0
         self.problem: str | None = None
         self.available_at = self.checked_at = -math.inf

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import pytest
 
+from conf.proxies import proxy_hint
 from conf.schema import ServerConfig
 from evaluation.generators.openai_server import served_origin
-from teacher.servers.proxies import proxy_hint
+from models.checks import check_available
 from tests.local import free_port
 from tests.teacher.faulty_server import teacher_at
 from tests.teacher.test_server import complete
@@ -38,6 +39,17 @@ def test_a_proxy_that_does_not_work_is_named(start_server, monkeypatch, name, ad
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     assert complete(replace(cfg, unreachable_timeout=5.0))
     assert served_origin(ServerConfig(url=server.url, model="other"))
+
+
+def test_a_proxy_before_the_hub_is_named(monkeypatch) -> None:
+    def refuse(_: str) -> None:
+        raise ConnectionError("refused")
+
+    monkeypatch.setattr("models.checks.find_commit", refuse)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setenv("ALL_PROXY", "socks5://127.0.0.1:9")
+    with raises_user_error("missing-model", contains=("refused; requests", "ALL_PROXY")):
+        check_available("student", "acme/tiny")
 
 
 def test_a_password_of_a_proxy_is_not_printed(monkeypatch) -> None:
