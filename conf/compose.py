@@ -105,7 +105,8 @@ def compose(command: str, schema: type, overrides: list[str]) -> Any:
             )
         own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
         settings = validate_settings(own, schema)
-        refuse_broken_link(cfg.hydra.run.dir)
+        # Hydra opens the log before the command's own errors are reported.
+        refuse_broken_link(f"{cfg.hydra.run.dir}/run.log")
         return settings
 
 

@@ -20,7 +20,7 @@ from pydantic_core import from_json
 
 from conf.errors import UserError
 from data.oracle.contacts import group_contacts
-from data.records import Collision, Landing, Scene
+from data.records import ALTERNATIVE, COUNTERFACTUAL, Collision, Landing, Scene
 
 FLOOR_TOLERANCE = 0.05
 """Maximum distance from the floor's plane of a contact with the floor, simulator units."""
@@ -101,8 +101,12 @@ def check_layout(where: str, content: Any, layout: type[AnyLayout]) -> AnyLayout
 
 
 def scene_id(*parts: str) -> str:
-    """Return a scene's id, in which characters that are unsafe in file names are replaced."""
-    return "-".join(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)
+    """Return a scene's id. Characters that are unsafe in file names are replaced, and those that
+    would make it the id of another scene's counterfactual or alternative future."""
+    name = "-".join(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)
+    for mark in (COUNTERFACTUAL, ALTERNATIVE):
+        name = name.replace(mark, mark.replace("-", "_"))
+    return name
 
 
 def check_unique_scenes(

@@ -59,6 +59,10 @@ def test_run_folder_is_below_the_expanded_folder_of_runs(home):
     overrides = ["checkpoints=~/ck", "run=mine"]
     with raises_user_error("broken-link", contains=str(home / "ck/select/mine")):
         compose("evaluation.select", SelectCommand, overrides)
+    (home / "ck/select/new").mkdir()
+    (home / "ck/select/new/run.log").symlink_to("nowhere/log")
+    with raises_user_error("broken-link", contains="new/run.log"):
+        compose("evaluation.select", SelectCommand, ["checkpoints=~/ck", "run=new"])
     (home / "ck/export_study").symlink_to("nowhere")
     with raises_user_error("broken-link", contains=str(home / "ck/export_study")):
         compose("evaluation.study.export", ExportStudyCommand, [*overrides[:1], "run=~/ck/study/a"])

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 from data.parallel import Workers
+from data.records import original_scene_id
 from data.sources import clevrer, movi_a, physion, releases, tracks
 from data.sources.releases import read_release
+from data.sources.validation import scene_id
 from tests.data.sources.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.sources.movi_a_files import (
     movi_example,
@@ -154,6 +156,13 @@ def test_contacts_of_an_object_with_itself_are_no_contacts(tmp_path) -> None:
     example = movi_example([(12.0, 0, 0, 0.0, 1.0), (14.0, 0, 1, 1.0, 0.0), (15.0, 0, 9, 1.0, 0.0)])
     path = write_movi_folder(tmp_path / "00000", example)
     assert [c.objects for c in movi_a.read_scene(path, tmp_path, "test").collisions] == [(0, 1)]
+
+
+@pytest.mark.parametrize("name", ["street-without-3", "a-alt-b", "x-without-alt-y", "a/b c"])
+def test_a_name_does_not_make_a_scene_of_another_one(name) -> None:
+    own = scene_id(name, "000128")
+    assert original_scene_id(own) == own
+    assert Path(own).name == own
 
 
 def test_an_error_of_a_library_leaves_its_record_out(tmp_path, monkeypatch, caplog) -> None:
