@@ -24,13 +24,15 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from conf.errors import SettingsError
+from conf.files import expand_path, refuse_broken_link
 from conf.runs import flatten, resolve_run_name, run_name, runs_folder
+from conf.typed_text import quote_texts, register_presets
 
-for resolver in (run_name, resolve_run_name, runs_folder):
+for resolver in (expand_path, run_name, resolve_run_name, runs_folder):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 CONFIG_NAMES = {"train.export": "export_model", "evaluation.study.export": "export_study"}
@@ -80,6 +82,7 @@ REMOVED_KEYS: dict[str, str] = {
 
 def register(command: str, schema: type) -> None:
     """Store `schema` under the name by which the defaults of `conf/<name>.yaml` refer to it."""
+    register_presets()
     ConfigStore.instance().store(name=f"{config_name(command)}_schema", node=schema)
 
 
@@ -92,11 +95,19 @@ def config_name(command: str) -> str:
 def compose(command: str, schema: type, overrides: list[str]) -> Any:
     """Compose the settings of one run as an instance of `schema`. Raises SettingsError."""
     with open_hydra(command, schema):
+        overrides = [adapt_override(override, schema) for override in overrides]
         refuse_empty_dicts(overrides)
-        cfg = compose_config(command, [allow_new_key(o, schema) for o in overrides])
-        with open_dict(cfg):
-            del cfg["hydra"]
-        return validate_settings(cfg, schema)
+        cfg = compose_config(command, overrides)
+        if cfg.hydra.job.chdir:
+            raise SettingsError(
+                "hydra.job.chdir=true: folders of settings are relative to the folder in which the "
+                "command starts; leave it out"
+            )
+        own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+        settings = validate_settings(own, schema)
+        # Hydra opens the log before the command's own errors are reported.
+        refuse_broken_link(f"{cfg.hydra.run.dir}/run.log")
+        return settings
 
 
 def refuse_empty_dicts(overrides: list[str]) -> None:
@@ -113,19 +124,24 @@ def refuse_empty_dicts(overrides: list[str]) -> None:
             )
 
 
-def allow_new_key(override: str, schema: type) -> str:
-    """Return an override with which Hydra accepts a new key of a dict of values, such as
-    `benchmark.selection.observation.window`: `++KEY=VALUE` instead of `KEY=VALUE`."""
-    key = override.partition("=")[0]
-    for name in key.split("."):
-        hint = get_type_hints(schema).get(name)
+def adapt_override(override: str, schema: type) -> str:
+    """Return an override that Hydra reads as the schema means it.
+
+    A text is quoted if it looks like a number. A new key of a dict of values, such as
+    `benchmark.selection.observation.window`, is added with `++KEY=VALUE` instead of `KEY=VALUE`.
+    """
+    key, equals, value = override.partition("=")
+    hint: Any = schema
+    prefix = ""
+    for name in key.lstrip("+").split("."):
+        if get_origin(hint) is dict:
+            hint = get_args(hint)[1]
+        else:
+            groups = [t for t in (hint, *get_args(hint)) if is_dataclass(t)]
+            hint = get_type_hints(groups[0]).get(name) if groups else None
         if get_origin(hint) is dict and not is_dataclass(get_args(hint)[1]):
-            return f"++{override}"
-        groups = [t for t in (hint, *get_args(hint)) if is_dataclass(t)]
-        if not groups:
-            return override
-        schema = groups[0]
-    return override
+            prefix = "" if key.startswith("+") else "++"
+    return f"{prefix}{key}{equals}{quote_texts(value, hint)}"
 
 
 def check_run_settings(command: str, schema: type, overrides: list[str]) -> None:

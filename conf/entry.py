@@ -22,9 +22,15 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from conf.compose import allow_new_key, check_run_settings, config_name, register, validate_settings
+from conf.compose import (
+    adapt_override,
+    check_run_settings,
+    config_name,
+    register,
+    validate_settings,
+)
 from conf.errors import SettingsError, UserError
-from conf.failures import report_failures
+from conf.failures import open_closed_streams, report_failures
 from conf.files import write_json
 from conf.help import help_text
 from conf.multirun.sweep import run_sweep
@@ -35,6 +41,8 @@ Main = Callable[[Any, Run], Metrics | None]
 
 HYDRA_MODES = ("run", "multirun", "cfg", "info", "shell_completion")
 """Hydra's command-line options, without `--`, that exclude each other."""
+REFUSED_OPTIONS = ("config_dir", "config_path", "config_name", "experimental_rerun")
+"""Hydra's command-line options that read settings from elsewhere, which are not checked."""
 
 
 def command(name: str, schema: type, ranks: bool = False) -> Callable[[Main], Callable[[], None]]:
@@ -52,6 +60,9 @@ def command(name: str, schema: type, ranks: bool = False) -> Callable[[Main], Ca
     def decorate(main: Main) -> Callable[[], None]:
         @functools.wraps(main)
         def start() -> None:
+            open_closed_streams()
+            # A log that cannot be written, as on a full disk, prints no tracebacks.
+            logging.raiseExceptions = False
             with report_failures():
                 if world_size() > 1 and not ranks:
                     raise UserError(
@@ -70,7 +81,7 @@ def command(name: str, schema: type, ranks: bool = False) -> Callable[[Main], Ca
 def _start(name: str, schema: type, main: Main) -> None:
     """Read the command line: print the help, run a sweep, or check all settings and start Hydra."""
     register(name, schema)
-    sys.argv[1:] = [allow_new_key(argument, schema) for argument in sys.argv[1:]]
+    sys.argv[1:] = [adapt_override(argument, schema) for argument in sys.argv[1:]]
     args = get_args_parser().parse_intermixed_args()
     # Hydra's own parser accepts overrides only behind the options.
     options = [argument for argument in sys.argv[1:] if argument not in args.overrides]
@@ -78,6 +89,13 @@ def _start(name: str, schema: type, main: Main) -> None:
     if args.help:
         print(help_text(name, schema, args.overrides))
         return
+    for option in REFUSED_OPTIONS:
+        if value := getattr(args, option):
+            raise SettingsError(
+                f"--{option.replace('_', '-')} {value}: settings are read from the folder conf/ of "
+                "DynaPix only; put a preset there, such as conf/student/mine.yaml for student=mine",
+                "unsupported-option",
+            )
     modes = [f"--{mode}" for mode in HYDRA_MODES if getattr(args, mode)]
     if len(modes) > 1:
         raise SettingsError(f"{modes[0]} with {modes[1]}: give one of them", "conflicting-options")
@@ -108,7 +126,7 @@ def _start(name: str, schema: type, main: Main) -> None:
     try:
         start(task)()
     except HydraException as error:
-        # The settings have been checked, so an option such as --config-dir is wrong.
+        # The settings have been checked, so an option such as --package is wrong.
         raise SettingsError(str(error).strip().partition("\n")[0]) from error
 
 

@@ -30,7 +30,7 @@ FULL_DISK_BYTES = 1 << 20
 """Free space below which a disk counts as full."""
 FILE_ERRORS = {
     "ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM", "ENOTDIR", "EISDIR", "EEXIST",
-    "ENAMETOOLONG",
+    "ENAMETOOLONG", "ELOOP",
 }  # fmt: skip
 """Names in `errno` of the errors of reading and writing that the user can correct."""
 
@@ -69,10 +69,13 @@ def report_failures(folder: str = ".") -> Iterator[None]:
             raise
         _end_process(128 + signal.SIGPIPE)
     except OSError as error:
-        if errno.errorcode.get(error.errno) not in FILE_ERRORS:
+        if not _is_file_error(error):
             raise
         _exit_after_file_error(str(error.filename or folder), str(error.strerror))
     except Exception as error:
+        # A library such as logging may raise an error of its own from that of the file.
+        if isinstance(cause := error.__cause__, OSError) and _is_file_error(cause):
+            _exit_after_file_error(str(cause.filename or folder), str(cause.strerror))
         if world_size() > 1 and re.search(PEER_ENDED, str(error)):
             _end_process(1)
         if os.path.exists(folder) and shutil.disk_usage(folder).free < FULL_DISK_BYTES:
@@ -80,6 +83,23 @@ def report_failures(folder: str = ".") -> Iterator[None]:
         if not re.search(FAILED_WRITE, str(error)):
             raise
         _exit_after_file_error(folder, f"a file was not written ({error})")
+
+
+def open_closed_streams() -> None:
+    """Open the standard streams that are closed, as after `>&-`, such that output is discarded.
+
+    Otherwise the next file that is opened has the descriptor of a stream, to which child processes
+    write their output.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            handle = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(handle, True)
+            setattr(sys, name, os.fdopen(handle, mode))
+
+
+def _is_file_error(error: OSError) -> bool:
+    return errno.errorcode.get(error.errno) in FILE_ERRORS
 
 
 def _output_is_closed() -> bool:

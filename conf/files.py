@@ -11,6 +11,29 @@ from typing import Any
 from conf.errors import UserError
 
 
+def expand_path(path: str) -> str:
+    """Return a path in which a leading `~` or `~user` is replaced by the home folder. Libraries
+    differ in whether they replace it."""
+    return os.path.expanduser(path)
+
+
+def refuse_broken_link(path: str | Path) -> None:
+    """Raises UserError if a path leads through a link whose target does not exist."""
+    for each in (*reversed(Path(path).parents), Path(path)):
+        if each.is_symlink() and not os.path.exists(each):
+            raise UserError(
+                f"{each} is a link to {os.readlink(each)}, which does not exist: create the "
+                "target, or delete the link",
+                code="broken-link",
+            )
+
+
+def is_writable(path: Path) -> bool:
+    """Return whether this user may write a file or a folder, or create it if it is missing."""
+    existing = next(each for each in (path, *path.absolute().parents) if each.exists())
+    return os.access(existing, os.W_OK)
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file so that a killed process leaves either the complete file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -49,7 +72,7 @@ def read_json(path: Path) -> dict[str, Any]:
         UserError: The file is damaged or missing.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(path.read_text(encoding="utf-8-sig"))
         if isinstance(value, dict):
             return value
         problem = "it is no JSON object"
@@ -66,7 +89,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_json_if_valid(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file; an empty one if the file is damaged or missing."""
     try:
-        return dict(json.loads(path.read_text()))
+        return dict(json.loads(path.read_text(encoding="utf-8-sig")))
     except (OSError, ValueError, TypeError):
         return {}
 
@@ -74,7 +97,7 @@ def read_json_if_valid(path: Path) -> dict[str, Any]:
 def read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the objects in a file of JSON lines; skip damaged lines, such as a last line that a
     killed process wrote only in part."""
-    with open(path, encoding="utf-8", errors="replace") as file:
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
         for line in file:
             try:
                 row = json.loads(line)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from conf.errors import SettingsError, UserError
-from conf.files import read_json, write_json, write_text
+from conf.files import expand_path, read_json, write_json, write_text
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +97,8 @@ def run_name(run: str | None, overrides: Sequence[str]) -> str:
     ordered = sorted((o.lstrip("+") for o in overrides), key=_key)
     ordered = [o for o in ordered if _key(o) not in RESULT_NEUTRAL_KEYS]
     # Keep only characters that need no quotes in an override such as model=NAME.
-    name = re.sub(r"[^A-Za-z0-9_.+-]", "-", "+".join(ordered)) or "default"
+    name = re.sub(r"'([A-Za-z0-9_.+-]+)'", r"\1", "+".join(ordered))
+    name = re.sub(r"[^A-Za-z0-9_.+-]", "-", name) or "default"
     if len(name) > 120:
         digest = hashlib.sha256(name.encode()).hexdigest()[:8]
         name = f"{name[:111]}-{digest}"
@@ -111,6 +112,7 @@ def _key(override: str) -> str:
 def resolve_run_name(run: str, folder: str) -> str:
     """Return the name of a run in `folder`; `run` is either this name or the path of the run's
     folder."""
+    run, folder = expand_path(run), expand_path(folder)
     return os.path.relpath(run, folder) if is_inside(run, folder) else os.path.normpath(run)
 
 
@@ -123,6 +125,7 @@ def runs_folder(checkpoints: str, product: str, run: str = "") -> str:
     """Return the folder to which the names of the runs that train a product (student or retriever)
     are relative. If `run` is the folder of a run of train.distill or train.reinforce, this is
     `checkpoints`, so that the run's name begins with "distill/" or "reinforce/"."""
+    checkpoints, run = expand_path(checkpoints), expand_path(run)
     if product == "student" and any(is_inside(run, f"{checkpoints}/{f}") for f in CONTINUATIONS):
         return checkpoints
     return f"{checkpoints}/{TRAINER_FOLDERS.get(product, product)}"

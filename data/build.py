@@ -14,7 +14,7 @@ from typing import Any
 
 from conf.entry import Run, command
 from conf.errors import SettingsError, UserError
-from conf.files import read_json, write_bytes, write_json
+from conf.files import is_writable, read_json, refuse_broken_link, write_bytes, write_json
 from conf.runs import compare_settings, flatten, lock_file
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.checks.counts import count_records, summarize_store
@@ -69,10 +69,12 @@ def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
 
 
 def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
-    """Open a benchmark as `ensure_items` does, and render the frames that its records refer to."""
+    """Open a benchmark as `ensure_items` does, and render the frames that its records refer to,
+    unless the store cannot be written: frames are then rendered when they are needed."""
     check_renderer(cfg, root)
     store = ensure_items(cfg, root, Workers(workers))
-    if not (store.folder / FRAMES_FOLDER / FRAMES_RECORD).exists():
+    is_rendered = (store.folder / FRAMES_FOLDER / FRAMES_RECORD).exists()
+    if not is_rendered and is_writable(store.folder):
         prerender_frames(store, "named", Workers(workers))
     return store
 
@@ -117,6 +119,7 @@ def build(cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool = F
         UserError: the benchmark would contain no item and no query.
     """
     check_quota_names(cfg)
+    refuse_broken_link(folder)
     log.info("building benchmark %s in %s", cfg.store_name, folder)
     with lock_partial_build(cfg, folder) as partial:
         if partial is None:

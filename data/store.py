@@ -121,8 +121,9 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
     """Read the rows of a parquet file."""
     import pyarrow.parquet as pq
 
-    # read_table would import pandas.
-    return pq.ParquetFile(path).read().to_pylist()
+    # read_table would import pandas, and a path would be expanded by rules of its own.
+    with open(path, "rb") as file:
+        return pq.ParquetFile(file).read().to_pylist()
 
 
 def hash_file(path: Path) -> str:

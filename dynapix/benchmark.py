@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any, Generic, TypeVar, overload
 import numpy as np
 
 from conf.errors import UserError
+from conf.files import expand_path
 from conf.schema.benchmark import store_name
 from data.frames.frame_cache import FrameReader
 from data.records import (
@@ -67,11 +69,12 @@ def load(
             "commands: pip install -e '.[train]', or leave it out and resize frames yourself",
             code="missing-package",
         )
-    folder = Path(benchmark)
+    name, root = expand_path(str(benchmark)), Path(expand_path(str(store)))
+    folder = Path(name)
     if not (folder / MANIFEST).exists():
-        folder = Path(store) / benchmark
+        folder = root / name
     is_built = (folder / MANIFEST).exists()
-    opened = open_store(folder) if is_built else _open_preset(str(benchmark), Path(store))
+    opened = open_store(folder) if is_built else _open_preset(name, root)
     count = frames or opened.manifest["config"]["prefix_frames"]
     return Benchmark(opened, split, count, image_size)
 
@@ -125,10 +128,13 @@ def _preset_world(preset: str) -> str:
 
 
 class Lazy(Sequence, Generic[Record]):
-    """A sequence whose elements are made when they are accessed. Slices are such sequences, too."""
+    """A sequence whose elements, `kind(record, benchmark)`, are made when they are accessed. Slices
+    are such sequences, too."""
 
-    def __init__(self, make: Callable[[Any], Record], records: Sequence[Any]) -> None:
-        self._make, self._records = make, records
+    def __init__(
+        self, kind: Callable[..., Record], records: Sequence[Any], benchmark: Benchmark
+    ) -> None:
+        self._kind, self._records, self._benchmark = kind, records, benchmark
 
     def __len__(self) -> int:
         return len(self._records)
@@ -139,11 +145,11 @@ class Lazy(Sequence, Generic[Record]):
     def __getitem__(self, index: slice) -> Lazy[Record]: ...
     def __getitem__(self, index: int | slice) -> Record | Lazy[Record]:
         if isinstance(index, slice):
-            return Lazy(self._make, self._records[index])
-        return self._make(self._records[index])
+            return Lazy(self._kind, self._records[index], self._benchmark)
+        return self._kind(self._records[index], self._benchmark)
 
     def __iter__(self) -> Iterator[Record]:
-        return map(self._make, self._records)
+        return (self._kind(record, self._benchmark) for record in self._records)
 
     def __repr__(self) -> str:
         return f"<{len(self):,} records>"
@@ -318,7 +324,7 @@ class Benchmark:
     @cached_property
     def selection(self) -> Lazy[Item]:
         """The selection items of the split."""
-        return Lazy(lambda record: Item(record, self), self.store.selection(self.split))
+        return Lazy(Item, self.store.selection(self.split), self)
 
     @cached_property
     def retrieval(self) -> Lazy[Query]:
@@ -326,14 +332,14 @@ class Benchmark:
         targets are in `database`."""
         test = self.split == "test"
         records = self.store.standard_test() if test else self.store.retrieval(self.split)
-        return Lazy(lambda record: Query(record, self), records)
+        return Lazy(Query, records, self)
 
     @cached_property
     def database(self) -> Lazy[Frame]:
         """The frames to rank for `retrieval`: the standard test's database, or, of the train split,
         the database of all future-state queries."""
         name = "test" if self.split == "test" else "future"
-        return Lazy(lambda ref: Frame(ref, self), self.store.database(name))
+        return Lazy(Frame, self.store.database(name), self)
 
     @cached_property
     def rationales(self) -> dict[str, str]:
@@ -345,6 +351,11 @@ class Benchmark:
         """
         return read_accepted(self.store.folder)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A worker process opens the benchmark once, instead of receiving it with each item.
+        folder = self.store.folder.absolute()
+        return _reopen, (folder, self.store.identity, self.split, self.frames, self.image_size)
+
     def __repr__(self) -> str:
         counts = ", ".join(f"{self._count(family)} {family}" for family in FAMILIES)
         return (
@@ -354,3 +365,27 @@ class Benchmark:
 
     def _count(self, family: str) -> int:
         return sum(item.family == family for item in self.selection)
+
+
+@lru_cache(maxsize=8)
+def _reopen(
+    folder: Path, identity: str, split: str, frames: int, image_size: int | None
+) -> Benchmark:
+    """Return the benchmark of a pickled item. Raises UserError if it is another one now."""
+    store = open_store(folder)
+    if store.identity != identity:
+        raise UserError(
+            f"{folder} was built again since its items were pickled: load them again",
+            code="different-builds",
+        )
+    return Benchmark(store, split, frames, image_size)
+
+
+def refuse_repeated(names: Sequence[str], kind: str) -> None:
+    """Raises UserError if an item or a query is given twice: it would count twice."""
+    if repeated := [name for name, count in Counter(names).items() if count > 1]:
+        more = f" ({len(repeated) - 1} more are repeated)" if len(repeated) > 1 else ""
+        raise UserError(
+            f"{kind} {repeated[0]} is given more than once{more}: give each {kind} once",
+            code="repeated-items",
+        )

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from conf.errors import UserError
-from conf.files import write_json, write_text
-from dynapix.benchmark import Benchmark, Query
+from conf.files import expand_path, write_json, write_text
+from dynapix.benchmark import Benchmark, Query, refuse_repeated
 from dynapix.saved_runs import saved_run
+from evaluation.metrics.arrays import to_array
 from evaluation.metrics.results import RetrievalReport, RetrievalResult, retrieval_results
 from evaluation.retrieval.exact_search import Ranks, exact_ranks, write_ranks
 
@@ -59,7 +60,7 @@ class RetrievalScores:
         Raises:
             UserError: The folder exists and contains something else.
         """
-        folder = Path(folder)
+        folder = Path(expand_path(str(folder)))
         store = self.benchmark.store
         with saved_run(folder, store, "retrieve", self.name, self.seed, self.metrics):
             write_ranks(folder, {self.name: self.ranks}, [q.record for q in self.queries])
@@ -91,12 +92,13 @@ def evaluate_retrieval(
         seed: Seed of the bootstrap over scenes.
 
     Raises:
-        UserError: There are no queries, or the embeddings have another shape, are not finite, or
-            are not those of the queries and of the database.
+        UserError: There are no queries, a query occurs twice, or the embeddings have another
+            shape, are not finite, or are not those of the queries and of the database.
     """
     queries = list(queries)
     if not queries:
         raise UserError("there are no queries to evaluate", code="no-items")
+    refuse_repeated([query.query_id for query in queries], "query")
     benchmark: Benchmark = queries[0]._benchmark
     names = [frame.name for frame in benchmark.database]
     query_rows = _rows(query_embeddings, [q.query_id for q in queries], "query")
@@ -138,8 +140,8 @@ def _rows(embeddings: Embeddings, names: Sequence[str], kind: str) -> np.ndarray
             )
         embeddings = [embeddings[name] for name in names]
     try:
-        rows = np.asarray(embeddings, np.float32)
-    except (TypeError, ValueError) as error:
+        rows = to_array(embeddings, np.float32)
+    except (RuntimeError, TypeError, ValueError) as error:
         raise UserError(
             f"{kind} embeddings are not an array of numbers: {error}", code="invalid-embeddings"
         ) from error

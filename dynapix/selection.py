@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -14,10 +15,11 @@ import numpy as np
 from tqdm import tqdm
 
 from conf.errors import UserError
-from conf.files import write_json, write_json_lines, write_text
+from conf.files import expand_path, write_json, write_json_lines, write_text
 from data.records import LETTERS
-from dynapix.benchmark import Benchmark, Item
+from dynapix.benchmark import Benchmark, Item, refuse_repeated
 from dynapix.saved_runs import saved_run
+from evaluation.metrics.arrays import to_array
 from evaluation.metrics.results import SIMILARITY, SelectionReport, SelectionResult
 from evaluation.metrics.selection import (
     Choices,
@@ -90,8 +92,9 @@ def evaluate(
         progress: Whether to show a progress bar.
 
     Raises:
-        UserError: There are no items or items of several benchmarks, `predict` returns another
-            number of predictions than it received items, or the first items all fail.
+        UserError: There are no items, items of several benchmarks or an item twice, `predict`
+            returns another number of predictions than it received items, or the first items all
+            fail.
     """
     items = list(items)
     benchmarks = {id(item._benchmark): item._benchmark for item in items}
@@ -100,11 +103,14 @@ def evaluate(
         raise UserError(
             f"{problem}: give Benchmark.selection or some of its items", code="invalid-items"
         )
+    refuse_repeated([item.item_id for item in items], "item")
     if batch_size is not None and batch_size < 1:
         raise UserError(f"batch_size={batch_size}: give 1 or more", code="invalid-setting")
     outcomes: list[Outcome] = []
     size = batch_size or 1
-    with tqdm(total=len(items), desc=name, unit="item", disable=not progress) as bar:
+    with tqdm(
+        total=len(items), desc=name, unit="item", disable=not progress or sys.stderr is None
+    ) as bar:
         for start in range(0, len(items), size):
             batch = items[start : start + size]
             outcomes += _predict_batch(predict, batch, single=batch_size is None)
@@ -136,8 +142,8 @@ def _read(item: Item, prediction: Any) -> Outcome:
         right = float(parsed.letter == item.answer)
         return Outcome(item.item_id, prediction, None, parsed.letter, right, reason)
     try:
-        scores = np.asarray(prediction, float)
-    except (TypeError, ValueError):
+        scores = to_array(prediction, float)
+    except Exception:  # A library's own error must not lose the earlier predictions.
         return _failure(item, f"predict returned {_shorten(prediction)}")
     if scores.shape != (len(LETTERS),):
         return _failure(item, f"predict returned {_shorten(prediction)}")
@@ -261,7 +267,7 @@ class Result:
         Raises:
             UserError: The folder exists and contains something else.
         """
-        folder = Path(folder)
+        folder = Path(expand_path(str(folder)))
         kind = "select" if self._texts else "similarity"
         record = (self.benchmark.store, kind, self.name, self.seed)
         with saved_run(folder, *record, metrics=self.accuracy.metrics):
@@ -296,7 +302,7 @@ class Result:
         Raises:
             UserError: The folder has no saved result, or its items are not those of `benchmark`.
         """
-        folder = Path(folder)
+        folder = Path(expand_path(str(folder)))
         try:
             record = json.loads((folder / "run.json").read_text())
             report = json.loads((folder / "report.json").read_text())

@@ -52,7 +52,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     log.info("collecting the texts of %s", name)
     chosen = [text_matching.ROUTES[key] for key in routes]
     responses = text_matching.collect_texts(
-        cfg, student, model, sample_of, chosen, queries, database, store
+        cfg, student, model, sample_of, chosen, queries, database, store, run.folder
     )
     texts = {
         mode: {r.item_id: text_matching.future_text(r.text) for r in mode_responses}

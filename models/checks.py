@@ -8,9 +8,11 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from huggingface_hub import constants
 from safetensors import safe_open
 
 from conf.errors import UserError
+from conf.proxies import proxy_hint
 from conf.schema import RetrieverConfig
 from models.fingerprints import find_commit
 
@@ -216,9 +218,10 @@ def check_available(group: str, model: str, key: str = "model") -> None:
         if Path(model).is_absolute() or model.startswith("."):
             message = f"{name}={model}: this folder does not exist"
         else:
+            hint = "" if constants.HF_HUB_OFFLINE else proxy_hint(constants.ENDPOINT)
             message = (
                 f"{name}={model} is neither a local folder nor in the hub's cache, and cannot be "
-                f"downloaded ({first_line(error)}). Give a local copy with {name}=FOLDER "
+                f"downloaded ({first_line(error)}{hint}). Give a local copy with {name}=FOLDER "
                 "(config.json, *.safetensors, tokenizer and processor files), or download it on a "
                 f"machine with network access: hf download {model}"
             )

@@ -1,7 +1,7 @@
 """Functions that rely on private or version-dependent parts of libraries ("hooks").
 
 All hooks were checked with torch 2.14 to 2.15, transformers 5.18 to 5.23, peft 0.19 to 0.21.2,
-accelerate 1.12 to 1.15, sentence-transformers 6.2, trl 1.16 and bitsandbytes 0.49 to 0.50.2, unless
+accelerate 1.15, sentence-transformers 6.2, trl 1.16 and bitsandbytes 0.49 to 0.50.2, unless
 a docstring says otherwise. `pyproject.toml` excludes later versions. Before it admits them, all
 tests must pass with them; tests/models/test_compat.py names most hooks that a library changed, and
 the tests of the modules below fail for the others.

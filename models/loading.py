@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +164,7 @@ def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
 
     model.requires_grad_(False)
     with lora_config("student", lora, task_type="CAUSAL_LM") as config:
-        return peft.get_peft_model(model, config)
+        return without_embeddings(peft.get_peft_model(model, config))
 
 
 @contextmanager
@@ -216,7 +217,15 @@ def load_trainable(
     prepare_for_training(base)
     with explain_damage(folder):
         check_adapters(folder, base, cfg.lora.rank, cfg.model)
-        return peft.PeftModel.from_pretrained(base, folder, is_trainable=True), processor
+        model = peft.PeftModel.from_pretrained(base, folder, is_trainable=True)
+    return without_embeddings(model), processor
+
+
+def without_embeddings(model: nn.Module) -> nn.Module:
+    """Let a model with adapters save these alone. By default, PEFT looks up the base on the hub at
+    each save, to find out whether its table of embeddings has grown."""
+    model.save_pretrained = partial(model.save_pretrained, save_embedding_layers=False)
+    return model
 
 
 def check_safetensors(folder: Path) -> None:

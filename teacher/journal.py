@@ -13,7 +13,7 @@ from typing import Any
 from conf.errors import UserError
 from conf.runs import wait_for_lock
 from data.records import Rationale
-from data.store import save_rows
+from data.store import load_rows, save_rows
 from teacher.sections import SECTIONS
 
 ACCEPTED = "rationales.parquet"
@@ -131,12 +131,9 @@ def read_accepted(folder: Path) -> dict[str, str]:
     Raises:
         UserError: There has been no narration.
     """
-    import pyarrow.parquet as pq
-
     if not (folder / ACCEPTED).exists():
         raise UserError(
             f"{folder} has no {ACCEPTED}: write rationales with python -m teacher.narrate",
             code="no-rationales",
         )
-    table = pq.read_table(folder / ACCEPTED, columns=["item_id", "text"])
-    return dict(zip(table["item_id"].to_pylist(), table["text"].to_pylist(), strict=True))
+    return {row["item_id"]: row["text"] for row in load_rows(folder / ACCEPTED)}

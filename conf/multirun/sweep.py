@@ -17,9 +17,9 @@ from hydra.core.utils import configure_log
 from hydra.types import RunMode
 from hydra.utils import instantiate
 
-from conf.compose import compose, compose_config, open_hydra
+from conf.compose import adapt_override, compose, compose_config, open_hydra
 from conf.errors import SettingsError
-from conf.files import write_json
+from conf.files import refuse_broken_link, write_json
 from conf.multirun.launchers import Job
 from conf.multirun.search import Search
 from conf.multirun.table import JOB_FILE, read_job, read_jobs, write_sweep_table
@@ -72,6 +72,7 @@ class Sweep:
             # Overrides of the command line replace the parameters of a sweep preset.
             lines = [f"{key}={value}" for key, value in (cfg.hydra.sweeper.params or {}).items()]
             lines += [line for line in self.task_overrides if not line.startswith("+sweep=")]
+            lines = [adapt_override(line, schema) for line in lines]
             parsed = OverridesParser.create(config_loader=loader).parse_overrides(lines)
         self.overrides = {override.get_key_element(): override for override in parsed}
         choices = self.hydra.runtime.choices
@@ -81,6 +82,7 @@ class Sweep:
             )
         self.is_search = choices["hydra/sweeper"] != "basic"
         self.folder = Path(cfg.hydra.sweep.dir)
+        refuse_broken_link(self.folder)
         self.name = run_name(cfg.run, self.task_overrides)
         self.jobs = self._list_jobs()
         if "run" in self.overrides and self.overrides["run"].is_sweep_override():

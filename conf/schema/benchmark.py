@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
 
-from conf.schema.settings import MISSING, Settings, setting
+from conf.schema.settings import MISSING, Settings, path, setting
 from conf.schema.world import WorldConfig
 
 RENDERERS = ("bullet", "blender")
@@ -66,6 +66,7 @@ class SelectionConfig(Settings):
     event and the other by a time."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.window = divide_window_quotas(self.window)
 
     def find_problems(self, group: str) -> Iterator[str]:
@@ -117,7 +118,7 @@ class BenchmarkConfig(Settings):
     distractors: str = setting("paper", DISTRACTORS)
     """Distractors of selection items: as in the paper (paper), or frames of other futures of the
     scene, chosen so that only a prediction of its motion reveals the target (balanced)."""
-    folder: str | None = None
+    folder: str | None = path(None)
     """Folder of the release or of the tracked videos, if `simulator` reads one."""
     fps: float = setting(30.0, above=0)
     """Frame rate (frames per second) of Physion's trials, most of which do not record it."""

@@ -10,7 +10,7 @@ from conf.runs import TRAINER_FOLDERS, is_inside, runs_folder
 from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import SamplingServerConfig, TeacherConfig, TeacherServerConfig
-from conf.schema.settings import MISSING, Settings, check_run, setting
+from conf.schema.settings import MISSING, Settings, check_run, path, setting
 from conf.schema.training import (
     ContrastiveTrainConfig,
     DistillTrainConfig,
@@ -31,9 +31,9 @@ class CommandConfig(Settings):
 
     run: str | None = None
     """Name of the run's folder below checkpoints/<command>/; null derives it from the overrides."""
-    store: str = "store"
+    store: str = path("store")
     """Folder of the built benchmarks."""
-    checkpoints: str = "checkpoints"
+    checkpoints: str = path("checkpoints")
     """Folder of the runs."""
     workers: int = setting(2, least=1)
     """Worker processes for simulation and rendering."""
@@ -49,7 +49,7 @@ class CommandConfig(Settings):
             return []
         if self.run.startswith(f"{self.checkpoints.rstrip('/')}/"):
             return [f"run={self.run} is a path: give the name only, run={Path(self.run).name}"]
-        if {"", ".", ".."} & {*self.run.split("/")}:
+        if {"", ".", ".."} & {*self.run.split("/")} or self.run.startswith("~"):
             return [f"run={self.run}: give a name, such as run=first"]
         return []
 
@@ -78,7 +78,7 @@ class StatisticsCommand(CommandConfig):
 @dataclass
 class ExportCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
-    folder: str = MISSING
+    folder: str = path(MISSING)
     """Folder to write to; it must not contain an earlier export."""
     images: bool = True
     """Include the images of the frames; otherwise a row only names its scenes and frames."""
@@ -110,9 +110,9 @@ class NarrateCommand(CommandConfig):
 class ServeCommand(CommandConfig):
     teacher: TeacherConfig = MISSING
     """The server listens at `teacher.url` and serves the model under the name `teacher.model`."""
-    model: str | None = None
+    model: str | None = path(None)
     """Folder of the model, or its name on the Hugging Face hub; null uses `teacher.model`."""
-    environment: str = ".venv-vllm"
+    environment: str = path(".venv-vllm")
     """Folder of the Python environment with vLLM, which `make vllm-env` creates."""
     prompt_tokens: int = setting(3072, least=1)
     """Maximum length of a prompt (tokens). The context length is this value plus
@@ -128,7 +128,7 @@ class ServeCommand(CommandConfig):
     frames: bool = False
     """Accept requests with frames, such as those of evaluation.select. A request chooses how its
     frames are preprocessed, so give access only to clients that you trust."""
-    adapter: str | None = None
+    adapter: str | None = path(None)
     """Folder of a student's adapters to serve under the model name `adapter`."""
     adapter_rank: int | None = setting(None, least=1)
     """Maximum LoRA rank of the adapters that clients load while the server runs, such as
@@ -157,7 +157,7 @@ class SftCommand(CommandConfig):
 class ContinuationCommand(CommandConfig):
     """Settings of the commands that train the student of another run further."""
 
-    model: str | None = None
+    model: str | None = path(None)
     """Folder of the run of train.sft whose student is trained further. It determines the benchmark,
     the narrator's settings and the student."""
     sampling_server: SamplingServerConfig = field(default_factory=SamplingServerConfig)
@@ -167,7 +167,7 @@ class ContinuationCommand(CommandConfig):
 
 @dataclass
 class DistillCommand(ContinuationCommand):
-    teacher_model: str | None = None
+    teacher_model: str | None = path(None)
     """Folder of the run that trained the teacher, for example with train.sft train.facts=true; null
     uses the student itself, as it is at the start. The teacher reads the facts of an item as text
     instead of its frames, and needs the student's tokenizer."""
@@ -268,7 +268,7 @@ class ExportModelCommand(CommandConfig):
     product: str = setting("student", tuple(TRAINER_FOLDERS))
     """Model to export: student (of train.sft, train.distill or train.reinforce) or retriever (of
     train.contrastive)."""
-    run: str = "default"
+    run: str = path("default")
     """Training run to export: its name or its folder. Runs of train.distill and
     train.reinforce need their folder."""
     format: str = setting("bf16", ("bf16", "fp32", "adapter"))

@@ -11,7 +11,15 @@ from conf.schema.benchmark import BenchmarkConfig
 from conf.schema.commands import CommandConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import ServerConfig
-from conf.schema.settings import MISSING, Settings, check_choices, check_run, is_url, setting
+from conf.schema.settings import (
+    MISSING,
+    Settings,
+    check_choices,
+    check_run,
+    is_url,
+    path,
+    setting,
+)
 from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
 
 RESPONSE_MODES = ("reasoning", "answer", "record", "constrained")
@@ -43,7 +51,7 @@ class GenerationCommand(CommandConfig):
     train: SftTrainConfig = field(default_factory=SftTrainConfig)
     """Training settings of the preset. For a base, only train.precision is used and, in
     evaluation.select, train.regime, which determines the prompt."""
-    model: str | None = None
+    model: str | None = path(None)
     """Folder of a run of train.sft, train.distill or train.reinforce, or of its export. The
     settings saved there replace `student` and `train`. null measures the base that `student`
     names."""
@@ -76,7 +84,7 @@ class EmbedderConfig(Settings):
     retriever: RetrieverConfig = MISSING
     train: ContrastiveTrainConfig = field(default_factory=ContrastiveTrainConfig)
     """Training settings of the preset, of which only train.precision is used."""
-    model: str | None = None
+    model: str | None = path(None)
     """Folder of a run of train.contrastive, or of its export. The settings saved there replace
     `retriever` and `train`. null uses the model that `retriever` names as released, or untrained if
     it is built from an architecture."""
@@ -108,7 +116,7 @@ class ReportCommand(CommandConfig):
     runs: list[str] | None = None
     """Run folders below `checkpoints`, or glob patterns of them, such as [select/cot,retrieve/*];
     null reports every finished run, and the results in `saved`."""
-    saved: str = "runs"
+    saved: str = path("runs")
     """Folder of the results that the `save` methods of `dynapix.Result` and
     `dynapix.RetrievalScores` wrote."""
     items: int = setting(120, least=0)
@@ -141,7 +149,7 @@ class TwoStageCommand(GenerationCommand):
 @dataclass
 class StudyCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
-    items: str = "60"
+    items: str = path("60")
     """Number of test items, sampled evenly from the families; or a file that lists items, with one
     item_id, or one JSON object with the key item_id, per line."""
     annotators: int = setting(3, least=1)
@@ -189,7 +197,7 @@ class StudyCommand(CommandConfig):
 
 @dataclass
 class ExportStudyCommand(CommandConfig):
-    run: str = "default"
+    run: str = path("default")
     """Run of evaluation.study to export: its name or its folder."""
     seed: int = setting(0, least=0)
     """Seed of the bootstrap over scenes."""

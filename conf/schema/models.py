@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from conf.schema.settings import MISSING, Settings, setting
+from conf.schema.settings import MISSING, Settings, path, setting
 
 ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")
 
@@ -66,7 +66,7 @@ class ModelConfig(Settings):
 
     name: str = MISSING
     """Name of the model in reports."""
-    model: str | None = None
+    model: str | None = path(None)
     """Folder of the base, or its name on the Hugging Face hub, from which it is downloaded unless
     it is in the local cache. null builds a model from `architecture`."""
     revision: str | None = None
@@ -139,7 +139,7 @@ class RetrieverConfig(ModelConfig):
     """Kind of model. qwen3_vl and vlm2vec embed a prefix and its question as one input; dual (CLIP,
     SigLIP 2) and languagebind embed them separately and add the embeddings. Only qwen3_vl can be
     trained; the others are evaluated as released."""
-    image_model: str | None = None
+    image_model: str | None = path(None)
     """Model that embeds frames, for languagebind only; `model` embeds prefixes and questions."""
     image_revision: str | None = None
     """Branch, tag or commit of `image_model` on the hub."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from conf.schema.settings import MISSING, Settings, is_url, setting
+from conf.schema.settings import MISSING, Settings, is_url, path, setting
 
 NARRATOR_WORDS = (80, 250)
 """Minimum and maximum number of words of the built-in narrator's rationales."""
@@ -22,7 +22,7 @@ class ServersConfig(Settings):
     url: Any = None
     """Address of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1, or a list of
     addresses of servers of the same model; null uses no server."""
-    model: str | None = None
+    model: str | None = path(None)
     """Name of the model on the server."""
     concurrency: int = setting(128, least=1)
     """Number of concurrent requests, over all servers; 128 requests saturate one vLLM server."""
@@ -52,7 +52,7 @@ class ServerConfig(ServersConfig):
 
     GROUP: ClassVar[str] = "server"
 
-    model: str | None = None
+    model: str | None = path(None)
     """Name of the model or of an adapter on the server; null uses student.model."""
     concurrency: int = setting(32, least=1)
     """Number of concurrent requests, over all servers; each contains the frames of one item."""
@@ -71,7 +71,7 @@ class TeacherServerConfig(ServersConfig):
 
     GROUP: ClassVar[str] = "teacher_server"
 
-    model: str | None = None
+    model: str | None = path(None)
     """Name of the teacher on the server. It needs the student's tokenizer."""
 
     def find_problems(self, group: str) -> Iterator[str]:

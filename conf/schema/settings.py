@@ -9,6 +9,8 @@ from math import isfinite
 from typing import Any, get_args, get_origin, get_type_hints
 from urllib.parse import urlsplit
 
+from conf.errors import UserError
+from conf.files import expand_path, refuse_broken_link
 from conf.runs import is_run_name, resolve_run_name
 
 MISSING: Any = "???"
@@ -35,8 +37,20 @@ def setting(default: Any, options: Sequence[str | None] = (), **bounds: float) -
     return field(default=default, metadata={"options": options, "bounds": bounds})
 
 
+def path(default: Any) -> Any:
+    """Return the dataclass field of a setting that names a file, a folder, or perhaps a model on
+    the hub. A leading `~` is the home folder."""
+    return field(default=default, metadata={"is_path": True})
+
+
 class Settings:
     """Base of a group of settings: a dataclass whose fields are settings or nested groups."""
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.metadata.get("is_path") and value is not None:
+                setattr(self, entry.name, expand_path(value))
 
     def check(self, group: str = "") -> list[str]:
         """Return one message per problem in this group and in its nested groups.
@@ -80,8 +94,17 @@ def from_dict(schema: type, values: Mapping[str, Any]) -> Any:
 
 
 def _check_value(
-    key: str, value: Any, options: Sequence[str | None] = (), bounds: Mapping[str, float] = {}
+    key: str,
+    value: Any,
+    options: Sequence[str | None] = (),
+    bounds: Mapping[str, float] = {},
+    is_path: bool = False,
 ) -> list[str]:
+    if is_path and value is not None:
+        try:
+            refuse_broken_link(value)
+        except UserError as error:
+            return [f"{key}={value}: {error}"]
     if options and value not in options:
         return [f"{key}={value}: the options are {', '.join(o or 'null' for o in options)}"]
     numbers = value if isinstance(value, list) else [value]

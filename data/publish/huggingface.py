@@ -158,7 +158,10 @@ def _write_table(
         else:
             path.parent.mkdir(exist_ok=True)
             unfinished = path.with_name(f".{path.name}.partial")
-            with pq.ParquetWriter(unfinished, schema, compression="zstd") as writer:
+            with (
+                open(unfinished, "wb") as file,
+                pq.ParquetWriter(file, schema, compression="zstd") as writer,
+            ):
                 for start in range(0, len(part), group):
                     rows = [builder.row(r, split) for r in part[start : start + group]]
                     writer.write_table(pa.Table.from_pylist(rows, schema))

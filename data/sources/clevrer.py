@@ -34,6 +34,7 @@ from data.sources.validation import (
     Layout,
     RecordError,
     Vector,
+    check_unique_objects,
     check_unique_scenes,
     find_contacts,
     read_layout,
@@ -113,6 +114,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
             "duplicate-scene",
         )
     ids = [each.object_id for each in annotation.object_property]
+    check_unique_objects(str(path), ids)
     objects = tuple(SceneObject(o.shape, o.material, o.color) for o in annotation.object_property)
     touches = []
     for contact in annotation.collision:

@@ -99,7 +99,7 @@ class Instance(States):
 
 
 class Video(Layout):
-    resolution: conlist(int, min_length=2, max_length=2)
+    resolution: conlist(Annotated[int, Field(gt=0)], min_length=2, max_length=2)
     num_frames: Literal[FRAMES]
     frame_rate: Literal[FPS]
 

@@ -38,6 +38,7 @@ from data.sources.validation import (
     FLOOR_TOLERANCE,
     MIN_VERTICAL,
     RecordError,
+    check_unique_objects,
     check_unique_scenes,
     decode_image,
     find_contacts,
@@ -96,6 +97,7 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
     with _open(path) as file:
         frames = _list_frames(file)
         ids = _read_array(file, "static/object_ids", (-1,), np.int64).tolist()
+        check_unique_objects(str(path), ids)
         models = _read_texts(file, "static/model_names")
         if len(models) != len(ids):
             raise RecordError(f"{path} names {len(models)} models of {len(ids)} objects")

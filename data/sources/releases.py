@@ -136,7 +136,8 @@ def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: 
             "release",
             code="unreadable-file",
         ) from error
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
+        # A library's own error of a record that a reader does not check.
         outcome = {"problem": f"{getattr(error, 'filename', None) or path}: {error}"}
     else:
         save_scene(scene, scene_path(folder, scene.scene_id))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 import re
 import warnings
@@ -19,7 +20,7 @@ from pydantic_core import from_json
 
 from conf.errors import UserError
 from data.oracle.contacts import group_contacts
-from data.records import Collision, Landing, Scene
+from data.records import ALTERNATIVE, COUNTERFACTUAL, Collision, Landing, Scene
 
 FLOOR_TOLERANCE = 0.05
 """Maximum distance from the floor's plane of a contact with the floor, simulator units."""
@@ -37,6 +38,10 @@ frames that are compared: what is recorded as position may be off the centre of 
 AGREEMENT, MAX_DEVIATION = 0.1, 0.25
 """Relative difference up to which velocities agree with displacements, and the median deviation of
 an object's velocities up to which a factor explains the difference."""
+
+
+COPY = re.compile(r"(?: - Copy| copy(?: \d+)?| \(\d+\))+(?=(?:\.\w+)?$)")
+"""What file managers append to the name of a copy."""
 
 
 class RecordError(UserError):
@@ -71,7 +76,9 @@ def read_layout(path: Path, layout: type[AnyLayout]) -> AnyLayout:
     does not have the layout."""
     kind = "YAML" if path.suffix == ".yaml" else "JSON"
     try:
-        content = (yaml.safe_load if kind == "YAML" else from_json)(path.read_bytes())
+        content = (yaml.safe_load if kind == "YAML" else from_json)(
+            path.read_bytes().removeprefix(codecs.BOM_UTF8)
+        )
     except FileNotFoundError as error:
         raise RecordError(f"{path} is missing", "missing-file") from error
     except (ValueError, yaml.YAMLError) as error:
@@ -94,8 +101,12 @@ def check_layout(where: str, content: Any, layout: type[AnyLayout]) -> AnyLayout
 
 
 def scene_id(*parts: str) -> str:
-    """Return a scene's id, in which characters that are unsafe in file names are replaced."""
-    return "-".join(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)
+    """Return a scene's id. Characters that are unsafe in file names are replaced, and those that
+    would make it the id of another scene's counterfactual or alternative future."""
+    name = "-".join(re.sub(r"[^A-Za-z0-9_.-]+", "_", part) for part in parts)
+    for mark in (COUNTERFACTUAL, ALTERNATIVE):
+        name = name.replace(mark, mark.replace("-", "_"))
+    return name
 
 
 def check_unique_scenes(
@@ -112,15 +123,24 @@ def check_unique_scenes(
         )
     if not paths:
         raise UserError(f"{folder} contains no scene: expected {contents}", code="empty-release")
-    first: dict[str, Path] = {}
+    listed, first = {*paths}, {}
     for path in paths:
-        if (other := first.setdefault(name := id_of(path), path)) is not path:
+        original = Path(*(COPY.sub("", part) for part in path.parts))
+        others = [first.setdefault(key, path) for key in (id_of(path), path.resolve())]
+        others += [original] if original in listed else []
+        if other := next((other for other in others if other != path), None):
             raise UserError(
-                f"{folder} contains scene {name} twice, as {other} and as {path}: "
+                f"{folder} contains scene {id_of(path)} twice, as {other} and as {path}: "
                 "choose a folder that contains each scene once",
                 code="duplicate-scene",
             )
     return paths
+
+
+def check_unique_objects(where: str, ids: Sequence[int]) -> None:
+    """Raises RecordError if two objects of a scene have the same id."""
+    if repeated := [name for name in ids if ids.count(name) > 1]:
+        raise RecordError(f"{where}: two objects have the id {repeated[0]}")
 
 
 def finite_array(values: Any, shape: tuple[int, ...], optional: bool = False) -> np.ndarray:

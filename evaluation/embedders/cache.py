@@ -4,15 +4,17 @@
 
 A file holds the embeddings of one kind of input (frame, query or text) that were made with the same
 settings. It records these settings, and the key in its name is their hash. Each batch is committed,
-so that a killed evaluation resumes after the last batch. All files can be deleted at any time.
+so that a killed evaluation resumes after the last batch. All files can be deleted at any time. In a
+store that this user may not write, new embeddings are kept in a temporary file.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,8 +22,11 @@ import numpy as np
 from tqdm import tqdm
 
 from conf.errors import UserError
+from conf.files import is_writable
 from data.parallel import batched
 from models.fingerprints import settings_key
+
+log = logging.getLogger(__name__)
 
 SCHEMA = """
 PRAGMA page_size = 65536; -- an embedding of 4,096 entries fits in a page
@@ -50,10 +55,22 @@ class EmbeddingCache:
     def __init__(self, root: Path, kind: str, settings: Mapping[str, Any]) -> None:
         self.kind, self._settings = kind, json.dumps(settings)
         self.path = root / f"{kind}-{settings_key(settings)}.sqlite"
-        root.mkdir(parents=True, exist_ok=True)
         with self._explain_damage():
-            self._db = sqlite3.connect(self.path, timeout=60)
+            self._db = self._connect(root)
             self._db.executescript(SCHEMA)
+
+    def _connect(self, root: Path) -> sqlite3.Connection:
+        """Open the file, or a temporary copy of it if it cannot be written."""
+        if is_writable(root) and is_writable(self.path):
+            root.mkdir(parents=True, exist_ok=True)
+            return sqlite3.connect(self.path, timeout=60)
+        log.warning("%s cannot be written: this evaluation keeps its embeddings to itself", root)
+        copy = sqlite3.connect("")
+        if self.path.exists():
+            address = f"{self.path.absolute().as_uri()}?immutable=1"
+            with closing(sqlite3.connect(address, uri=True)) as saved:
+                saved.backup(copy)
+        return copy
 
     def complete(
         self, inputs: Mapping[str, Input], embed: Callable[[list[Input]], np.ndarray], batch: int

@@ -13,6 +13,7 @@ import numpy as np
 import openai
 
 from conf.errors import UserError
+from conf.proxies import proxy_hint
 from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageCommand
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import build_record_schema
@@ -29,7 +30,7 @@ from teacher.servers.server import (
     Messages,
     RequestFields,
     authentication_error,
-    get_api_key,
+    open_client,
 )
 
 log = logging.getLogger(__name__)
@@ -110,6 +111,7 @@ class ServedModel:
             canary = build_messages(blank_sample(first))
             shared_fields = request_fields(student, mode, first.clip)
             async with ServerPool(server, shared_fields, canary) as pool:
+                thoughts: list[Subject] = []
 
                 async def respond(subject: Subject) -> None:
                     messages, fields = await loop.run_in_executor(preparer, prepare, subject)
@@ -123,9 +125,18 @@ class ServedModel:
                             "the cause and run the same command again, which resumes",
                             code="no-response",
                         ) from error
+                    if response.reasoning and not response.text and response.flaw != TRUNCATED:
+                        thoughts.append(subject)
                     save([(subject, restore_thought(response, starts_in_thought))])
 
                 await run_limited(subjects, server.concurrency, respond)
+        if thoughts:
+            log.warning(
+                "%d of %d responses in %s mode are thoughts without an answer, although they are "
+                "complete: if the model does not think, start the server without a reasoning "
+                "parser (--reasoning-parser), which takes responses for thoughts",
+                len(thoughts), len(subjects), mode,
+            )  # fmt: skip
 
 
 def blank_sample(sample: Sample) -> Sample:
@@ -176,9 +187,7 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
     origins = {}
     for url in server.urls:
         try:
-            with openai.OpenAI(
-                base_url=url, api_key=get_api_key(), max_retries=0, timeout=10
-            ) as client:
+            with open_client(openai.OpenAI, url, timeout=10) as client:
                 models = {m.id: m.model_extra or {} for m in client.models.list()}
         except openai.AuthenticationError as error:
             raise authentication_error(url, error) from error
@@ -197,6 +206,7 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
     if not origins:
         lines = [
             f"{url} does not list its models ({_describe(error)}): {_advise(error)}"
+            f"{proxy_hint(url)}"
             for url, error in problems.items()
         ]
         raise UserError("\n".join(lines), code="no-server")

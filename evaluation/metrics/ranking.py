@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from conf.errors import UserError
+from evaluation.metrics.arrays import to_array
 
 
 def target_scores(scores: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -106,7 +107,12 @@ def rank_metrics(
     Raises:
         UserError: The arguments have other shapes or values.
     """
-    scores, columns = np.asarray(scores, np.float32), np.asarray(gold)
+    try:
+        scores, columns = to_array(scores, np.float32), to_array(gold)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise UserError(
+            f"scores or gold are not arrays of numbers: {error}", code="invalid-scores"
+        ) from error
     if scores.ndim != 2 or not scores.size or columns.shape != scores.shape[:1]:
         raise UserError(
             f"scores have the shape {scores.shape} and gold has {columns.shape}: give scores "

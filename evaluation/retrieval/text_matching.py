@@ -11,10 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
+from pathlib import Path
 
 import numpy as np
 
 from conf.errors import UserError
+from conf.files import is_writable
 from conf.runs import lock_folder
 from conf.schema import StudentConfig, TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
@@ -80,9 +82,12 @@ def collect_texts(
     queries: Sequence[RetrievalQuery],
     database: Sequence[FrameRef],
     store: Store,
+    own: Path,
 ) -> dict[str, list[ModelResponse]]:
     """Return a model's responses by mode, in the modes that the routes need: to every frame of the
     database in caption mode, to every query in the other modes.
+
+    They are kept in the store; in the folder `own`, if the store cannot be written.
 
     Raises:
         UserError: Another process collects this model's texts, or the model cannot respond.
@@ -94,12 +99,15 @@ def collect_texts(
         mode: response_settings(mode, "", student, cfg.seed, model.identity, store.identity, None)
         for mode in modes
     }
-    folder = store.folder / TEXTS / settings_key(model.identity)
+    shared = store.folder / TEXTS / settings_key(model.identity)
+    folder = shared if is_writable(shared) else own / TEXTS
     folder.mkdir(parents=True, exist_ok=True)
     responses = {}
     busy = f"{folder} is in use by another process: run this again when that process has ended"
     with lock_folder(folder, busy):
         log = ResponseLog(folder / "texts.jsonl", settings, [*queries, *database])
+        if folder != shared:
+            log.add_from(shared.glob("texts.jsonl"))
         for mode in modes:
             subjects, unit = (database, "frame") if mode == "caption" else (queries, "query")
             # By scene, so that each scene's frames are decoded once.

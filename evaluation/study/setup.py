@@ -92,7 +92,7 @@ def read_item_ids(path: Path) -> list[str]:
         UserError: The file cannot be read, lists no item, or lists an item twice.
     """
     try:
-        lines = [line.strip() for line in path.read_text("utf-8").splitlines() if line.strip()]
+        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
         ids = [str(json.loads(x)["item_id"]) if x.startswith("{") else x for x in lines]
     except OSError as error:
         raise UserError(

@@ -45,8 +45,13 @@ class ScoredPrompt:
     log_probabilities: list[float | None]
 
 
-def parse_completion(completion: Any, n: int) -> list[Response]:
+def parse_completion(completion: Any, n: int, is_constrained: bool = False) -> list[Response]:
     """Convert the first `n` choices of the openai library's chat completion to responses.
+
+    Args:
+        is_constrained: Whether the responses were constrained to a grammar or a schema, which
+            allows no thought: a server's reasoning parser may put the whole response into
+            `reasoning`.
 
     Raises:
         ValueError: The completion has no choices.
@@ -60,6 +65,8 @@ def parse_completion(completion: Any, n: int) -> list[Response]:
         reasoning = _clean(
             getattr(message, "reasoning_content", None) or getattr(message, "reasoning", None)
         )
+        if is_constrained and not text and choice.finish_reason != "length":
+            text, reasoning = reasoning, ""
         responses.append(
             Response(
                 text=text,

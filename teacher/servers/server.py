@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import openai
 
 from conf.errors import UserError
+from conf.proxies import proxy_hint
 from conf.schema import ServersConfig
 from teacher.servers.responses import Response, ScoredPrompt, parse_completion
 
@@ -20,6 +21,7 @@ Messages = list[dict[str, Any]]
 RequestFields = dict[str, Any]
 """Fields of a chat completion request; those outside OpenAI's API are in `extra_body`."""
 Reply = TypeVar("Reply")
+Client = TypeVar("Client", openai.OpenAI, openai.AsyncOpenAI)
 
 MALFORMED_REPLY_ERRORS = (AttributeError, IndexError, TypeError, ValueError)
 """Errors that the openai client or `parse_completion` raises for a reply that does not follow the
@@ -44,6 +46,25 @@ def get_api_key() -> str:
             code="invalid-api-key",
         )
     return key or "none"
+
+
+def open_client(kind: type[Client], url: str, timeout: float) -> Client:
+    """Return a client of a server that repeats no request.
+
+    Raises:
+        UserError: The environment names a proxy for the server that cannot be used, or an API key
+            with invalid characters.
+    """
+    options = {"base_url": url, "api_key": get_api_key(), "max_retries": 0, "timeout": timeout}
+    try:
+        return kind(**options)
+    except Exception as error:  # That of a missing package, or of an address that is none.
+        if hint := proxy_hint(url):
+            raise UserError(f"{url} cannot be reached ({error}){hint}", code="proxy") from error
+        # The proxy is that of other hosts.
+        is_async = kind is openai.AsyncOpenAI
+        transport = openai.DefaultAsyncHttpxClient if is_async else openai.DefaultHttpxClient
+        return kind(**options, http_client=transport(trust_env=False))
 
 
 def authentication_error(url: str, error: openai.APIStatusError) -> UserError:
@@ -90,9 +111,7 @@ class ServerClient:
     def __init__(self, url: str, cfg: ServersConfig) -> None:
         self.url = url
         self.cfg = cfg
-        self.client = openai.AsyncOpenAI(
-            base_url=url, api_key=get_api_key(), max_retries=0, timeout=cfg.timeout
-        )
+        self.client = open_client(openai.AsyncOpenAI, url, cfg.timeout)
         self.in_flight = self.pauses = 0
         self.problem: str | None = None
         self.available_at = self.checked_at = -math.inf
@@ -110,7 +129,7 @@ class ServerClient:
             completion = await self.client.chat.completions.create(
                 model=self.cfg.model, messages=messages, n=n, **fields
             )
-            return parse_completion(completion, n)
+            return parse_completion(completion, n, is_constrained(fields))
 
         return await self._translate_errors(request)
 
@@ -193,14 +212,17 @@ class ServerClient:
             raise RateLimitedError("rate-limited (HTTP 429)", _retry_after(error)) from error
         except openai.APIStatusError as error:
             if error.status_code >= 500 or error.status_code in RETRYABLE_STATUSES:
-                raise RequestError(f"HTTP {error.status_code}") from error
+                hint = proxy_hint(self.url)
+                raise RequestError(f"HTTP {error.status_code}{hint}") from error
             raise RefusedError(error.message) from error
         except (openai.APITimeoutError, TimeoutError) as error:
             raise RequestError(
                 f"no response within {cfg.GROUP}.timeout={cfg.timeout:g} seconds"
+                f"{proxy_hint(self.url)}"
             ) from error
         except openai.APIConnectionError as error:
-            raise RequestError(str(error.__cause__ or error)) from error
+            cause = error.__cause__ or error
+            raise RequestError(f"{cause}{proxy_hint(self.url)}") from error
         except (openai.APIResponseValidationError, *MALFORMED_REPLY_ERRORS) as error:
             raise MalformedReplyError(f"{type(error).__name__}: {error}") from error
 
@@ -214,6 +236,11 @@ class ServerClient:
             f"{served}. Check that the URL belongs to an OpenAI-compatible server and ends in /v1",
             code="unknown-model",
         )
+
+
+def is_constrained(fields: RequestFields) -> bool:
+    """Return whether the fields of a request constrain its response to a grammar or a schema."""
+    return "response_format" in fields or "structured_outputs" in fields.get("extra_body", {})
 
 
 def _retry_after(error: openai.APIStatusError) -> float | None:

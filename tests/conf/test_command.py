@@ -49,6 +49,8 @@ def test_unfinished_run_without_results_accepts_other_settings(folder):
         (["+teacher.sed=1"], 2, "did you mean teacher.seed?  [unknown-key]\n"),
         (["-m", "--cfg", "job"], 2, "[conflicting-options]\n"),
         (["checkpoints=toy.py"], 1, f"error: toy.py/toy/default: Not a directory; {RESUME}"),
+        (["--config-dir", "folder"], 2, "[unsupported-option]\n"),
+        (["-cn", "other"], 2, "[unsupported-option]\n"),
     ],
 )
 def test_failed_command_prints_no_traceback(folder, arguments, status, end):
@@ -56,6 +58,23 @@ def test_failed_command_prints_no_traceback(folder, arguments, status, end):
     assert done.returncode == status
     assert done.stderr.endswith(end)
     assert "Traceback" not in done.stderr
+
+
+def test_a_log_that_cannot_be_opened_is_named(folder):
+    (folder / "checkpoints/toy/default/run.log").mkdir(parents=True)
+    done = run_toy(folder)
+    log = folder.resolve() / "checkpoints/toy/default/run.log"
+    assert (done.returncode, done.stderr) == (1, f"error: {log}: Is a directory; {RESUME}")
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
+def test_closed_streams_change_nothing(folder, closed):
+    done = run_child(["bash", "-c", f"{sys.executable} -m toy {closed}"], cwd=folder)
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
+    run = folder / "checkpoints/toy/default"
+    assert json.loads((run / "metrics.json").read_text())["loss"] == 1
+    assert (run / ".lock").read_bytes() == b""
 
 
 def test_library_error_on_a_full_disk_is_a_failed_write(monkeypatch, tmp_path, capsys):

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import base64
 import json
+import pickle
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from io import BytesIO
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import dynapix
@@ -20,9 +24,9 @@ from conf.compose import compose
 from conf.schema import BuildCommand
 from data.frames.frame_cache import FrameReader
 from data.records import Rationale
-from data.store import MANIFEST
+from data.store import MANIFEST, Store
 from dynapix.__main__ import COMMANDS, overview
-from dynapix.benchmark import _preset_world, preset_names
+from dynapix.benchmark import _preset_world, _reopen, preset_names
 from dynapix.selection import MIN_FAILURES_TO_STOP
 from evaluation.metrics.selection import Choices, build_selection_report
 from evaluation.reporting.tables import selection_table
@@ -182,6 +186,13 @@ def test_letters_texts_and_scores_give_equal_credits(bench) -> None:
     assert set(batches[:-1]) == {7}
 
 
+class Unreadable:
+    """An array of a library that raises an error of its own when it is read."""
+
+    def __array__(self, *_: object, **__: object) -> np.ndarray:
+        raise LookupError("the device is gone")
+
+
 @pytest.mark.parametrize(
     ("bad", "reason"),
     [
@@ -190,6 +201,7 @@ def test_letters_texts_and_scores_give_equal_credits(bench) -> None:
         (lambda: {"A": 1}, "(dict) instead of"),
         (lambda: [0.1, 0.2, 0.7], "[0.1, 0.2, 0.7] (list) instead of"),
         (lambda: [0.1, float("nan"), 0.2, 0.3], "not all finite"),
+        (lambda: Unreadable(), "(Unreadable) instead of"),
     ],
 )
 def test_items_that_fail_are_kept_and_count_as_wrong(bench, bad, reason) -> None:
@@ -353,3 +365,88 @@ def test_items_of_two_benchmarks_and_wrong_batches_are_refused(bench, micro_stor
             lambda item: "A" if item.family == "time" else [0, 0, 0, 1],
             progress=False,
         )
+
+
+TENSORS = {
+    "gradients": lambda rows: torch.tensor(rows, requires_grad=True),
+    "bf16": lambda rows: torch.tensor(rows, dtype=torch.bfloat16, requires_grad=True),
+    "list": lambda rows: list(torch.tensor(rows, requires_grad=True)),
+    "nested": lambda rows: np.array(rows).tolist(),
+}
+
+
+@pytest.mark.parametrize("kind", TENSORS)
+def test_numbers_of_every_kind_are_read(bench, kind) -> None:
+    scores = np.eye(4, dtype=np.float32)
+    result = dynapix.evaluate(
+        bench.selection, lambda item: TENSORS[kind](scores[item.index]), progress=False
+    )
+    assert (result.accuracy.micro.value, result.failures) == (1, [])
+    gold = torch.arange(4)
+    assert dynapix.rank_metrics(TENSORS[kind](scores), gold, ks=[1])["recall@1"] == 1
+    queries, frames = np.ones((len(bench.retrieval), 4)), np.ones((len(bench.database), 4))
+    constant = dynapix.evaluate_retrieval(bench.retrieval, *map(TENSORS[kind], (queries, frames)))
+    assert constant.metrics["tie_rate"] == 1
+
+
+def test_scores_that_are_no_numbers_are_refused() -> None:
+    for scores in ([[1.0], [1.0, 2.0]], "scores", Unreadable):
+        with raises_user_error("invalid-scores"):
+            dynapix.rank_metrics(scores, [0])
+
+
+def test_an_item_or_a_query_that_is_given_twice_is_refused(bench) -> None:
+    items, queries = list(bench.selection), list(bench.retrieval)
+    with raises_user_error("repeated-items", contains=items[1].item_id):
+        dynapix.evaluate([*items, items[1], items[1]], always_a, progress=False)
+    rows, frames = np.ones((len(queries) + 1, 4)), np.ones((len(bench.database), 4))
+    with raises_user_error("repeated-items", contains=queries[0].query_id):
+        dynapix.evaluate_retrieval([*queries, queries[0]], rows, frames)
+
+
+def describe(record: dynapix.Item | dynapix.Query) -> tuple[str, int]:
+    """Run in a worker process."""
+    return record.record.name, int(record.prefix.sum())
+
+
+def test_public_objects_can_be_sent_to_workers(bench) -> None:
+    items = bench.selection[:2]
+    result = dynapix.evaluate(bench.selection, always_a, progress=False)
+    vectors = np.ones((len(bench.retrieval), 4)), np.ones((len(bench.database), 4))
+    scores = dynapix.evaluate_retrieval(bench.retrieval, *vectors)
+    copies = pickle.loads(pickle.dumps((bench, items, result, scores, bench.database[0])))
+    assert (copies[0].name, copies[0].frames) == (bench.name, bench.frames)
+    assert [item.record for item in copies[1]] == [item.record for item in items]
+    assert copies[1][0]._benchmark is copies[0]
+    assert (str(copies[2]), str(copies[3])) == (str(result), str(scores))
+    assert len(pickle.dumps(items[0])) < 10_000
+    assert copies[2].compare(result)[-1].difference == 0
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        records = [items[0], bench.retrieval[0]]
+        assert list(pool.map(describe, records)) == list(map(describe, records))
+
+
+def test_items_of_a_benchmark_that_was_built_again_are_refused(bench, monkeypatch) -> None:
+    pickled = pickle.dumps(bench.selection[0])
+    monkeypatch.setattr(Store, "identity", "another")
+    _reopen.cache_clear()
+    with raises_user_error("different-builds", contains=str(bench.store.folder)):
+        pickle.loads(pickled)
+
+
+def test_home_folder_is_expanded_and_a_broken_link_refused(bench, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "built").symlink_to(bench.store.folder)
+    assert len(dynapix.load("~/built").selection) == len(bench.selection)
+    assert len(dynapix.load("built", store="~").selection) == len(bench.selection)
+    # A folder that is really called "~" is not the home folder.
+    (tmp_path / "~").mkdir()
+    shutil.copytree(bench.store.folder, tmp_path / "~" / "built")
+    monkeypatch.chdir(tmp_path)
+    assert dynapix.load("./~/built").selection[0].record == bench.selection[0].record
+    saved = dynapix.evaluate(bench.selection, always_a, progress=False).save("~/runs/a")
+    assert saved == tmp_path / "runs" / "a"
+    assert len(dynapix.Result.load("~/runs/a", bench).items) == len(bench.selection)
+    (tmp_path / "tiny-above").symlink_to("nowhere")
+    with raises_user_error("broken-link", contains=str(tmp_path / "tiny-above")):
+        dynapix.load("tiny", store="~")

@@ -83,6 +83,21 @@ def test_a_saved_student_gives_the_same_logits(nf4_cfg, micro_store, frames, tmp
     torch.testing.assert_close(one, two, atol=1e-5, rtol=0)
 
 
+def test_adapters_are_saved_without_a_look_at_the_hub(nf4_cfg, tmp_path, monkeypatch) -> None:
+    def look_up(*_: object) -> None:
+        raise AssertionError("a save needs no network")
+
+    monkeypatch.setattr("peft.utils.save_and_load.check_file_exists_on_hf_hub", look_up)
+    model, processor = loading.load_student(nf4_cfg, "fp32", list)
+    loading.save_student(model, processor, tmp_path / "student", "fp32")
+    again, _ = loading.load_trainable(nf4_cfg, "fp32", tmp_path / "student")
+    for each in (model, again):
+        each.peft_config["default"].base_model_name_or_path = "acme/tiny"
+        each.save_pretrained(tmp_path / "saved")
+    names = {path.name for path in (tmp_path / "saved").iterdir()}
+    assert "adapter_model.safetensors" in names
+
+
 @pytest.mark.parametrize("preset", ["qwen3_vl_8b", "qwen3_vl_2b"])
 def test_an_error_names_a_model_that_cannot_be_loaded(preset, monkeypatch, tmp_path) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)

@@ -3,12 +3,15 @@
 import asyncio
 import json
 import threading
+from types import SimpleNamespace
 
 import pytest
 
 from teacher.narrate import narrate_store
 from teacher.server_narrator import request_fields
 from teacher.servers.pool import ServerPool
+from teacher.servers.responses import parse_completion
+from teacher.servers.server import is_constrained
 from tests.teacher.faulty_server import FaultyServer, completion, teacher_at
 from tests.user_errors import raises_user_error
 from tests.waiting import wait_until
@@ -127,3 +130,20 @@ def test_restart_of_a_server_rejects_no_response(store, start_server, caplog):
 def test_repeated_url_counts_once(start_server):
     server = start_server()
     assert len(ServerPool(teacher_at(server, server), {}).servers) == 1
+
+
+@pytest.mark.parametrize(
+    ("fields", "finish", "text", "reasoning"),
+    [
+        ({"response_format": {}}, "stop", "{}", ""),
+        ({"extra_body": {"structured_outputs": {}}}, "stop", "{}", ""),
+        ({"response_format": {}}, "length", "", "{}"),
+        ({"extra_body": {"top_k": 1}}, "stop", "", "{}"),
+    ],
+)
+def test_a_constrained_response_has_no_thought(fields, finish, text, reasoning):
+    message = SimpleNamespace(content=None, reasoning="{}")
+    choices = [SimpleNamespace(message=message, finish_reason=finish)]
+    completion = SimpleNamespace(choices=choices, usage=None)
+    [response] = parse_completion(completion, 1, is_constrained(fields))
+    assert (response.text, response.reasoning) == (text, reasoning)

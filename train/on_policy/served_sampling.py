@@ -118,8 +118,7 @@ class ServedSampler(ResponseSampler):
         self._folder.mkdir(exist_ok=True)
         earlier = self._list_adapters()
         folder = self._folder / f"{self._servers.model}-{uuid.uuid4().hex[:12]}"
-        # By default, PEFT looks up the base on the hub to find out whether its table has grown.
-        model.save_pretrained(folder, save_embedding_layers=False)
+        model.save_pretrained(folder)
         async with self._connect(folder.name) as pool:
             await pool.load_adapter(folder)
             await self._unload(pool, earlier)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -139,3 +140,21 @@ def test_two_processes_may_fill_one_file(tmp_path) -> None:
     first.complete(dict(list(INPUTS.items())[:10]), embed, 64)
     assert model.inputs == [0, 1]
     assert np.array_equal(first.rows(["other/1", "scene-000/0"]), Model()([1, 0]))
+
+
+@pytest.mark.parametrize("has_file", [False, True])
+def test_a_store_that_cannot_be_written_keeps_its_files(tmp_path, monkeypatch, has_file) -> None:
+    folder = tmp_path / "store" / "embeddings"
+    if has_file:
+        filled(folder)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    embeddings = EmbeddingCache(folder, "frame", SETTINGS)
+    model = Model()
+    embeddings.complete(INPUTS | {"new/1": 9001}, model, 64)
+    assert model.inputs == ([9001] if has_file else [*INPUTS.values(), 9001])
+    expected = Model()([*INPUTS.values(), 9001])
+    assert np.array_equal(embeddings.rows([*INPUTS, "new/1"]), expected)
+    after = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert after == before
+    assert folder.exists() == has_file

@@ -110,6 +110,16 @@ def test_constrained_requests_have_the_schema_and_a_seed_per_item(
     assert seeds[0] == seeds[1] != seeds[2]
     assert len(set(seeds[0])) == 2
 
+    # The schema allows no thought, but a reasoning parser may take the record for one.
+    for reply, letter in (
+        ({"content": None, "reasoning": FULL}, "C"),
+        ({"content": "", "reasoning": FULL[:60], "finish_reason": "length"}, None),
+    ):
+        misfiled = start_server(lambda _, reply=reply: reply)
+        respond = responder(config_of(misfiled), frames, THINKING, "constrained")
+        respond(items[:1], (kept := []).extend)
+        assert [score_response(item, "constrained", text).letter for item, text in kept] == [letter]
+
     # Sampling without top_p and top_k is requested explicitly.
     unlimited = replace(STUDENT, temperature=0.7, top_p=1.0, top_k=0)
     responder(config_of(server), frames, unlimited)(items[:1], lambda _: None)
@@ -135,7 +145,9 @@ def test_a_thought_is_not_parsed_as_the_answer(reply, thinking, text, items) -> 
     assert letter == (None if "</think>" not in text and thinking else text[-1])
 
 
-def test_malformed_responses_are_stored_and_scored(items, frames, start_server, tmp_path) -> None:
+def test_malformed_responses_are_stored_and_scored(
+    items, frames, start_server, tmp_path, caplog
+) -> None:
     replies = iter(
         [
             "x" * 1_000_000,
@@ -155,6 +167,8 @@ def test_malformed_responses_are_stored_and_scored(items, frames, start_server, 
     )
     assert [a.letter for a in answers] == [None, None, "B", None, None, None, None, "C"]
     assert answers[4].reason == "cut off"
+    assert "1 of 8 responses in record mode are thoughts" in caplog.text
+    assert "--reasoning-parser" in caplog.text
     stored = open_log(tmp_path, items).responses
     assert [stored[a.item_id, "record"] for a in answers] == answers
 

@@ -215,7 +215,9 @@ def test_a_students_texts_serve_every_matcher(
 
 
 @pytest.mark.slow
-def test_texts_of_a_server_are_requested_once(measure, store, start_server) -> None:
+def test_texts_of_a_server_are_requested_once(
+    measure, store, start_server, monkeypatch, tmp_path
+) -> None:
     server = start_server(lambda _: 500 if len(server.requests) == 6 else RATIONALE)
     served = ServerConfig(
         url=server.url, model="served", concurrency=1, unreachable_timeout=0.2, timeout=10.0
@@ -227,7 +229,11 @@ def test_texts_of_a_server_are_requested_once(measure, store, start_server) -> N
     # A text is requested once, except for the request that failed.
     requests = len(server.requests)
     assert measure("two", **settings)[1] == report
+    # A store that cannot be written has texts to read, and keeps no others.
+    monkeypatch.setattr("os.access", lambda *_: False)
+    assert measure("three", **settings)[1] == report
     assert len(server.requests) == requests
+    assert (tmp_path / "three" / "texts" / "texts.jsonl").exists()
 
 
 def test_a_late_interaction_matcher_is_refused(measure) -> None:

@@ -1,0 +1,78 @@
+"""One reading of a path: `~` and links mean the same in every setting and for every library."""
+
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from conf.compose import adapt_override, compose
+from conf.schema import BuildCommand, ExportStudyCommand, SelectCommand
+from tests.conf.schemas import COMMANDS, path_settings
+from tests.user_errors import raises_user_error
+
+PATHS = [
+    pytest.param(schema, key, id=f"{schema.__name__}-{key}")
+    for schema in COMMANDS
+    for key in path_settings(schema)
+]
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "home"
+
+
+def settings_with(schema: type, key: str, value: str):
+    """Return settings in which every required setting but `key` has some value."""
+    merged = OmegaConf.structured(schema)
+    for missing in OmegaConf.missing_keys(merged):
+        is_group = missing.rpartition(".")[2] in ("benchmark", "teacher", "student", "retriever")
+        OmegaConf.update(merged, missing, {"name": "x"} if is_group else "x")
+    OmegaConf.update(merged, key, value)
+    return OmegaConf.to_object(merged)
+
+
+@pytest.mark.parametrize(("schema", "key"), PATHS)
+def test_every_path_expands_the_home_folder(schema, key, home):
+    group, _, name = key.rpartition(".")
+    for typed, expected in (("~/a", str(home / "a")), ("./~/a", "./~/a"), ("a~", "a~")):
+        settings = settings_with(schema, key, typed)
+        for part in filter(None, group.split(".")):
+            settings = getattr(settings, part)
+        assert getattr(settings, name) == expected
+    assert adapt_override(f"{key}=~/a", schema) == f"{key}='~/a'"
+
+
+@pytest.mark.parametrize(("schema", "key"), PATHS)
+def test_every_path_through_a_broken_link_is_named(schema, key, home):
+    Path("link").symlink_to("nowhere")
+    for path in ("link", "link/below"):
+        problems = settings_with(schema, key, path).check()
+        assert any(p.startswith(f"{key}={path}: link is a link to nowhere") for p in problems)
+
+
+def test_run_folder_is_below_the_expanded_folder_of_runs(home):
+    (home / "ck/select").mkdir(parents=True)
+    (home / "ck/select/mine").symlink_to("nowhere")
+    overrides = ["checkpoints=~/ck", "run=mine"]
+    with raises_user_error("broken-link", contains=str(home / "ck/select/mine")):
+        compose("evaluation.select", SelectCommand, overrides)
+    (home / "ck/select/new").mkdir()
+    (home / "ck/select/new/run.log").symlink_to("nowhere/log")
+    with raises_user_error("broken-link", contains="new/run.log"):
+        compose("evaluation.select", SelectCommand, ["checkpoints=~/ck", "run=new"])
+    (home / "ck/export_study").symlink_to("nowhere")
+    with raises_user_error("broken-link", contains=str(home / "ck/export_study")):
+        compose("evaluation.study.export", ExportStudyCommand, [*overrides[:1], "run=~/ck/study/a"])
+
+
+@pytest.mark.parametrize(
+    ("override", "code"),
+    [("run=~", "invalid-setting"), ("run=~/a", "invalid-setting"),
+     ("hydra.job.chdir=true", "invalid-setting")],
+)  # fmt: skip
+def test_paths_that_no_run_can_have_are_refused(home, override, code):
+    with raises_user_error(code):
+        compose("data.build", BuildCommand, [override])
