@@ -93,7 +93,7 @@ def assert_spans_are_valid(text: str) -> None:
 
 
 def test_recall_and_precision_on_unseen_sentences() -> None:
-    """The rules were not tuned on these sentences, which were written independently of them."""
+    """The sentences were written by somebody who had not seen the rules."""
     positive, negative = sentences("unseen_positive"), sentences("unseen_negative")
     detected = sum(bool(find_numbers(sentence)) for sentence in positive)
     false_alarms = sum(bool(find_numbers(sentence)) for sentence in negative)
