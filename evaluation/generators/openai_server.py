@@ -205,8 +205,8 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
         origins[url] = {"root": served.get("root"), "parent": parent}
     if not origins:
         lines = [
-            f"{url} does not list its models ({_describe(error)}): {_advise(error)}"
-            f"{proxy_hint(url)}"
+            f"{url} does not list its models ({_describe(error)})"
+            f"{proxy_hint(url) or f': {_advise(error)}'}"
             for url, error in problems.items()
         ]
         raise UserError("\n".join(lines), code="no-server")
