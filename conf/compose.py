@@ -10,10 +10,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from difflib import SequenceMatcher
 from importlib.resources import files
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 import yaml
 from hydra import compose as hydra_compose
@@ -72,6 +72,8 @@ REMOVED_KEYS: dict[str, str] = {
     "train.mine_margin": "leave it out: hard negatives are the benchmark's",
     "benchmark.retrieval.standard": "leave it out: the test queries of retrieval.builders are the "
     "standard test",
+    "benchmark.selection.observation": "leave it out: event items observe 21 frames and window "
+    "items 16",
     "frames_gb": "use frames=none: frames are then rendered when they are needed",
     "parallel": "leave it out: workers are processes of this machine",
 }
@@ -93,7 +95,7 @@ def compose(command: str, schema: type, overrides: list[str]) -> Any:
     """Compose the settings of one run as an instance of `schema`. Raises SettingsError."""
     with open_hydra(command, schema):
         refuse_empty_dicts(overrides)
-        cfg = compose_config(command, [allow_new_key(o, schema) for o in overrides])
+        cfg = compose_config(command, overrides)
         with open_dict(cfg):
             del cfg["hydra"]
         return validate_settings(cfg, schema)
@@ -111,21 +113,6 @@ def refuse_empty_dicts(overrides: list[str]) -> None:
                 f"{override.input_line}: an empty dict changes nothing, because the entries of the "
                 "preset stay: set each entry that should change, as in KEY.NAME=VALUE"
             )
-
-
-def allow_new_key(override: str, schema: type) -> str:
-    """Return an override with which Hydra accepts a new key of a dict of values, such as
-    `benchmark.selection.observation.window`: `++KEY=VALUE` instead of `KEY=VALUE`."""
-    key = override.partition("=")[0]
-    for name in key.split("."):
-        hint = get_type_hints(schema).get(name)
-        if get_origin(hint) is dict and not is_dataclass(get_args(hint)[1]):
-            return f"++{override}"
-        groups = [t for t in (hint, *get_args(hint)) if is_dataclass(t)]
-        if not groups:
-            return override
-        schema = groups[0]
-    return override
 
 
 def check_run_settings(command: str, schema: type, overrides: list[str]) -> None:

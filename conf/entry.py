@@ -22,7 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from conf.compose import allow_new_key, check_run_settings, config_name, register, validate_settings
+from conf.compose import check_run_settings, config_name, register, validate_settings
 from conf.errors import SettingsError, UserError
 from conf.failures import report_failures
 from conf.files import write_json
@@ -60,7 +60,6 @@ def command(name: str, schema: type) -> Callable[[Main], Callable[[], None]]:
 def _start(name: str, schema: type, main: Main) -> None:
     """Read the command line: print the help, run a sweep, or check all settings and start Hydra."""
     register(name, schema)
-    sys.argv[1:] = [allow_new_key(argument, schema) for argument in sys.argv[1:]]
     args = get_args_parser().parse_intermixed_args()
     # Hydra's own parser accepts overrides only behind the options.
     options = [argument for argument in sys.argv[1:] if argument not in args.overrides]

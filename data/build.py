@@ -27,7 +27,6 @@ from data.items.cells import (
 )
 from data.items.database import make_databases
 from data.items.queries import BUILDERS
-from data.items.recipes import OBSERVATIONS
 from data.oracle.displacement import visible_positions
 from data.parallel import Workers
 from data.records import COUNTERFACTUAL, SPLITS, Scene, SelectionItem
@@ -213,10 +212,6 @@ def check_quota_names(cfg: BenchmarkConfig) -> None:
             f"selection.{name}": (quotas, subtypes[name])
             for name, quotas in family_quotas(cfg).items()
         },
-        "selection.observation": (
-            cfg.selection.observation,
-            (*OBSERVATIONS, *(s for family in OBSERVATIONS for s in subtypes[family])),
-        ),
         "retrieval.builders": (cfg.retrieval.builders, [str(b) for b in BUILDERS]),
     }
     problems = []

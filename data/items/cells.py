@@ -12,7 +12,7 @@ import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, replace
+from dataclasses import asdict, astuple
 from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
@@ -62,7 +62,7 @@ def make_items_and_queries(
     quotas = {name: _with_reserve(cfg, name, quota) for name, quota in cell_quotas(cfg).items()}
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
     is_balanced = cfg.distractors == "balanced"
-    recipe = cfg.item_recipe, cfg.suite, cfg.distractors, cfg.selection.observation
+    recipe = cfg.item_recipe, cfg.suite, cfg.distractors
     if cfg.simulator != "bullet":
         # A release may have changed since a killed build, while its scenes keep their ids.
         every = [f"{SCENES_FOLDER}/{name}.npz" for ids in scene_ids.values() for name in ids]
@@ -125,13 +125,9 @@ def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) ->
 
 def cell_recipe(cfg: BenchmarkConfig, family: str, subtype: str) -> Recipe:
     """Return the recipe of a cell of a benchmark's suite."""
-    observation = cfg.selection.observation
-    if cfg.item_recipe == "dynapix":
-        return recipes.make_recipe(family, subtype, observation)
-    if cfg.item_recipe == "tracks":
-        recipe = recipes.make_recipe(family, subtype, observation, second=None)
-        return replace(recipe, suite=cfg.suite)
-    return transfer.make_transfer_recipe(cfg.item_recipe, cfg.suite, family, subtype)
+    if cfg.item_recipe in transfer.CELLS:
+        return transfer.make_transfer_recipe(cfg.item_recipe, cfg.suite, family, subtype)
+    return recipes.make_recipe(cfg.suite, family, subtype)
 
 
 def list_subtypes(cfg: BenchmarkConfig) -> Mapping[str, tuple[str, ...]]:
