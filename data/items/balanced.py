@@ -12,6 +12,7 @@ easy items are the farthest.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
@@ -30,7 +31,7 @@ from data.items.futures import (
     scene_with_states,
     simulate_futures,
 )
-from data.items.pickers import CellInputs, Recipe, Timing, new_item
+from data.items.pickers import DistractorPicker, Recipe, Timing, new_item
 from data.items.scores import Balance, CandidateFrames, render_small
 from data.oracle.displacement import frame_displacements
 from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
@@ -50,24 +51,19 @@ LARGEST_SHARE = 0.9
 """Maximum time to the earlier of two moments, as a share of the time to the later one."""
 
 
-@dataclass
-class BalancedPicker:
+@dataclass(kw_only=True)
+class BalancedPicker(DistractorPicker):
     """Makes the balanced items of one cell and one split. It uses the timings and the subjects of
     the paper's recipe, but not its distractors.
 
     Attributes:
         folder: The store or partial build in which alternative futures are saved.
-        dropped: Number of timings for which no choice of distractors was suitable.
     """
 
-    cell: CellInputs
-    split: str
-    rng: np.random.Generator
     world: WorldConfig
     folder: Path
-    dropped: int = 0
     balance: Balance = field(init=False)
-    _tries: tuple[str, int] = ("", 0)
+    _tries: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         self.balance = Balance(self.rng)
@@ -158,9 +154,8 @@ class BalancedPicker:
         moving = moving_objects(scene, timing.stop, about)
         if not moving or shift < self.cell.min_displacement:
             return []
-        tried, tries = self._tries
-        self._tries = scene.scene_id, tries + 1 if tried == scene.scene_id else 1
-        if self._tries[1] > TRIES:
+        self._tries[scene.scene_id] += 1
+        if self._tries[scene.scene_id] > TRIES:
             return []
         if family != "time":
             return joint_groups(scene, timing.stop, timing.target, moving)

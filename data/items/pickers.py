@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -80,24 +80,12 @@ class Recipe:
     suite: str = "dynapix"
 
 
-class Picker(Protocol):
-    """Chooses distractors. `dropped` counts the timings for which too few are suitable."""
-
-    dropped: int
-
-    def make_item(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
-    ) -> SelectionItem | None:
-        """Return an item whose first candidate is the target, or None if too few distractors are
-        suitable."""
-        ...
-
-
 @dataclass
 class DistractorPicker:
     """Takes the first distractors of the recipe's pools that differ visibly from each other.
 
-    Cross-scene distractors come from the scenes of the split.
+    Cross-scene distractors come from the scenes of the split. `dropped` counts the timings for
+    which too few distractors are suitable.
     """
 
     cell: CellInputs
@@ -108,6 +96,8 @@ class DistractorPicker:
     def make_item(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
     ) -> SelectionItem | None:
+        """Return an item whose first candidate is the target, or None if too few distractors are
+        suitable."""
         pools = recipe.pools(scene, timing, about, self)
         chosen = [Candidate(scene.scene_id, timing.target)]
         for k, (pool, count) in enumerate(pools):
@@ -189,7 +179,9 @@ def fill_quota(
     cell_name: str,
     recipe: Recipe,
     cell: CellInputs,
-    make_picker: Callable[[CellInputs, str, np.random.Generator], Picker] = DistractorPicker,
+    make_picker: Callable[
+        [CellInputs, str, np.random.Generator], DistractorPicker
+    ] = DistractorPicker,
 ) -> tuple[list[SelectionItem], int]:
     """Make the items of one cell, at most one per scene, from scenes in a seeded order.
 

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from conf.schema import PartConfig, WorldConfig
+from conf.schema import WorldConfig
 from data.records import Landing, SceneObject
-from data.sim.parts import part_box
+from data.sim.parts import world_boxes
 from data.sim.shapes import CUBE_HALF, RADIUS, half_height
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ class Body:
     """An object and its initial state: ground position, yaw in radians, ground velocity."""
 
     object: SceneObject
-    position: Sequence[float] | np.ndarray
-    yaw: float
+    position: Sequence[float] | np.ndarray = (0.0, 0.0)
+    yaw: float = 0.0
     velocity: Sequence[float] | np.ndarray = (0.0, 0.0)
     height: float | None = None
     """Initial height of the centre of a body in the air; None for a body on the floor."""
@@ -58,17 +58,17 @@ class Motion:
     Attributes:
         states: (F, N, 13) positions, quaternions, linear and angular velocities as in `Scene`.
         touching: The frames in which each pair touches.
-        touching_at_start: Whether any two bodies, or a body and a part, touch at the first frame.
-            Such a motion is not simulated: it has the first frame only.
         landings: Landings, on the floor or on a part, of bodies that start in the air.
         is_rejected: Whether the simulation stopped because the caller rejected its contacts.
+        touching_at_start: Whether any two bodies, or a body and a part, touch at the first frame.
+            Such a motion is not simulated: it has the first frame only.
     """
 
     states: np.ndarray
     touching: Touching
-    touching_at_start: bool
     landings: tuple[Landing, ...] = ()
     is_rejected: bool = False
+    touching_at_start: bool = False
 
     @property
     def positions(self) -> np.ndarray:
@@ -131,8 +131,7 @@ class Simulator:
             self._bullet.getClosestPoints(a, b, TOUCHING)
             for a, b in chain(combinations(handles, 2), product(handles, fixed[1:]))
         ):
-            states = self._state(handles)[None]
-            return Motion(states, {}, touching_at_start=True)
+            return Motion(self._state(handles)[None], {}, touching_at_start=True)
         frames = frames or world.physics.frames
         recorded = np.zeros((frames, len(bodies), 13))
         recorded[0] = self._state(handles)
@@ -161,13 +160,7 @@ class Simulator:
             if pairs and (rejected := is_rejected(touching)):
                 recorded = recorded[: frame + 1]
                 break
-        return Motion(
-            recorded,
-            dict(touching),
-            touching_at_start=False,
-            landings=tuple(landings),
-            is_rejected=rejected,
-        )
+        return Motion(recorded, dict(touching), tuple(landings), rejected)
 
     def simulate_branches(
         self,
@@ -222,23 +215,15 @@ class Simulator:
             solverResidualThreshold=0,
             deterministicOverlappingPairs=1,
         )
-        floor = bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))
-        bullet.changeDynamics(
-            floor,
-            -1,
-            lateralFriction=physics.floor_friction,
-            restitution=physics.floor_restitution,
-        )
-        return [floor, *(self._add_part(part) for part in world.parts.values())]
-
-    def _add_part(self, part: PartConfig) -> int:
-        bullet, box = self._bullet, part_box(part)
-        form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=box.half)
-        handle = bullet.createMultiBody(0, form, -1, box.position, box.quaternion)
-        bullet.changeDynamics(
-            handle, -1, lateralFriction=part.friction, restitution=part.restitution
-        )
-        return handle
+        surfaces = [(physics.floor_friction, physics.floor_restitution)]
+        fixed = [bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))]
+        for part, box in zip(world.parts.values(), world_boxes(world), strict=True):
+            form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=box.half)
+            fixed.append(bullet.createMultiBody(0, form, -1, box.position, box.quaternion))
+            surfaces.append((part.friction, part.restitution))
+        for handle, (friction, restitution) in zip(fixed, surfaces, strict=True):
+            bullet.changeDynamics(handle, -1, lateralFriction=friction, restitution=restitution)
+        return fixed
 
     def _add_body(self, body: Body, world: WorldConfig) -> int:
         height = body.height

@@ -17,7 +17,8 @@ from data.records import COLORS, MATERIALS, SceneObject
 from data.sim import starts
 from data.sim.camera import Camera
 from data.sim.parts import world_boxes
-from data.sim.starts import RejectedError, Sample, SizedObject
+from data.sim.physics import Body
+from data.sim.starts import RejectedError, Sample
 
 STARTS = {"slide": starts.slide, "throw": starts.throw, "strike": starts.strike}
 """Functions that sample the initial states of objects, by `start.kind` of the world."""
@@ -99,15 +100,16 @@ def check_view(world: WorldConfig, camera: Camera) -> None:
             )
 
 
-def sample_objects(rng: np.random.Generator, world: WorldConfig) -> list[SizedObject]:
-    """Sample the number of objects in a scene, their distinct appearances and their sizes."""
+def sample_objects(rng: np.random.Generator, world: WorldConfig) -> list[Body]:
+    """Sample the number of objects in a scene, their distinct appearances and their sizes. The
+    bodies have no places yet."""
     settings = world.objects
     every = [SceneObject(*each) for each in product(settings.shapes, MATERIALS, COLORS)]
     count = int(rng.integers(settings.min_count, settings.max_count + 1))
     chosen = [every[k] for k in rng.choice(len(every), count, replace=False)]
     low, high = settings.scale
     scales = rng.uniform(low, high, count).tolist() if low < high else [low] * count
-    return [SizedObject(*each) for each in zip(chosen, scales, strict=True)]
+    return [Body(each, scale=scale) for each, scale in zip(chosen, scales, strict=True)]
 
 
 def check_sample(sample: Sample, world: WorldConfig) -> None:
