@@ -101,10 +101,9 @@ def scene_id(*parts: str) -> str:
 def check_unique_scenes(
     folder: Path, paths: list[Path], id_of: Callable[[Path], str], contents: str
 ) -> list[Path]:
-    """Check that a release has scenes and none of them twice, and return `paths`, one per scene.
-
-    `id_of` returns the scene id of a path, and `contents` describes what the folder should contain.
-    """
+    """Return `paths`, one per scene, of a release. Raises UserError if there are none, or if
+    `id_of`, which returns the scene id of a path, is equal for two. `contents` describes what the
+    folder should contain."""
     if not folder.is_dir():
         raise UserError(
             f"folder {folder} does not exist: choose the folder that contains {contents}",
@@ -124,11 +123,8 @@ def check_unique_scenes(
 
 
 def finite_array(values: Any, shape: tuple[int, ...], optional: bool = False) -> np.ndarray:
-    """Return numbers as an array of `shape`, in which -1 stands for any length.
-
-    With `optional`, non-finite numbers may stand for what is not recorded. Raises ValueError if
-    they do not fit the shape, or not all of them are finite numbers.
-    """
+    """Return numbers as an array of `shape`, in which -1 stands for any length. Raises ValueError
+    if they do not fit it, or if some are non-finite, unless `optional` permits these."""
     try:
         array = np.asarray(values, np.float64).reshape(shape)
     except (TypeError, ValueError) as error:
@@ -142,8 +138,8 @@ def finite_array(values: Any, shape: tuple[int, ...], optional: bool = False) ->
 def find_contacts(
     touches: Iterable[tuple[int, Sequence[int]]], count: int, fps: float
 ) -> tuple[Collision, ...]:
-    """Return the contacts of two of `count` objects, from the frames in which pairs touch. Another
-    index stands for what is no object, such as the floor."""
+    """Return the contacts of `count` objects, from the frames in which pairs of indices touch.
+    Another index stands for what is no object, such as the floor."""
     touching: dict[tuple[int, int], list[int]] = defaultdict(list)
     for frame, pair in touches:
         one, other = sorted(pair)
