@@ -19,9 +19,8 @@ PENUMBRA = 0.06
 _SPREAD = 2 * (0.85 * RADIUS) ** 2
 """Twice the variance of a shadow's Gaussian profile at scale 1, squared simulator units."""
 _REACH = 1.0
-"""Half the side of the square in which a shadow is computed at scale 1, simulator units. At
-distances d above 0.984 a shadow is below float32 precision:
-SHADOW_DEPTH * exp(-d^2 / _SPREAD) < 2^-25."""
+"""Radius at scale 1 within which a shadow is computed, simulator units. At distances d above 0.984
+a shadow is below float32 precision: SHADOW_DEPTH * exp(-d^2 / _SPREAD) < 2^-25."""
 
 
 class Floor:
@@ -44,28 +43,23 @@ class Floor:
             points[..., 0] = points[:, :1, 0]
         self._x, self._y = np.moveaxis(points, -1, 0).astype(np.float32).astype(float)
 
-    def shade(
-        self, positions: np.ndarray, scales: Sequence[float], boxes: np.ndarray
-    ) -> np.ndarray:
-        """Compute the brightness of the floor with the objects' shadows.
+    def shade(self, positions: np.ndarray, scales: Sequence[float]) -> np.ndarray:
+        """Compute the brightness of the floor with the shadows of objects.
 
         Args:
             positions: (N, 3) positions of the objects.
             scales: (N,) sizes of the objects.
-            boxes: (N, 4) bounding boxes of their shadows, from `shadow_boxes`.
 
         Returns:
             (H, W) float32 factors for the colour of the floor.
         """
         shade = self._lit.copy()
-        centres = self._shadow_centres(positions, scales).tolist()
-        for (x, y), scale, (left, top, right, bottom) in zip(
-            centres, scales, boxes.tolist(), strict=True
-        ):
-            if left < right and top < bottom:
-                box = np.s_[top:bottom, left:right]
-                squares = (self._y[box] - y) ** 2 + (self._x[box] - x) ** 2
-                shade[box] *= 1 - SHADOW_DEPTH * np.exp(-squares / (_SPREAD * scale**2))
+        slant = 0.5 * RADIUS * np.asarray(self._light[:2]) / self._light[2]
+        centres = positions[:, :2] - slant * np.asarray(scales)[:, None]
+        for (x, y), scale in zip(centres.tolist(), scales, strict=True):
+            squares = (self._y - y) ** 2 + (self._x - x) ** 2
+            near = squares < (_REACH * scale) ** 2
+            shade[near] *= 1 - SHADOW_DEPTH * np.exp(-squares[near] / (_SPREAD * scale**2))
         return shade
 
     def paint(self, shade: np.ndarray, floor: float, background: float) -> np.ndarray:
@@ -78,31 +72,6 @@ class Floor:
         channel = shade * floor
         channel[self._is_sky] = background
         return channel
-
-    def shadow_boxes(self, positions: np.ndarray, scales: Sequence[float]) -> np.ndarray:
-        """Compute the bounding boxes of the shadows in the image.
-
-        Args:
-            positions: (..., N, 3) positions of the objects.
-            scales: (N,) sizes of the objects.
-
-        Returns:
-            (..., N, 4) left, top, right and bottom in pixels; right and bottom are exclusive.
-        """
-        ground = np.zeros(positions.shape)
-        ground[..., :2] = self._shadow_centres(positions, scales)
-        corners = _REACH * np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]])
-        corners = np.asarray(scales)[:, None, None] * corners
-        # `project` places a corner behind the camera far below the image; the box is then clipped.
-        pixels, _ = self._camera.project(ground[..., None, :] + corners)
-        size = self._camera.width, self._camera.height
-        boxes = np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2) + 1], axis=-1)
-        return np.clip(boxes, 0, [*size, *size]).astype(int)
-
-    def _shadow_centres(self, positions: np.ndarray, scales: Sequence[float]) -> np.ndarray:
-        """Return the (..., N, 2) centres of the shadows of objects at (..., N, 3) positions."""
-        slant = 0.5 * RADIUS * np.asarray(self._light[:2]) / self._light[2]
-        return positions[..., :2] - slant * np.asarray(scales)[:, None]
 
     def _part_shade(self, points: np.ndarray, world: WorldConfig) -> np.ndarray:
         """Return the light (H, W) that the world's parts leave on the floor: 1 outside shadows."""
