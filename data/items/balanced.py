@@ -131,11 +131,9 @@ class BalancedPicker(DistractorPicker):
     def _candidate_frames(
         self, scene: Scene, name: str, stop: int, moments: Sequence[int], futures: np.ndarray
     ) -> tuple[Scene, list[int]]:
-        """Return the frames from which candidates are chosen as a scene, and their moments.
-
-        They are the last observed frame, the scene's own frame at each moment (first the target),
-        and all futures at the first moment, then at the second.
-        """
+        """Return the frames from which candidates are chosen as a scene, and their moments: the
+        last observed frame, the scene's own frame at each moment (first the target), and all
+        futures at the first moment, then at the second."""
         own = scene_states(scene)[[stop, *moments]]
         others = [futures[:, moment - stop] for moment in moments]
         frames = scene_with_states(scene, name, np.concatenate([own, *others]), self.world)
@@ -180,11 +178,8 @@ class BalancedPicker(DistractorPicker):
 
 
 def _choices(moments: int, futures: int) -> np.ndarray:
-    """Return all choices of candidates (T, 4) as indices of the frames of `_candidate_frames`; the
-    first is the target.
-
-    With two moments, a choice contains the scene's own and one other future, each at both moments.
-    """
+    """Return all choices of candidates (T, 4) as indices of the frames of `_candidate_frames`, the
+    target first. With two moments, a choice has the scene's own and one other future at both."""
     first = TARGET + moments
     if moments == 1:
         triples = list(combinations(range(first, first + futures), 3))
