@@ -63,11 +63,8 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
 def measure_shortcuts(
     items: list[SelectionItem], scores: np.ndarray, store: Store, blind: bool
 ) -> pd.DataFrame:
-    """Return the accuracy of each shortcut on the items of the test split, by category.
-
-    Args:
-        scores: (N, S, 4) scores of the items' candidates.
-    """
+    """Return the accuracy of each shortcut on the items of the test split, by category, given the
+    scores (N, S, 4) of the items' candidates."""
     answers = np.array([item.answer for item in items])
     right = pd.DataFrame(score_simple_strategies(scores, answers), columns=list(SIMPLE))
     right[LOGISTIC] = score_logistic_model(items, scores, answers)

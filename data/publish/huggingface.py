@@ -246,7 +246,6 @@ def summarize(shards: Sequence[Shard]) -> pd.DataFrame:
     """Return the rows, size in MB and number of files of each split."""
     import pandas as pd
 
-    files = pd.DataFrame(shards)
-    splits = files.groupby(["configuration", "split"], sort=False)
+    splits = pd.DataFrame(shards).groupby(["configuration", "split"], sort=False)
     summary = splits.agg(rows=("rows", "sum"), MB=("bytes", "sum"), files=("path", "size"))
     return summary.assign(MB=summary["MB"] / 1e6)

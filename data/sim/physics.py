@@ -118,13 +118,9 @@ class Simulator:
         frames: int | None = None,
         is_rejected: Callable[[Touching], bool] = lambda touching: False,
     ) -> Motion:
-        """Simulate bodies in a world. Equal arguments give bit-identical results.
-
-        Args:
-            frames: Number of frames; that of the world by default.
-            is_rejected: Whether the contacts so far make the motion useless. The simulation then
-                stops, and the result is the motion up to this frame.
-        """
+        """Simulate bodies in a world, by default for its number of frames. Equal arguments give
+        bit-identical results. `is_rejected` says whether the contacts so far make the motion
+        useless: the simulation then stops, and the result is the motion up to this frame."""
         fixed = self._reset(world)
         handles = [self._add_body(body, world) for body in bodies]
         if any(
@@ -148,9 +144,7 @@ class Simulator:
                     if point[1] not in fixed and point[2] not in fixed and point[9] > 0:
                         pairs.add(tuple(sorted(map(handles.index, point[1:3]))))
                 for k in list(in_air):
-                    points = chain.from_iterable(
-                        list_contacts(surface, handles[k]) for surface in fixed
-                    )
+                    points = (p for surface in fixed for p in list_contacts(surface, handles[k]))
                     if any(point[9] > 0 for point in points):
                         in_air.remove(k)
                         landings.append(Landing(frame, k))
@@ -171,18 +165,13 @@ class Simulator:
         world: WorldConfig,
         frames: int,
     ) -> np.ndarray:
-        """Simulate objects from one state with several choices of their velocities.
-
-        Args:
-            states: (N, 13) states of the objects, such as those at a frame of a scene.
-            velocities: (K, N, 6) linear and angular velocities of each branch, instead of those in
-                `states`.
-            frames: Number of frames, of which the first has the given state.
+        """Simulate objects from states (N, 13) with several choices of their velocities: linear and
+        angular ones (K, N, 6) for K branches.
 
         Returns:
-            (K, frames, N, 13) states, bit-identical for equal arguments. A branch with the
-            velocities of `states` is close to an uninterrupted simulation, but not equal, because
-            Bullet keeps contacts from step to step.
+            (K, frames, N, 13) states, the given ones first, bit-identical for equal arguments. A
+            branch with the velocities of `states` is close to an uninterrupted simulation, but not
+            equal, because Bullet keeps contacts from step to step.
         """
         self._reset(world)
         handles = [
@@ -226,9 +215,8 @@ class Simulator:
         return fixed
 
     def _add_body(self, body: Body, world: WorldConfig) -> int:
-        height = body.height
-        if height is None:
-            height = half_height(body.object.shape, body.scale)
+        on_floor = half_height(body.object.shape, body.scale)
+        height = on_floor if body.height is None else body.height
         turn = self._bullet.getQuaternionFromEuler([0, 0, body.yaw])
         state = [*body.position, height, *turn, *body.velocity, 0.0, 0.0, 0.0, 0.0]
         return self._add(body.object, body.scale, state, world)

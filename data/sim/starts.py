@@ -61,9 +61,9 @@ class Sample:
 def slide(
     objects: Sequence[Body], world: WorldConfig, camera: Camera, rng: np.random.Generator
 ) -> Sample:
-    """Sample bodies whose first body slides into the view.
+    """Sample bodies of which the first slides into the view.
 
-    Each further body is placed so that it collides with an earlier body, until the scene has its
+    Each further body is placed so that it collides with an earlier one, until the scene has its
     intended number of collisions; the others rest and touch no other body. A placement by which a
     pair touches at the start or collides twice is rejected.
     """
@@ -110,18 +110,13 @@ class _Slide:
         self, bodies: list[Body], motion: Motion, added: Body, goal: int
     ) -> tuple[list[Body], Motion] | None:
         """Add a body that collides with another body or, once there are `goal` collisions, with
-        none.
-
-        Returns:
-            All bodies and their motion, or None if the sampled body does not fit.
-        """
+        none. Return all bodies and their motion, or None if the sampled body does not fit."""
         is_colliding = len(motion.touching) < goal
         body = (self._colliding if is_colliding else self._resting)(added, motion)
         if body is None:
             return None
         extended = [*bodies, body]
-        # A body at rest usually stays clear of the others, and then need not be simulated with
-        # them.
+        # A body at rest that stays clear of the others need not be simulated with them.
         combined = None if is_colliding else self._combine(motion, body)
         most = self.world.start.max_collisions or math.inf
 
@@ -130,9 +125,8 @@ class _Slide:
             is_repeated = has_repeated(contacts, self.world.physics.fps)
             return is_repeated or len(contacts) > most or (collides and not is_colliding)
 
-        result = combined or shared_simulator().simulate(
-            extended, self.world, is_rejected=is_rejected
-        )
+        simulate = shared_simulator().simulate
+        result = combined or simulate(extended, self.world, is_rejected=is_rejected)
         if result.touching_at_start or result.is_rejected:
             return None
         collides = any(len(bodies) in pair for pair in result.touching)
@@ -267,12 +261,8 @@ def _near_middle(world: WorldConfig, rng: np.random.Generator) -> np.ndarray:
 def is_on_screen(place: np.ndarray, height: float, camera: Camera) -> bool:
     """Return whether a point above a ground position is on screen, with a margin of `MARGIN`."""
     pixel, depth = camera.project(np.array([*place, height]))
-    margin = round(MARGIN * camera.magnification)
-    return bool(
-        depth > 1
-        and margin < pixel[0] < camera.width - margin
-        and margin < pixel[1] < camera.height - margin
-    )
+    margin, size = round(MARGIN * camera.magnification), np.array([camera.width, camera.height])
+    return bool(depth > 1 and ((margin < pixel) & (pixel < size - margin)).all())
 
 
 def length(vector: np.ndarray) -> float:

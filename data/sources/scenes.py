@@ -68,9 +68,8 @@ def scene_prefix(cfg: BenchmarkConfig) -> str:
 def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, list[Element]]:
     """Assign a random share of every `SPLIT_BLOCK` scenes to the test split; the order is kept.
 
-    A scene's split depends only on its index, the seed and the test share, so that a scene has the
-    same split in a smaller and in a larger benchmark, unless a split would be empty: it then gets a
-    scene of the other one.
+    A scene's split depends only on its index, the seed and the test share, not on the number of
+    scenes, unless a split would be empty: it then gets a scene of the other one.
     """
     splits: dict[str, list[Element]] = {split: [] for split in SPLITS}
     for first in range(0, len(scenes), SPLIT_BLOCK):
@@ -95,8 +94,7 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
 
 
 def keep_test_scenes(cfg: BenchmarkConfig, scene_ids: dict[str, list[str]]) -> dict[str, list[str]]:
-    """Keep `cfg.test_scenes` random scenes of the test split, in the same order; nothing uses the
-    others."""
+    """Keep `cfg.test_scenes` random scenes of the test split, in the same order."""
     test = scene_ids["test"]
     order = named_rng(cfg.seed, "test scenes").permutation(len(test))
     chosen = {*order[: cfg.test_scenes].tolist()}

@@ -171,10 +171,9 @@ def reconcile_velocities(scene: Scene, path: Path) -> Scene:
     """Return a scene whose velocities agree with its positions and its frame rate.
 
     Velocities of another unit of time are multiplied by the factor that explains the difference,
-    with the warning `RescaledVelocities`; without such a factor, the record is invalid. Where an
-    object lacks velocities, they are the central differences of its positions or of its
-    orientations: if some are non-finite, or if all are zero although it moves, as a simulator
-    records them for what it does not simulate as a rigid body.
+    with the warning `RescaledVelocities`; without such a factor, RecordError is raised. An object
+    lacks velocities if some are non-finite, or if all are zero although it moves, as a simulator
+    records them for what is no rigid body. They are then derived from positions or orientations.
     """
     norms = np.linalg.norm(scene.quaternions, axis=-1)
     if (wrong := np.argwhere(np.abs(norms - 1) > 0.01)).size:
@@ -217,9 +216,8 @@ def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
     """Return the factor by which velocities are to be multiplied to agree with the displacements
     between frames, and how much those of each object still deviate (N,), as a share.
 
-    Compared are central differences, in frames in which an object moves, hardly turns, and does not
+    Frames are compared in which an object moves, hardly turns, has finite velocities, and does not
     begin or end a contact. If there are few, the factor is 1; an object with few deviates by 0.
-    Velocities that are NaN are left out.
     """
     moved, turned = (rates[1:-1] for rates in _find_rates(scene))
     velocities = scene.velocities[1:-1].astype(float)
@@ -247,8 +245,8 @@ def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
 
 
 def _find_rates(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return linear and angular velocities (F, N, 3) from the differences of positions and of
-    orientations: central ones, and one-sided ones in the first and the last frame."""
+    """Return linear and angular velocities (F, N, 3) by central differences of positions and of
+    orientations; in the first and the last frame, by one-sided ones."""
     from scipy.spatial.transform import Rotation
 
     frames = np.arange(scene.frames)
