@@ -258,10 +258,7 @@ def scene_candidates(scene: Scene, frames: Iterable[int], source: str) -> Iterat
 
 
 def cross_scene_targets(
-    picker: DistractorPicker,
-    scene: Scene,
-    timings: Callable[[Scene], Sequence[Timing]],
-    count: int,
+    picker: DistractorPicker, scene: Scene, timings: Callable[[Scene], Sequence[Timing]], count: int
 ) -> list[Candidate]:
     """Return the first target of up to `count` other scenes of the split and of the scene's
     scenario. Scenes that share more objects with `scene` come first."""

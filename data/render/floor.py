@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from conf.schema import WorldConfig
-from data.sim.camera import Camera
+from data.sim.camera import Camera, pixel_rays
 from data.sim.parts import world_boxes
 from data.sim.shapes import RADIUS
 
@@ -28,8 +28,7 @@ class Floor:
 
     def __init__(self, camera: Camera, world: WorldConfig) -> None:
         self._camera, self._light = camera, world.light.direction
-        columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        rays = camera.rays(columns.astype(float), rows.astype(float))
+        rays = pixel_rays(camera)
         is_sky = rays[..., 2] > -1e-3
         self._is_sky = np.nonzero(is_sky)
         reach = camera.eye[2] / np.where(is_sky, np.inf, -rays[..., 2])
@@ -44,15 +43,8 @@ class Floor:
         self._x, self._y = np.moveaxis(points, -1, 0).astype(np.float32).astype(float)
 
     def shade(self, positions: np.ndarray, scales: Sequence[float]) -> np.ndarray:
-        """Compute the brightness of the floor with the shadows of objects.
-
-        Args:
-            positions: (N, 3) positions of the objects.
-            scales: (N,) sizes of the objects.
-
-        Returns:
-            (H, W) float32 factors for the colour of the floor.
-        """
+        """Return the brightness of the floor with the shadows of objects at positions (N, 3), as
+        (H, W) float32 factors for its colour. `scales` are the sizes (N,) of the objects."""
         shade = self._lit.copy()
         slant = 0.5 * RADIUS * np.asarray(self._light[:2]) / self._light[2]
         centres = positions[:, :2] - slant * np.asarray(scales)[:, None]
@@ -63,12 +55,8 @@ class Floor:
         return shade
 
     def paint(self, shade: np.ndarray, floor: float, background: float) -> np.ndarray:
-        """Return one colour channel (H, W) of the floor, and of the background above the horizon.
-
-        Args:
-            shade: Factors from `shade`.
-            floor, background: The channel's values, 0 to 255.
-        """
+        """Return one colour channel (H, W) of the floor, in `shade`, and of the background above
+        the horizon; `floor` and `background` are its values, 0 to 255."""
         channel = shade * floor
         channel[self._is_sky] = background
         return channel

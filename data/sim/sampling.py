@@ -77,27 +77,23 @@ def sample_scene(world: WorldConfig, seed: int, index: int) -> Sample:
 def check_view(world: WorldConfig, camera: Camera) -> None:
     """Raises UserError if the camera does not see `start.middle`, or if a part is not entirely in
     front of the camera and above the floor."""
-    uses_middle = world.start.kind != "strike"
-    if uses_middle and not starts.is_on_screen(np.array(world.start.middle), 0.0, camera):
-        raise UserError(
-            f"world {world.name}: the camera does not see benchmark.world.start.middle="
-            f"{world.start.middle}: change benchmark.world.camera.aim={world.camera.aim} or "
-            "benchmark.world.camera.position",
-            code="impossible-world",
+    problems, start = [], world.start
+    if start.kind != "strike" and not starts.is_on_screen(np.array(start.middle), 0.0, camera):
+        problems.append(
+            f"the camera does not see benchmark.world.start.middle={start.middle}: change "
+            f"benchmark.world.camera.aim={world.camera.aim} or benchmark.world.camera.position"
         )
     for name, box in zip(world.parts, world_boxes(world), strict=True):
+        part, lowest = f"benchmark.world.parts.{name}", box.corners[:, 2].min()
         if camera.project(box.corners)[1].min() < MIN_PART_DEPTH:
-            raise UserError(
-                f"world {world.name}: benchmark.world.parts.{name} is not entirely in front of the "
-                "camera: move it or the camera",
-                code="impossible-world",
+            problems.append(f"{part} is not entirely in front of the camera: move it or the camera")
+        elif lowest < MIN_CORNER_HEIGHT:
+            problems.append(
+                f"{part} reaches {-lowest:.2f} below the floor, where it would be drawn over it: "
+                "raise the z of its position"
             )
-        if (lowest := box.corners[:, 2].min()) < MIN_CORNER_HEIGHT:
-            raise UserError(
-                f"world {world.name}: benchmark.world.parts.{name} reaches {-lowest:.2f} below the "
-                "floor, where it would be drawn over it: raise the z of its position",
-                code="impossible-world",
-            )
+    if problems:
+        raise UserError(f"world {world.name}: {problems[0]}", code="impossible-world")
 
 
 def sample_objects(rng: np.random.Generator, world: WorldConfig) -> list[Body]:
