@@ -75,21 +75,16 @@ class BalancedPicker(DistractorPicker):
         if not groups:
             return None
         for _ in range(TRIES if recipe.family == "time" else 1):
-            if item := self._try_item(recipe, scene, timing, about, groups):
+            if item := self._try_item(recipe, scene, timing, groups):
                 return item
         self.dropped += 1
         return None
 
     def _try_item(
-        self,
-        recipe: Recipe,
-        scene: Scene,
-        timing: Timing,
-        about: tuple[int, ...],
-        groups: Sequence[Group],
+        self, recipe: Recipe, scene: Scene, timing: Timing, groups: Sequence[Group]
     ) -> SelectionItem | None:
         """Make an item from new futures, or return None if no choice of them is suitable."""
-        family, cell = recipe.family, recipe.fields(timing)
+        family, cell, about = recipe.family, recipe.fields(timing), recipe.subjects(scene, timing)
         moments = [timing.target]
         if family == "time":
             moments += self._wrong_moment(scene, timing, about)

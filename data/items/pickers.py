@@ -59,10 +59,8 @@ class Recipe:
 
     Attributes:
         timings: Returns the timings that an item can have in a scene.
-        fields: Returns the item's question, its subtype and its other fields that depend on the
-            cell.
-        pools: Returns the possible distractors of an item, given the scene, the timing, the objects
-            that count and the picker.
+        fields: Returns the item's question, its subtype and what else depends on the cell.
+        pools: Returns the possible distractors of an item.
         subjects: Returns the indices of the objects whose positions count in frames of the item's
             scene. Without any, there is no item at this timing. In frames of other scenes, all
             objects count.
@@ -71,7 +69,7 @@ class Recipe:
     family: str
     timings: Callable[[Scene], list[Timing]]
     fields: Callable[[Timing], Mapping[str, Any]]
-    pools: Callable[[Scene, Timing, tuple[int, ...], DistractorPicker], Sequence[Pool]]
+    pools: Callable[[Scene, Timing, DistractorPicker], Sequence[Pool]]
     subjects: Callable[[Scene, Timing], tuple[int, ...]] = visible_objects
     suite: str = "dynapix"
 
@@ -94,7 +92,7 @@ class DistractorPicker:
     ) -> SelectionItem | None:
         """Return an item whose first candidate is the target, or None if too few distractors are
         suitable."""
-        pools = recipe.pools(scene, timing, about, self)
+        pools = recipe.pools(scene, timing, self)
         chosen = [Candidate(scene.scene_id, timing.target)]
         for k, (pool, count) in enumerate(pools):
             # Stop if the remaining pools cannot complete the item.

@@ -149,9 +149,8 @@ def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery],
             target = stop + seconds * FPS
             if target >= scene.frames or shifts[target].max() < cell.min_displacement:
                 continue
-            absent, asked = (
-                scene.objects[k].noun_phrase for k in (removed, int(shifts[target].argmax()))
-            )
+            most = int(shifts[target].argmax())
+            absent, asked = (scene.objects[k].noun_phrase for k in (removed, most))
             yield RetrievalQuery(
                 query_id=f"counterfactual-{other}-{stop}-{target}",
                 split=scene.split,

@@ -110,9 +110,7 @@ def event_recipe(subtype: str) -> Recipe:
         ]
         return [t for t in every if framing == "contact" or is_next(scene, t.stop, t.event)]
 
-    def pools(
-        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
-    ) -> Sequence[Pool]:
+    def pools(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
         if distractors == "cross_scene":
             return [(cross_scene_targets(picker, scene, timings, CROSS_SCENES), 3)]
         if distractors == "same_offset":
@@ -154,9 +152,7 @@ def spell_seconds(count: int) -> str:
     return "1 second" if count == 1 else f"{count} seconds"
 
 
-def frames_after_prefix(
-    scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
-) -> Sequence[Pool]:
+def frames_after_prefix(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
     """Return pools of the other frames after the prefix."""
     later = picker.rng.permutation(np.arange(timing.stop + 1, scene.frames))
     wrong = scene_candidates(scene, later[later != timing.target], "same_time")
@@ -179,9 +175,8 @@ def window_recipe(suite: str, subtype: str) -> Recipe:
         visible = visible_objects(scene, timing)
         return tuple(k for k in window_subjects(window_family, scene, timing) if k in visible)
 
-    def pools(
-        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
-    ) -> Sequence[Pool]:
+    def pools(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
+        about = subjects(scene, timing)
         frames = timing.outside_prefix(similar_frames(scene, timing.target, about))
         if not is_hard:
             # Shuffled, because the least similar frames are consecutive and the target would stand

@@ -86,9 +86,7 @@ def make_transfer_recipe(recipe: str, suite: str, family: str, subtype: str) -> 
         fixed = {"suite": suite, "subtype": subtype, "distractors": "mixed"}
         return {**fixed, "question": question, **axes}
 
-    def pools(
-        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
-    ) -> Sequence[Pool]:
+    def pools(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
         own, first = (1, timing.stop) if recipe == "movi_a" else (2, timing.target)
         frames = picker.rng.permutation(np.arange(first + 1, scene.frames))
         wrong = scene_candidates(scene, frames[frames != timing.target], "same_time")
