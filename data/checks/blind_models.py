@@ -82,12 +82,8 @@ def score_blind_models(
     used = np.concatenate([train, test])
     last, candidates = encode_items([items[k] for k in used], store)
     answers = torch.tensor([items[k].answer for k in used])
-    views = {
-        "blind, candidates alone": candidates,
-        "blind, last frame and candidates": torch.cat(
-            [candidates, last[:, None].expand_as(candidates)], dim=-1
-        ),
-    }
+    both = torch.cat([candidates, last[:, None].expand_as(candidates)], dim=-1)
+    views = {"blind, candidates alone": candidates, "blind, last frame and candidates": both}
     right = {}
     for name, features in views.items():
         torch.manual_seed(seed)
@@ -130,7 +126,7 @@ def is_right(model: BlindModel, features: torch.Tensor, answers: torch.Tensor) -
 
 
 def encode_items(items: Sequence[SelectionItem], store: Store) -> tuple[torch.Tensor, torch.Tensor]:
-    """Encode the last observed frame (N, tokens, features) and the candidates
+    """Encode the last observed frames (N, tokens, features) and the candidates
     (N, 4, tokens, features) of items, in half precision."""
     frames = [f for i in items for f in (FrameRef(i.scene_id, i.prefix_stop), *i.candidates)]
     encode = _load_encoder()

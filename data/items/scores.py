@@ -85,25 +85,19 @@ class CandidateFrames:
     def scores(self, candidates: np.ndarray) -> np.ndarray:
         """Return the scores (S, T, 4) of T choices of candidates, (T, 4) indices of frames."""
         one, other = candidates[:, :, None], candidates[:, None, :]
-        return np.stack(
-            [
-                self.displacement[0, candidates],
-                self.pixels[0, candidates],
-                self.displacement[one, other].sum(axis=-1),
-                self.pixels[one, other].sum(axis=-1),
-                *self.single[:, candidates],
-            ]
-        )
+        pairs = self.displacement, self.pixels
+        nearness = [each[0, candidates] for each in pairs]
+        oddness = [each[one, other].sum(axis=-1) for each in pairs]
+        return np.stack([*nearness, *oddness, *self.single[:, candidates]])
 
 
 def _gap(scene: Scene, frame: int) -> float:
     """Return the smallest gap between two visible objects of a frame, simulator units. Gaps below
     `TOUCHING` count as equal."""
     seen = np.flatnonzero(visible_positions(scene)[1][frame])
-    radii = scene.object_radii
+    places, radii = scene.positions[frame], scene.object_radii
     gaps = [
-        np.linalg.norm(scene.positions[frame, a] - scene.positions[frame, b])
-        - (radii[a] + radii[b])
+        np.linalg.norm(places[a] - places[b]) - (radii[a] + radii[b])
         for a, b in combinations(seen.tolist(), 2)
     ]
     return max(float(min(gaps, default=APART)), TOUCHING)

@@ -48,12 +48,11 @@ def make_scenes(
     names = [scene_prefix(cfg) + f"s{cfg.seed}-{k:06d}" for k in range(cfg.scenes)]
     scene_ids = keep_test_scenes(cfg, split_scenes(cfg, names))
     split_of = {name: split for split, ids in scene_ids.items() for name in ids}
-    jobs = {
-        path: partial(_simulate_one, cfg, index, split_of[name], path)
-        for index, name in enumerate(names)
-        if name in split_of
-        for path in [scene_path(folder, name)]
-    }
+    jobs = {}
+    for index, name in enumerate(names):
+        if name in split_of:
+            path = scene_path(folder, name)
+            jobs[path] = partial(_simulate_one, cfg, index, split_of[name], path)
     workers.write_files(jobs, "simulating scenes", "scene")
     return scene_ids, {}
 
