@@ -50,7 +50,7 @@ def save_frames(frames: dict[int, np.ndarray], path: Path) -> None:
 
 def load_frames(path: Path, wanted: Iterable[int] | None = None) -> dict[int, np.ndarray]:
     """Return those of the wanted frames (by default all) that an archive contains, by frame index:
-    none if it is missing or, which is logged, damaged."""
+    none if it is missing or damaged. A damaged archive is logged."""
     try:
         with zipfile.ZipFile(path) as archive:
             header = json.loads(archive.comment)

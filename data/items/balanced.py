@@ -174,7 +174,8 @@ class BalancedPicker(DistractorPicker):
 
 def _choices(moments: int, futures: int) -> np.ndarray:
     """Return all choices of candidates (T, 4) as indices of the frames of `_candidate_frames`, the
-    target first. With two moments, a choice has the scene's own and one other future at both."""
+    target first. With two moments, a choice has the scene's own and one other future, each at both
+    moments."""
     first = TARGET + moments
     if moments == 1:
         triples = list(combinations(range(first, first + futures), 3))

@@ -127,8 +127,8 @@ def counterfactual_database(
     cfg: BenchmarkConfig, queries: list[RetrievalQuery], unique: UniqueFrames
 ) -> list[FrameRef]:
     """Return the database of the counterfactual queries: their targets, then their hard negatives
-    (the factual frames of all queries first), then other frames of the counterfactual scenes. The
-    hard negatives of test queries come first, because only they are evaluated on this database."""
+    (the factual frames of all queries first), then other frames of the counterfactual scenes. Test
+    queries come before training queries, because only test queries are evaluated on it."""
     wanted = cfg.retrieval.counterfactual_source
     ranked = sorted(queries, key=lambda q: q.split != "test")
     for frame in chain.from_iterable(zip(*(q.hard_negatives for q in ranked), strict=True)):

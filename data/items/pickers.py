@@ -167,9 +167,7 @@ def fill_quota(
     cell_name: str,
     recipe: Recipe,
     cell: CellInputs,
-    make_picker: Callable[
-        [CellInputs, str, np.random.Generator], DistractorPicker
-    ] = DistractorPicker,
+    make_picker: Callable[..., DistractorPicker] = DistractorPicker,
 ) -> tuple[list[SelectionItem], int]:
     """Make the items of one cell, at most one per scene, from scenes in a seeded order. An item has
     the first timing, in a random order, at which one can be made.

@@ -165,9 +165,8 @@ def window_recipe(suite: str, subtype: str) -> Recipe:
     source = "same_near" if is_hard else "same_far"
 
     def timings(scene: Scene) -> list[Timing]:
-        starts = range(scene.frames - horizon - WINDOW_OBSERVED + 1)
-        stops = ((start, start + WINDOW_OBSERVED - 1) for start in starts)
-        return [Timing(start, stop, stop + horizon) for start, stop in stops]
+        stops = range(WINDOW_OBSERVED - 1, scene.frames - horizon)
+        return [Timing(stop - WINDOW_OBSERVED + 1, stop, stop + horizon) for stop in stops]
 
     def subjects(scene: Scene, timing: Timing) -> tuple[int, ...]:
         if window_group(scene, timing.start, timing.stop, horizon) != group:

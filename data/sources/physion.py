@@ -112,10 +112,10 @@ def read_scene(path: Path, folder: Path, split: str, fps: float = FPS) -> Scene:
             for key in ("velocities", "angular_velocities", "center")
         )
         centres = np.where(np.isfinite(centres), centres, positions)
-        stimulus = _stimulus(path, folder)
-        named = "static/stimulus_name" in file
-        names = [stimulus, *(_read_texts(file, "static/stimulus_name") if named else [])]
-        scenario = _find_scenario(" ".join(names), path)
+        names = stimulus = _stimulus(path, folder)
+        if "static/stimulus_name" in file:
+            names = " ".join([names, *_read_texts(file, "static/stimulus_name")])
+        scenario = _find_scenario(names, path)
         is_swapped = scenario == "Roll" and models[2:3] == [SWAPPED_RAMP]
         order = [0, 2, 1, *range(3, len(ids))] if is_swapped else [*range(len(ids))]
         collisions, landings = _find_events(frames, ids, positions, fps)
