@@ -55,7 +55,8 @@ class BulletRenderer:
         # RGBX, because Pillow would premultiply the colours of an RGBA image by alpha.
         fine = Image.frombuffer("RGBX", mask.shape[::-1], layers, "raw", "RGBX", 0, 1)
         *colors, cover = fine.reduce(OVERSAMPLING).split()
-        shade = self._floor.shade(scene.positions[frame], scene.object_scales)
+        boxes = self._shadow_boxes[frame]
+        shade = self._floor.shade(scene.positions[frame], scene.object_scales, boxes)
         bands = []
         uncovered = 1 - np.asarray(cover, np.float32) / 255
         world = self._world
@@ -145,6 +146,7 @@ class BulletRenderer:
         self._handles = [
             self._add(*each) for each in zip(scene.objects, scene.object_scales, strict=True)
         ]
+        self._shadow_boxes = self._floor.shadow_boxes(scene.positions, scene.object_scales)
         self._scene_id = scene.scene_id
 
     def _add(self, scene_object: SceneObject, scale: float) -> int:

@@ -19,8 +19,9 @@ PENUMBRA = 0.06
 _SPREAD = 2 * (0.85 * RADIUS) ** 2
 """Twice the variance of a shadow's Gaussian profile at scale 1, squared simulator units."""
 _REACH = 1.0
-"""Radius at scale 1 within which a shadow is computed, simulator units. At distances d above 0.984
-a shadow is below float32 precision: SHADOW_DEPTH * exp(-d^2 / _SPREAD) < 2^-25."""
+"""Half the side of the square in which a shadow is computed at scale 1, simulator units. At
+distances d above 0.984 a shadow is below float32 precision:
+SHADOW_DEPTH * exp(-d^2 / _SPREAD) < 2^-25."""
 
 
 class Floor:
@@ -42,16 +43,21 @@ class Floor:
             points[..., 0] = points[:, :1, 0]
         self._x, self._y = np.moveaxis(points, -1, 0).astype(np.float32).astype(float)
 
-    def shade(self, positions: np.ndarray, scales: Sequence[float]) -> np.ndarray:
+    def shade(
+        self, positions: np.ndarray, scales: Sequence[float], boxes: np.ndarray
+    ) -> np.ndarray:
         """Return the brightness of the floor with the shadows of objects at positions (N, 3), as
-        (H, W) float32 factors for its colour. `scales` are the sizes (N,) of the objects."""
+        (H, W) float32 factors for its colour. `scales` are the sizes (N,) of the objects, and
+        `boxes` the bounding boxes (N, 4) of their shadows, from `shadow_boxes`."""
         shade = self._lit.copy()
-        slant = 0.5 * RADIUS * np.asarray(self._light[:2]) / self._light[2]
-        centres = positions[:, :2] - slant * np.asarray(scales)[:, None]
-        for (x, y), scale in zip(centres.tolist(), scales, strict=True):
-            squares = (self._y - y) ** 2 + (self._x - x) ** 2
-            near = squares < (_REACH * scale) ** 2
-            shade[near] *= 1 - SHADOW_DEPTH * np.exp(-squares[near] / (_SPREAD * scale**2))
+        centres = self._shadow_centres(positions, scales).tolist()
+        for (x, y), scale, (left, top, right, bottom) in zip(
+            centres, scales, boxes.tolist(), strict=True
+        ):
+            if left < right and top < bottom:
+                box = np.s_[top:bottom, left:right]
+                squares = (self._y[box] - y) ** 2 + (self._x[box] - x) ** 2
+                shade[box] *= 1 - SHADOW_DEPTH * np.exp(-squares / (_SPREAD * scale**2))
         return shade
 
     def paint(self, shade: np.ndarray, floor: float, background: float) -> np.ndarray:
@@ -60,6 +66,24 @@ class Floor:
         channel = shade * floor
         channel[self._is_sky] = background
         return channel
+
+    def shadow_boxes(self, positions: np.ndarray, scales: Sequence[float]) -> np.ndarray:
+        """Return the bounding boxes (..., N, 4) of the shadows of objects at positions (..., N, 3)
+        of sizes (N,): left, top, right and bottom in pixels; right and bottom are exclusive."""
+        ground = np.zeros(positions.shape)
+        ground[..., :2] = self._shadow_centres(positions, scales)
+        corners = _REACH * np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]])
+        corners = np.asarray(scales)[:, None, None] * corners
+        # `project` places a corner behind the camera far below the image; the box is then clipped.
+        pixels, _ = self._camera.project(ground[..., None, :] + corners)
+        size = self._camera.width, self._camera.height
+        boxes = np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2) + 1], axis=-1)
+        return np.clip(boxes, 0, [*size, *size]).astype(int)
+
+    def _shadow_centres(self, positions: np.ndarray, scales: Sequence[float]) -> np.ndarray:
+        """Return the (..., N, 2) centres of the shadows of objects at (..., N, 3) positions."""
+        slant = 0.5 * RADIUS * np.asarray(self._light[:2]) / self._light[2]
+        return positions[..., :2] - slant * np.asarray(scales)[:, None]
 
     def _part_shade(self, points: np.ndarray, world: WorldConfig) -> np.ndarray:
         """Return the light (H, W) that the world's parts leave on the floor: 1 outside shadows."""

@@ -45,19 +45,21 @@ def test_version_of_blender_names_its_release_and_samples() -> None:
     assert versions.RENDERERS.keys() == RENDERERS.keys()
 
 
-def test_shadow_is_confined_to_its_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shadow_is_confined_to_its_box() -> None:
     """Tested for objects on screen, at its edges, far away and behind the camera."""
     floor = Floor(Camera().sized(192, 128), CLEVRER)
+    width, height = 192, 128
     rng = np.random.default_rng(0)
     for spread in (1.0, 3.0, 8.0):
         positions = rng.uniform(-spread, spread, (6, 3)).astype(np.float32)
+        everywhere = np.tile([0, 0, width, height], (6, 1))
         scales = rng.uniform(0.5, 2.0, 6)
-        shade = floor.shade(positions, scales)
-        with monkeypatch.context() as patch:
-            patch.setattr("data.render.floor._REACH", 100.0)
-            np.testing.assert_array_equal(shade, floor.shade(positions, scales))
+        boxes = floor.shadow_boxes(positions, scales)
+        shade = floor.shade(positions, scales, boxes)
+        np.testing.assert_array_equal(shade, floor.shade(positions, scales, everywhere))
     middle = np.zeros((1, 3), np.float32)
-    darker = floor.shade(middle, [1.0]) < floor.shade(middle[:0], [])
+    lit = floor.shade(middle[:0], [], boxes[:0])
+    darker = floor.shade(middle, [1.0], floor.shadow_boxes(middle, [1.0])) < lit
     assert 0 < darker.mean() < 0.5
 
 
