@@ -74,6 +74,8 @@ REMOVED_KEYS: dict[str, str] = {
     "train.mine_margin": "leave it out: hard negatives are the benchmark's",
     "benchmark.retrieval.standard": "leave it out: the test queries of retrieval.builders are the "
     "standard test",
+    "benchmark.selection.observation": "leave it out: event items observe 21 frames and window "
+    "items 16",
     "frames_gb": "use frames=none: frames are then rendered when they are needed",
     "parallel": "leave it out: workers are processes of this machine",
 }
@@ -125,23 +127,17 @@ def refuse_empty_dicts(overrides: list[str]) -> None:
 
 
 def adapt_override(override: str, schema: type) -> str:
-    """Return an override that Hydra reads as the schema means it.
-
-    A text is quoted if it looks like a number. A new key of a dict of values, such as
-    `benchmark.selection.observation.window`, is added with `++KEY=VALUE` instead of `KEY=VALUE`.
-    """
+    """Return an override that Hydra reads as the schema means it: a text is quoted if it looks like
+    a number."""
     key, equals, value = override.partition("=")
     hint: Any = schema
-    prefix = ""
     for name in key.lstrip("+").split("."):
         if get_origin(hint) is dict:
             hint = get_args(hint)[1]
         else:
             groups = [t for t in (hint, *get_args(hint)) if is_dataclass(t)]
             hint = get_type_hints(groups[0]).get(name) if groups else None
-        if get_origin(hint) is dict and not is_dataclass(get_args(hint)[1]):
-            prefix = "" if key.startswith("+") else "++"
-    return f"{prefix}{key}{equals}{quote_texts(value, hint)}"
+    return f"{key}{equals}{quote_texts(value, hint)}"
 
 
 def check_run_settings(command: str, schema: type, overrides: list[str]) -> None:

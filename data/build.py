@@ -19,15 +19,9 @@ from conf.runs import compare_settings, flatten, lock_file
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.checks.counts import count_records, summarize_store
 from data.frames.prerender import FRAMES_RECORD, prerender_frames
-from data.items.cells import (
-    family_quotas,
-    list_subtypes,
-    load_cached,
-    make_items_and_queries,
-)
+from data.items.cells import family_quotas, list_subtypes, load_cached, make_items_and_queries
 from data.items.database import make_databases
 from data.items.queries import BUILDERS
-from data.items.recipes import OBSERVATIONS
 from data.oracle.displacement import visible_positions
 from data.parallel import Workers
 from data.records import COUNTERFACTUAL, SPLITS, Scene, SelectionItem
@@ -80,8 +74,8 @@ def ensure_benchmark(cfg: BenchmarkConfig, root: Path, workers: int) -> Store:
 
 
 def check_renderer(cfg: BenchmarkConfig, root: Path) -> None:
-    """Raises UserError if a benchmark that is not built yet needs Blender, as `check_blender` does.
-    Without this check, the error would come after the simulation of the scenes."""
+    """Raises UserError as `check_blender` does if a benchmark that is not built yet needs Blender:
+    otherwise, the error would come after the simulation of the scenes."""
     is_rendered = cfg.simulator == "bullet" and cfg.renderer == "blender"
     if is_rendered and not (root / cfg.store_name).exists():
         check_blender()
@@ -91,11 +85,7 @@ def ensure_items(
     cfg: BenchmarkConfig, root: Path, workers: Workers, strict: bool = False, verify: bool = False
 ) -> Store:
     """Open the benchmark `root / cfg.store_name`; build it first, without frames, if it is missing.
-
-    Raises:
-        UserError: the existing store is damaged, or was built by another version of the code or
-            with other settings.
-    """
+    Raises UserError as `open_store` does, or if the benchmark was built with other settings."""
     check_quota_names(cfg)
     folder = root / cfg.store_name
     if not folder.exists():
@@ -197,8 +187,7 @@ def empty_benchmark(
 
 def world_changes(world: WorldConfig) -> dict[str, Any]:
     """Return the settings of a world that differ from those of CLEVRER's world, by dotted key."""
-    usual = flatten(asdict(WorldConfig()))
-    settings = flatten(asdict(world))
+    usual, settings = flatten(asdict(WorldConfig())), flatten(asdict(world))
     return {
         key: settings.get(key)
         for key in sorted(settings.keys() | usual.keys())
@@ -211,17 +200,8 @@ def check_quota_names(cfg: BenchmarkConfig) -> None:
     from conf.compose import nearest_key
 
     subtypes = list_subtypes(cfg)
-    named = {
-        **{
-            f"selection.{name}": (quotas, subtypes[name])
-            for name, quotas in family_quotas(cfg).items()
-        },
-        "selection.observation": (
-            cfg.selection.observation,
-            (*OBSERVATIONS, *(s for family in OBSERVATIONS for s in subtypes[family])),
-        ),
-        "retrieval.builders": (cfg.retrieval.builders, [str(b) for b in BUILDERS]),
-    }
+    named = {f"selection.{name}": (own, subtypes[name]) for name, own in family_quotas(cfg).items()}
+    named["retrieval.builders"] = cfg.retrieval.builders, [str(b) for b in BUILDERS]
     problems = []
     for key, (settings, options) in named.items():
         if settings and not options:
@@ -241,14 +221,12 @@ def check_quota_names(cfg: BenchmarkConfig) -> None:
 
 @contextmanager
 def lock_partial_build(cfg: BenchmarkConfig, folder: Path) -> Iterator[Path | None]:
-    """Lock the partial build of `folder`, and wait while another process has locked it.
+    """Lock the partial build of `folder`, and wait while another process has locked it. Raises
+    UserError if the partial build has other settings.
 
     Yields:
         The folder of the partial build, which may contain files of a killed build; None if another
         process has completed `folder` in the meantime.
-
-    Raises:
-        UserError: the partial build has other settings.
     """
     partial = folder.with_name(f".{folder.name}.partial")
     plan = {

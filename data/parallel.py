@@ -45,21 +45,18 @@ class Workers:
         done: int = 0,
         sizes: Mapping[Name, int] | None = None,
     ) -> Iterator[tuple[Name, Any]]:
-        """Run jobs and yield their names and results in order of completion.
+        """Run jobs and yield their names and results in order of completion. Raises UserError if
+        workers die repeatedly without finishing a job.
 
         Args:
             unit: What the progress bar counts, in the singular.
             done: What has been done besides `jobs`, in units.
             sizes: Units of each job; one each by default.
-
-        Raises:
-            UserError: workers die repeatedly without finishing a job.
         """
-        remaining = dict(jobs)
-        sizes = sizes or dict.fromkeys(jobs, 1)
-        total = done + sum(sizes[name] for name in jobs)
         from joblib.externals.loky import BrokenProcessPool
 
+        remaining, sizes = dict(jobs), sizes or dict.fromkeys(jobs, 1)
+        total = done + sum(sizes[name] for name in jobs)
         with tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=1.0) as bar:
             deaths = 0
             while remaining:

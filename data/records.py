@@ -75,8 +75,7 @@ class Collision:
 
 @dataclass(frozen=True)
 class Landing:
-    """The first contact of an object that was in the air with the floor or with a static part of
-    the world."""
+    """The first contact of an object that was in the air with the floor or a part of the world."""
 
     frame: int
     """The first frame at or after the contact."""
@@ -228,7 +227,7 @@ class SelectionItem:
                 f"item {self.item_id}: prefix {self.prefix_start} to {self.prefix_stop} "
                 f"does not end before target {self.target_frame}"
             )
-        target = (self.scene_id, self.target_frame)
+        target = self.scene_id, self.target_frame
         is_target = [(c.scene_id, c.frame) == target for c in self.candidates]
         if is_target != [k == self.answer for k in range(4)]:
             raise ValueError(
@@ -340,8 +339,6 @@ def _rationale_adapter() -> TypeAdapter[Rationale]:
 
 
 def sample_prefix_frames(start: int, stop: int, count: int) -> list[int]:
-    """Sample `count` evenly spaced frames of the inclusive range [start, stop], with both ends.
-
-    All frames are returned if the range has fewer than `count`.
-    """
+    """Sample `count` evenly spaced frames of the inclusive range [start, stop], with both ends; all
+    frames if the range has fewer."""
     return [int(f) for f in np.linspace(start, stop, min(count, stop - start + 1)).round()]

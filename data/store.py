@@ -71,8 +71,7 @@ def scene_path(folder: Path, scene_id: str) -> Path:
 
 
 def part_path(folder: Path, inputs: Any) -> Path:
-    """Return the path of a job's result in a partial build; its name is a hash of the inputs of the
-    job."""
+    """Return the path of a job's result in a partial build, which a hash of its inputs names."""
     key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()
     return folder / PARTS / f"{key[:32]}.json"
 
@@ -191,8 +190,7 @@ class Store:
         return [RetrievalQuery.from_row(r) for r in kept]
 
     def standard_test(self) -> list[RetrievalQuery]:
-        """Return the queries of the standard test: the future-state queries of the test split,
-        whose targets are in the database `test`."""
+        """The future-state queries of the test split, whose targets are in the database `test`."""
         return self.retrieval("test")
 
     def database(self, name: str = "test") -> list[FrameRef]:
@@ -208,11 +206,8 @@ cached_scene = lru_cache(maxsize=512)(load_scene)
 def open_store(folder: Path, verify: bool = False) -> Store:
     """Open a built benchmark, and check every file that its manifest lists.
 
-    A file is hashed if its size or its modification time differs from those at the last check. Thus
-    all files are hashed when a benchmark is opened for the first time, and few or none later.
-
-    Args:
-        verify: Hash all files.
+    A file is hashed if its size or its modification time differs from those at the last check, or
+    if `verify` is set.
 
     Raises:
         UserError: `folder` is not a benchmark, was built by another version of the code, or has a
@@ -241,10 +236,8 @@ def open_store(folder: Path, verify: bool = False) -> Store:
         raise refusal(problem, "damaged-file") from error
     for key, version in current.items():
         if built[key] != version:
-            raise refusal(
-                f"{folder} has version {built[key]} of the {key}, but this code has {version}",
-                "different-version",
-            )
+            problem = f"{folder} has version {built[key]} of the {key}, but this code has {version}"
+            raise refusal(problem, "different-version")
     if manifest != with_checksum(manifest):
         raise refusal(f"{path} was changed after the build", "damaged-file")
     expected = manifest["files"]

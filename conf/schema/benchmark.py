@@ -58,9 +58,6 @@ class SelectionConfig(Settings):
     window: dict[str, Quota] = field(default_factory=dict)
     """Quota of each window cell, such as G1_A_h8_easy. The quota of a group and family, such as
     G1_A, is divided evenly among those of its six cells that have no quota of their own."""
-    observation: dict[str, int] = field(default_factory=dict)
-    """Number of observed frames, by family (event or window) or by subtype, such as {window: 20}.
-    By default, event items have 21 and window items 16. Time items observe a second."""
     matched: Quota = field(default_factory=Quota)
     """Pairs of matched-anchor items. The two questions of a pair ask for the same target, one by an
     event and the other by a time."""
@@ -68,11 +65,6 @@ class SelectionConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.window = divide_window_quotas(self.window)
-
-    def find_problems(self, group: str) -> Iterator[str]:
-        for name, frames in self.observation.items():
-            if not 5 <= frames <= SCENE_FRAMES // 2:
-                yield f"{group}observation.{name}={frames} must be from 5 to {SCENE_FRAMES // 2}"
 
 
 @dataclass
@@ -196,11 +188,6 @@ class BenchmarkConfig(Settings):
         if recipe == "tracks":
             yield from self._find_contact_quotas(group)
         elif recipe != "dynapix":
-            if self.selection.observation:
-                yield (
-                    f"{group}selection.observation with {group}recipe={recipe}: this recipe has "
-                    "observations of its own; leave it out"
-                )
             if any(quota.train + quota.test for quota in self.retrieval.builders.values()):
                 yield (
                     f"{group}retrieval.builders with {group}recipe={recipe}: this recipe has no "

@@ -22,9 +22,9 @@ def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: St
     """Mean distance of the objects from their positions at constant velocity, px at 336 x 336.
 
     Positions are extrapolated from the last frame of the prefix to the target's moment, which
-    questions of the event and window families do not state. An object that the candidate's scene
-    lacks has the image's diagonal as its distance, which is also the maximum. The result is NaN for
-    releases of simulators whose cameras the scenes do not record.
+    questions of the event and window families do not state. The maximum is the image's diagonal,
+    also for an object that the candidate's scene lacks. The result is NaN for releases whose scenes
+    record no camera.
     """
     config = store.manifest["config"]
     if config["simulator"] in ("movi_a", "physion"):

@@ -68,17 +68,9 @@ class BlindModel(nn.Module):
 def score_blind_models(
     items: Sequence[SelectionItem], store: Store, seed: int
 ) -> dict[str, np.ndarray]:
-    """Train both blind models, and return for each item of the test split whether they are right.
-
-    Args:
-        seed: Seed of the sample of training items, the weights and the order of the batches.
-
-    Returns:
-        For each model, an array (N,) that is NaN for items of the training split.
-
-    Raises:
-        UserError: the encoder is missing, or a split has no items.
-    """
+    """Train both blind models, and return by model whether they are right on each item of the test
+    split, (N,): NaN for items of the training split. Raises UserError if the encoder is missing, or
+    a split has no items."""
     splits = np.array([item.split for item in items])
     rng = named_rng(seed, "blind")
     train = rng.permutation(np.flatnonzero(splits == "train"))[:TRAIN_ITEMS]
@@ -90,12 +82,8 @@ def score_blind_models(
     used = np.concatenate([train, test])
     last, candidates = encode_items([items[k] for k in used], store)
     answers = torch.tensor([items[k].answer for k in used])
-    views = {
-        "blind, candidates alone": candidates,
-        "blind, last frame and candidates": torch.cat(
-            [candidates, last[:, None].expand_as(candidates)], dim=-1
-        ),
-    }
+    both = torch.cat([candidates, last[:, None].expand_as(candidates)], dim=-1)
+    views = {"blind, candidates alone": candidates, "blind, last frame and candidates": both}
     right = {}
     for name, features in views.items():
         torch.manual_seed(seed)
@@ -138,13 +126,9 @@ def is_right(model: BlindModel, features: torch.Tensor, answers: torch.Tensor) -
 
 
 def encode_items(items: Sequence[SelectionItem], store: Store) -> tuple[torch.Tensor, torch.Tensor]:
-    """Encode the last observed frame (N, tokens, features) and the candidates
+    """Encode the last observed frames (N, tokens, features) and the candidates
     (N, 4, tokens, features) of items, in half precision."""
-    frames = [
-        ref
-        for item in items
-        for ref in (FrameRef(item.scene_id, item.prefix_stop), *item.candidates)
-    ]
+    frames = [f for i in items for f in (FrameRef(i.scene_id, i.prefix_stop), *i.candidates)]
     encode = _load_encoder()
     chunks = tqdm([*batched(frames, CHUNK)], desc="encoding frames", unit="batch")
     features = torch.cat([encode([_image(ref, store) for ref in chunk]) for chunk in chunks])

@@ -21,10 +21,8 @@ PENALTY = 1e-2
 
 
 def score_simple_strategies(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
-    """Return the score of each simple strategy on each item, (N, 2 S): 1 if it chooses the target,
-    otherwise 0.
-
-    If the target is among m candidates with the best score, the strategy scores 1 / m.
+    """Return the score of each simple strategy on each item, (N, 2 S): 1 / m if the target is among
+    m candidates with the best score, otherwise 0.
 
     Args:
         scores: (N, S, 4) scores of the candidates.
@@ -36,10 +34,7 @@ def score_simple_strategies(scores: np.ndarray, answers: np.ndarray) -> np.ndarr
 
 def fit_logistic(features: np.ndarray, answers: np.ndarray) -> np.ndarray:
     """Return the coefficients (F,) of a conditional logistic model, by maximum likelihood with a
-    small penalty.
-
-    The probability of a candidate is the softmax of its linear score over the four candidates.
-    """
+    small penalty: the probability of a candidate is the softmax of its linear score over four."""
     from scipy.optimize import minimize
     from scipy.special import softmax
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -27,13 +28,13 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
 
     Returns:
         ``scenes``: distributions of objects, collisions and event frames. ``answers``: items by
-        letter. ``cells``: items by family, subtype and split. ``candidates``:
-        median displacements, and items by number of distractors earlier than the target, by
-        category. ``shortcuts``: accuracies on the test split of the strategies of
-        `data.checks.shortcuts` and of the baseline `velocity`, by category. ``retrieval``: measures
-        of a ranker that only recognises the scene, on the standard test. ``shortfalls``: cells
-        with fewer records than their quotas. A category is a family, a kind of distractors in the
-        event family, or a difficulty in the window family.
+        letter. ``cells``: items by family, subtype and split. ``candidates``: median displacements,
+        and items by number of distractors earlier than the target, by category. ``shortcuts``:
+        accuracies on the test split of the strategies of `data.checks.shortcuts` and of the
+        baseline `velocity`, by category. ``retrieval``: measures of a ranker that only recognises
+        the scene, on the standard test. ``shortfalls``: cells with fewer records than their quotas.
+        A category is a family, a kind of distractors in the event family, or a difficulty in the
+        window family.
     """
     items, config = store.selection(), store.manifest["config"]
     queries = store.standard_test()
@@ -46,9 +47,8 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
     candidates = categories[["nearest distractor", "least"]].median()
     for count in range(4):
         candidates[f"{count} earlier"] = earlier.get(count, pd.Series(dtype=int))
-    shortcuts = measure_shortcuts(
-        items, np.stack([c.item_scores() for c in compared]), store, blind
-    )
+    scores = np.stack([each.item_scores() for each in compared])
+    shortcuts = measure_shortcuts(items, scores, store, blind)
     return {
         "scenes": describe_scenes(store),
         "answers": rows["letter"].value_counts().reindex(list(LETTERS), fill_value=0).to_dict(),
@@ -63,11 +63,8 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
 def measure_shortcuts(
     items: list[SelectionItem], scores: np.ndarray, store: Store, blind: bool
 ) -> pd.DataFrame:
-    """Return the accuracy of each shortcut on the items of the test split, by category.
-
-    Args:
-        scores: (N, S, 4) scores of the items' candidates.
-    """
+    """Return the accuracy of each shortcut on the items of the test split, by category, given the
+    scores (N, S, 4) of the items' candidates."""
     answers = np.array([item.answer for item in items])
     right = pd.DataFrame(score_simple_strategies(scores, answers), columns=list(SIMPLE))
     right[LOGISTIC] = score_logistic_model(items, scores, answers)
@@ -86,15 +83,13 @@ def measure_shortcuts(
 def describe_scenes(store: Store) -> dict[str, Any]:
     """Count scenes by their numbers of objects and collisions; find quartiles of event frames."""
     scenes = [store.scene(name) for split in SPLITS for name in store.scene_ids(split)]
-    collisions_of = {s.scene_id: collisions_in(s, 1, s.frames) for s in scenes}
-    counts = pd.DataFrame(
-        {s.scene_id: (len(s.objects), len(collisions_of[s.scene_id])) for s in scenes}
-    ).T
-    frames = [c.frame for own in collisions_of.values() for c in own]
-    objects, collisions = (counts[k].value_counts().sort_index().to_dict() for k in (0, 1))
+    collisions = [collisions_in(scene, 1, scene.frames) for scene in scenes]
+    frames = [c.frame for own in collisions for c in own]
+    objects = Counter(sorted(len(scene.objects) for scene in scenes))
+    counts = Counter(sorted(map(len, collisions)))
     return {
         "objects": {str(n): scenes for n, scenes in objects.items()},
-        "collisions": {str(n): scenes for n, scenes in collisions.items()},
+        "collisions": {str(n): scenes for n, scenes in counts.items()},
         "mean collisions": len(frames) / len(scenes),
         "event frames": np.percentile(frames, [0, 25, 50, 75, 100]).tolist() if frames else [],
     }

@@ -20,11 +20,8 @@ FRAMES_RECORD = "frames.json"
 
 
 def prerender_frames(store: Store, which: str, workers: Workers) -> None:
-    """Render a store's missing frames to its cache.
-
-    Args:
-        which: `all`, or `named` for those that items, queries and databases refer to.
-    """
+    """Render a store's missing frames to its cache: `all`, or those `named` by items, queries and
+    databases."""
     options = {"frames": which, "renderer": store.manifest["renderer"]}
     record = store.folder / FRAMES_FOLDER / FRAMES_RECORD
 

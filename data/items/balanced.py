@@ -12,6 +12,7 @@ easy items are the farthest.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
@@ -30,7 +31,7 @@ from data.items.futures import (
     scene_with_states,
     simulate_futures,
 )
-from data.items.pickers import CellInputs, Recipe, Timing, new_item
+from data.items.pickers import DistractorPicker, Recipe, Timing, new_item
 from data.items.scores import Balance, CandidateFrames, render_small
 from data.oracle.displacement import frame_displacements
 from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
@@ -50,24 +51,19 @@ LARGEST_SHARE = 0.9
 """Maximum time to the earlier of two moments, as a share of the time to the later one."""
 
 
-@dataclass
-class BalancedPicker:
+@dataclass(kw_only=True)
+class BalancedPicker(DistractorPicker):
     """Makes the balanced items of one cell and one split. It uses the timings and the subjects of
     the paper's recipe, but not its distractors.
 
     Attributes:
         folder: The store or partial build in which alternative futures are saved.
-        dropped: Number of timings for which no choice of distractors was suitable.
     """
 
-    cell: CellInputs
-    split: str
-    rng: np.random.Generator
     world: WorldConfig
     folder: Path
-    dropped: int = 0
     balance: Balance = field(init=False)
-    _tries: tuple[str, int] = ("", 0)
+    _tries: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         self.balance = Balance(self.rng)
@@ -79,21 +75,16 @@ class BalancedPicker:
         if not groups:
             return None
         for _ in range(TRIES if recipe.family == "time" else 1):
-            if item := self._try_item(recipe, scene, timing, about, groups):
+            if item := self._try_item(recipe, scene, timing, groups):
                 return item
         self.dropped += 1
         return None
 
     def _try_item(
-        self,
-        recipe: Recipe,
-        scene: Scene,
-        timing: Timing,
-        about: tuple[int, ...],
-        groups: Sequence[Group],
+        self, recipe: Recipe, scene: Scene, timing: Timing, groups: Sequence[Group]
     ) -> SelectionItem | None:
         """Make an item from new futures, or return None if no choice of them is suitable."""
-        family, cell = recipe.family, recipe.fields(timing)
+        family, cell, about = recipe.family, recipe.fields(timing), recipe.subjects(scene, timing)
         moments = [timing.target]
         if family == "time":
             moments += self._wrong_moment(scene, timing, about)
@@ -135,11 +126,9 @@ class BalancedPicker:
     def _candidate_frames(
         self, scene: Scene, name: str, stop: int, moments: Sequence[int], futures: np.ndarray
     ) -> tuple[Scene, list[int]]:
-        """Return the frames from which candidates are chosen as a scene, and their moments.
-
-        They are the last observed frame, the scene's own frame at each moment (first the target),
-        and all futures at the first moment, then at the second.
-        """
+        """Return the frames from which candidates are chosen as a scene, and their moments: the
+        last observed frame, the scene's own frame at each moment (first the target), and all
+        futures at the first moment, then at the second."""
         own = scene_states(scene)[[stop, *moments]]
         others = [futures[:, moment - stop] for moment in moments]
         frames = scene_with_states(scene, name, np.concatenate([own, *others]), self.world)
@@ -158,9 +147,8 @@ class BalancedPicker:
         moving = moving_objects(scene, timing.stop, about)
         if not moving or shift < self.cell.min_displacement:
             return []
-        tried, tries = self._tries
-        self._tries = scene.scene_id, tries + 1 if tried == scene.scene_id else 1
-        if self._tries[1] > TRIES:
+        self._tries[scene.scene_id] += 1
+        if self._tries[scene.scene_id] > TRIES:
             return []
         if family != "time":
             return joint_groups(scene, timing.stop, timing.target, moving)
@@ -185,11 +173,9 @@ class BalancedPicker:
 
 
 def _choices(moments: int, futures: int) -> np.ndarray:
-    """Return all choices of candidates (T, 4) as indices of the frames of `_candidate_frames`; the
-    first is the target.
-
-    With two moments, a choice contains the scene's own and one other future, each at both moments.
-    """
+    """Return all choices of candidates (T, 4) as indices of the frames of `_candidate_frames`, the
+    target first. With two moments, a choice has the scene's own and one other future, each at both
+    moments."""
     first = TARGET + moments
     if moments == 1:
         triples = list(combinations(range(first, first + futures), 3))

@@ -67,11 +67,7 @@ def choose_items(
 def item_deviations(scores: np.ndarray) -> np.ndarray:
     """Return for each item (N, D) by how much its target differs from a target without shortcuts:
     its relative scores in standard deviations, and for each rank, whether it has the rank, less a
-    quarter.
-
-    Args:
-        scores: (N, S, 4) scores of the candidates, the target first.
-    """
+    quarter. `scores` are those of the candidates (N, S, 4), the target first."""
     relative = compare_candidates(scores)
     relative = relative - relative.mean(axis=-1, keepdims=True)
     scatter = np.einsum("nfc,ngc->fg", relative, relative) / relative[:, 0].size

@@ -12,7 +12,7 @@ import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, replace
+from dataclasses import asdict, astuple
 from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
@@ -25,13 +25,7 @@ from conf.schema import BenchmarkConfig, Quota
 from data.items import recipes, transfer
 from data.items.balanced import BalancedPicker
 from data.items.balanced_subset import RESERVE, choose_items
-from data.items.pickers import (
-    CellInputs,
-    DistractorPicker,
-    Recipe,
-    fill_quota,
-    shuffle_candidates,
-)
+from data.items.pickers import CellInputs, DistractorPicker, Recipe, fill_quota, shuffle_candidates
 from data.items.queries import make_counterfactual_queries, make_future_queries
 from data.items.scores import compare_item, order_target_first
 from data.parallel import Workers
@@ -62,31 +56,26 @@ def make_items_and_queries(
     quotas = {name: _with_reserve(cfg, name, quota) for name, quota in cell_quotas(cfg).items()}
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
     is_balanced = cfg.distractors == "balanced"
-    recipe = cfg.item_recipe, cfg.suite, cfg.distractors, cfg.selection.observation
+    recipe = cfg.item_recipe, cfg.suite, cfg.distractors
     if cfg.simulator != "bullet":
         # A release may have changed since a killed build, while its scenes keep their ids.
         every = [f"{SCENES_FOLDER}/{name}.npz" for ids in scene_ids.values() for name in ids]
         recipe = *recipe, hash_files(folder, every)
     inputs = [component_versions(asdict(cfg)), scene_ids, *recipe, *settings]
-    paths = {
-        name: part_path(folder, [*inputs, name, asdict(quota)]) for name, quota in quotas.items()
-    }
+    jobs, sizes, paths = {}, {}, {}
     # Largest quotas first, so that no single worker is left with a large job at the end.
-    jobs, sizes = {}, {}
     for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train):
         cell = CellInputs(scene_ids, partial(load_cached, folder), quota, *settings)
-        jobs[paths[name]] = partial(_make_cell, cfg, name, cell, paths[name])
-        sizes[paths[name]] = quota.train + quota.test
+        paths[name] = path = part_path(folder, [*inputs, name, asdict(quota)])
+        jobs[path] = partial(_make_cell, cfg, name, cell, path)
+        sizes[path] = quota.train + quota.test
     if is_balanced:
         # The alternative futures of balanced items have the same names for other settings: a result
         # from before a change of settings may refer to futures that were simulated since.
-        for path in {*(folder / PARTS).glob("*.json")} - {*paths.values()}:
+        for path in {*(folder / PARTS).glob("*.json")} - jobs.keys():
             path.unlink()
     workers.write_files(jobs, "making items and queries", "item", sizes)
-    items: list[SelectionItem] = []
-    scores: dict[str, list[list[list[float]]]] = {}
-    queries: list[RetrievalQuery] = []
-    dropped: Counter[str] = Counter()
+    items, queries, scores, dropped = [], [], {}, Counter()
     for name in quotas:
         part = json.loads(paths[name].read_bytes())
         if _is_query_cell(name):
@@ -125,13 +114,9 @@ def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) ->
 
 def cell_recipe(cfg: BenchmarkConfig, family: str, subtype: str) -> Recipe:
     """Return the recipe of a cell of a benchmark's suite."""
-    observation = cfg.selection.observation
-    if cfg.item_recipe == "dynapix":
-        return recipes.make_recipe(family, subtype, observation)
-    if cfg.item_recipe == "tracks":
-        recipe = recipes.make_recipe(family, subtype, observation, second=None)
-        return replace(recipe, suite=cfg.suite)
-    return transfer.make_transfer_recipe(cfg.item_recipe, cfg.suite, family, subtype)
+    if cfg.item_recipe in transfer.CELLS:
+        return transfer.make_transfer_recipe(cfg.item_recipe, cfg.suite, family, subtype)
+    return recipes.make_recipe(cfg.suite, family, subtype)
 
 
 def list_subtypes(cfg: BenchmarkConfig) -> Mapping[str, tuple[str, ...]]:
@@ -143,13 +128,9 @@ def list_subtypes(cfg: BenchmarkConfig) -> Mapping[str, tuple[str, ...]]:
 def _choose_balanced(
     cfg: BenchmarkConfig, items: list[SelectionItem], scores: Mapping[str, Any]
 ) -> list[SelectionItem]:
-    """Return the items up to their quotas, chosen so that their scores are even in each family,
-    difficulty and split.
-
-    Args:
-        scores: Scores of the candidates by item id. Items without scores, such as matched pairs,
-            are kept.
-    """
+    """Return the items up to their quotas, chosen so that the scores of their candidates, by item
+    id, are even in each family, difficulty and split. Items without scores, such as matched pairs,
+    are kept."""
     pools: dict[tuple[str, ...], list[SelectionItem]] = defaultdict(list)
     for item in items:
         if item.item_id in scores:
@@ -158,15 +139,11 @@ def _choose_balanced(
     quotas = family_quotas(cfg)
     for (split, family, difficulty), pool in pools.items():
         rng = named_rng(cfg.seed, "pool", split, family, difficulty)
-        kept = choose_items(
-            order_target_first(
-                np.array([scores[item.item_id] for item in pool]),
-                np.array([item.answer for item in pool]),
-            ),
-            [item.subtype for item in pool],
-            {subtype: getattr(quota, split) for subtype, quota in quotas[family].items()},
-            rng,
-        )
+        own = np.array([scores[item.item_id] for item in pool])
+        answers = np.array([item.answer for item in pool])
+        wanted = {subtype: getattr(quota, split) for subtype, quota in quotas[family].items()}
+        ordered, cells = order_target_first(own, answers), [item.subtype for item in pool]
+        kept = choose_items(ordered, cells, wanted, rng)
         for _, cell in groupby((pool[k] for k in kept), key=lambda item: item.subtype):
             chosen |= {item.item_id: item for item in shuffle_candidates([*cell], rng)}
     return [
@@ -182,15 +159,13 @@ def family_quotas(cfg: BenchmarkConfig) -> dict[str, dict[str, Quota]]:
 def cell_quotas(cfg: BenchmarkConfig) -> dict[str, Quota]:
     """Return the quotas above 0 of all cells and builders, by name."""
     quotas = {
-        **{
-            f"{family}/{subtype}": quota
-            for family, quotas in family_quotas(cfg).items()
-            for subtype, quota in quotas.items()
-        },
-        MATCHED_ANCHOR: cfg.selection.matched,
-        **{f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()},
-        COUNTERFACTUAL: cfg.retrieval.counterfactual,
+        f"{family}/{subtype}": quota
+        for family, quotas in family_quotas(cfg).items()
+        for subtype, quota in quotas.items()
     }
+    quotas[MATCHED_ANCHOR] = cfg.selection.matched
+    quotas |= {f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()}
+    quotas[COUNTERFACTUAL] = cfg.retrieval.counterfactual
     return {name: quota for name, quota in quotas.items() if quota.train + quota.test}
 
 

@@ -44,10 +44,8 @@ class UniqueFrames:
             return False
         appearances = list(_appearances(self.scene_of(frame.scene_id), frame.frame))
         for objects, positions in appearances:
-            others = self._positions[objects]
-            if any(
-                np.abs(other - positions).max(initial=0) < DUPLICATE_DISTANCE for other in others
-            ):
+            steps = (np.abs(other - positions) for other in self._positions[objects])
+            if any(step.max(initial=0) < DUPLICATE_DISTANCE for step in steps):
                 self.left_out += 1
                 return False
         for objects, positions in appearances:
@@ -56,11 +54,8 @@ class UniqueFrames:
         return True
 
     def fill(self, names: list[str], wanted: int, seed: int) -> list[FrameRef]:
-        """Add `wanted` frames of the scenes `names`, a random frame of each scene in turn.
-
-        Returns:
-            The added frames; fewer than `wanted` if the scenes have no more.
-        """
+        """Add and return `wanted` frames of the scenes `names`, a random frame of each scene in
+        turn; fewer if the scenes have no more."""
 
         def new_frames(name: str) -> Iterator[FrameRef]:
             order = named_rng(seed, "database", name).permutation(self.scene_of(name).frames)
@@ -131,12 +126,9 @@ def future_databases(
 def counterfactual_database(
     cfg: BenchmarkConfig, queries: list[RetrievalQuery], unique: UniqueFrames
 ) -> list[FrameRef]:
-    """Return the database of the counterfactual queries.
-
-    It contains their targets, then their hard negatives (the factual frames of all queries first),
-    then other frames of the counterfactual scenes. The hard negatives of test queries come before
-    those of training queries, because only test queries are evaluated on this database.
-    """
+    """Return the database of the counterfactual queries: their targets, then their hard negatives
+    (the factual frames of all queries first), then other frames of the counterfactual scenes. Test
+    queries come before training queries, because only test queries are evaluated on it."""
     wanted = cfg.retrieval.counterfactual_source
     ranked = sorted(queries, key=lambda q: q.split != "test")
     for frame in chain.from_iterable(zip(*(q.hard_negatives for q in ranked), strict=True)):

@@ -42,12 +42,9 @@ def moving_objects(scene: Scene, frame: int, about: Sequence[int]) -> list[int]:
 
 
 def joint_groups(scene: Scene, frame: int, last: int, moving: Sequence[int]) -> list[Group]:
-    """Divide moving objects into groups that keep the collisions of the scene.
-
-    Objects that collide with each other after `frame` and up to `last`, directly or through others,
-    form a group: if all get the same additional velocity, they still collide at the same moments.
-    Objects that do not collide form groups of their own.
-    """
+    """Divide moving objects into groups that keep the collisions of the scene: objects that collide
+    after `frame` and up to `last`, directly or through others, form a group. If all get the same
+    additional velocity, they still collide at the same moments."""
     groups = [{k} for k in range(len(scene.objects))]
     for collision in collisions_in(scene, frame + 1, last):
         one, two = (next(g for g in groups if k in g) for k in collision.objects)
@@ -106,18 +103,11 @@ def _turn(velocity: np.ndarray, angle: float) -> np.ndarray:
 def simulate_futures(
     scene: Scene, frame: int, last: int, velocities: np.ndarray, world: WorldConfig
 ) -> np.ndarray:
-    """Simulate a scene from `frame` to `last` with other velocities (K, N, 6) at `frame`.
-
-    Returns:
-        (K, last - frame + 1, N, 13) states.
-    """
+    """Simulate a scene from `frame` to `last` with other velocities (K, N, 6) at `frame`; return
+    states (K, last - frame + 1, N, 13)."""
+    states, count = scene_states(scene)[frame].astype(float), last - frame + 1
     return shared_simulator().simulate_branches(
-        scene.objects,
-        scene.object_scales,
-        scene_states(scene)[frame].astype(float),
-        velocities,
-        world,
-        last - frame + 1,
+        scene.objects, scene.object_scales, states, velocities, world, count
     )
 
 

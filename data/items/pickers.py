@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, islice
-from typing import Any, Protocol
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -47,11 +47,8 @@ class Timing:
 
 
 def visible_objects(scene: Scene, timing: Timing) -> tuple[int, ...]:
-    """Return the indices of the objects that are visible in at least one frame of the prefix.
-
-    Only these objects may distinguish candidates of one scene, because a model cannot predict that
-    another object will enter.
-    """
+    """Return the indices of the objects that are visible in a frame of the prefix. Only these may
+    distinguish candidates of one scene: a model cannot predict that another object will enter."""
     visible = visible_positions(scene)[1][timing.start : timing.stop + 1]
     return tuple(np.flatnonzero(visible.any(axis=0)).tolist())
 
@@ -61,43 +58,28 @@ class Recipe:
     """How the items of one cell are made.
 
     Attributes:
-        timings: Function that returns the timings that an item can have in a scene.
-        fields: Function that returns the item's question, its subtype and its other fields that
-            depend on the cell.
-        pools: Function that returns the possible distractors of an item, given the scene, the
-            timing, the objects that count and the picker.
-        subjects: Function that returns the indices of the objects whose positions count in frames
-            of the item's scene. Without any, there is no item at this timing. In frames of other
-            scenes, all objects count.
-        suite: Name of the suite of the items.
+        timings: Returns the timings that an item can have in a scene.
+        fields: Returns the item's question, its subtype and what else depends on the cell.
+        pools: Returns the possible distractors of an item.
+        subjects: Returns the indices of the objects whose positions count in frames of the item's
+            scene. Without any, there is no item at this timing. In frames of other scenes, all
+            objects count.
     """
 
     family: str
     timings: Callable[[Scene], list[Timing]]
     fields: Callable[[Timing], Mapping[str, Any]]
-    pools: Callable[[Scene, Timing, tuple[int, ...], DistractorPicker], Sequence[Pool]]
+    pools: Callable[[Scene, Timing, DistractorPicker], Sequence[Pool]]
     subjects: Callable[[Scene, Timing], tuple[int, ...]] = visible_objects
     suite: str = "dynapix"
-
-
-class Picker(Protocol):
-    """Chooses distractors. `dropped` counts the timings for which too few are suitable."""
-
-    dropped: int
-
-    def make_item(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
-    ) -> SelectionItem | None:
-        """Return an item whose first candidate is the target, or None if too few distractors are
-        suitable."""
-        ...
 
 
 @dataclass
 class DistractorPicker:
     """Takes the first distractors of the recipe's pools that differ visibly from each other.
 
-    Cross-scene distractors come from the scenes of the split.
+    Cross-scene distractors come from the scenes of the split. `dropped` counts the timings for
+    which too few distractors are suitable.
     """
 
     cell: CellInputs
@@ -108,23 +90,20 @@ class DistractorPicker:
     def make_item(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
     ) -> SelectionItem | None:
-        pools = recipe.pools(scene, timing, about, self)
+        """Return an item whose first candidate is the target, or None if too few distractors are
+        suitable."""
+        pools = recipe.pools(scene, timing, self)
         chosen = [Candidate(scene.scene_id, timing.target)]
         for k, (pool, count) in enumerate(pools):
             # Stop if the remaining pools cannot complete the item.
             if len(chosen) + sum(limit for _, limit in pools[k:]) < 4:
                 break
-            fitting = (
-                candidate
-                for candidate in pool
-                if all(
-                    self._displacement(candidate, c, about) >= self.cell.min_displacement
-                    for c in chosen
-                )
-            )
-            # `fitting` is lazy, so it also compares each candidate with those chosen in this loop.
-            for candidate in islice(fitting, min(count, 4 - len(chosen))):
-                chosen.append(candidate)
+            wanted, bound = min(len(chosen) + count, 4), self.cell.min_displacement
+            for candidate in pool:
+                if len(chosen) == wanted:
+                    break
+                if all(self._displacement(candidate, c, about) >= bound for c in chosen):
+                    chosen.append(candidate)
         if len(chosen) < 4:
             self.dropped += 1
             return None
@@ -171,7 +150,6 @@ class CellInputs:
     """The inputs for making the items or queries of one cell.
 
     Attributes:
-        scene_ids: Scene ids by split.
         min_displacement: Between any two candidates, the position of at least one object must
             differ by this many px at 336 x 336.
         hard_negatives: Number of hard negatives of a query.
@@ -189,15 +167,13 @@ def fill_quota(
     cell_name: str,
     recipe: Recipe,
     cell: CellInputs,
-    make_picker: Callable[[CellInputs, str, np.random.Generator], Picker] = DistractorPicker,
+    make_picker: Callable[..., DistractorPicker] = DistractorPicker,
 ) -> tuple[list[SelectionItem], int]:
-    """Make the items of one cell, at most one per scene, from scenes in a seeded order.
-
-    The item of a scene has the first timing, in a random order, at which one can be made.
+    """Make the items of one cell, at most one per scene, from scenes in a seeded order. An item has
+    the first timing, in a random order, at which one can be made.
 
     Returns:
-        The items of each split up to its quota, and the number of timings that were dropped because
-        no three distractors are suitable.
+        The items of each split up to its quota, and the number of timings that were dropped.
     """
     items, dropped = [], 0
     for split in SPLITS:

@@ -129,11 +129,11 @@ def make_future_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQ
 
 
 def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
-    """Make the counterfactual queries, and count those that are dropped; see `fill_query_quota`.
+    """Make the counterfactual queries, and count those dropped; see `fill_query_quota`.
 
     A query names the removed object and the object that its absence displaces most, among those
     that are visible in the prefix and in the target frame. The first hard negative is the same
-    frame of the factual scene; the others are other frames of the counterfactual scene.
+    frame of the factual scene.
     """
 
     def queries_of(scene: Scene) -> Iterator[RetrievalQuery]:
@@ -149,9 +149,8 @@ def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery],
             target = stop + int(seconds * FPS)
             if target >= scene.frames or shifts[target].max() < cell.min_displacement:
                 continue
-            absent, asked = (
-                scene.objects[k].noun_phrase for k in (removed, int(shifts[target].argmax()))
-            )
+            most = int(shifts[target].argmax())
+            absent, asked = (scene.objects[k].noun_phrase for k in (removed, most))
             yield RetrievalQuery(
                 query_id=f"counterfactual-{other}-{stop}-{target}",
                 split=scene.split,
@@ -180,30 +179,26 @@ def fill_query_quota(
     queries_of: Callable[[Scene], Iterable[RetrievalQuery]],
     one_per_scene: bool = False,
 ) -> tuple[list[RetrievalQuery], int]:
-    """Make the queries of one builder up to its quota in each split.
-
-    Scenes take turns in a seeded order: each gives one query before any gives a second one.
+    """Make the queries of one builder up to its quota in each split. Scenes take turns in a seeded
+    order: each gives one query before any gives a second one.
 
     Args:
-        queries_of: Function that returns all queries about a scene, for `add_hard_negatives`.
+        queries_of: Returns all queries about a scene, for `add_hard_negatives`.
         one_per_scene: Whether a scene gives at most one query.
 
     Returns:
-        The queries, and the number of queries that were dropped because they have too few
-        distinguishable hard negatives.
+        The queries, and the number of queries that `add_hard_negatives` dropped.
     """
 
     def attempts(
         queries: list[RetrievalQuery], rng: np.random.Generator
     ) -> Iterator[RetrievalQuery | None]:
         for query in queries:
-            completed = add_hard_negatives(query, cell, rng)
-            yield completed
+            yield (completed := add_hard_negatives(query, cell, rng))
             if completed is not None and one_per_scene:
                 return
 
-    made: list[RetrievalQuery] = []
-    dropped = 0
+    made, dropped = [], 0
     for split in SPLITS:
         rng = named_rng(cell.seed, "retrieval", builder, split)
         scene_ids, wanted = cell.scene_ids[split], getattr(cell.quota, split) + len(made)
@@ -229,10 +224,8 @@ def add_hard_negatives(
 
     The added frames differ from the target, from each other and from the hard negatives that the
     query already has by at least `cell.min_displacement`. Frames of the prefix are included: the
-    database contains them too, and a retriever has to rank them below the target.
-
-    Returns:
-        The query, or None if there are too few such frames.
+    database contains them too, and a retriever has to rank them below the target. Return None if
+    there are too few such frames.
     """
     scene, target = cell.scene_of(query.target.scene_id), query.target.frame
     displacements = frame_displacements(scene)
@@ -243,10 +236,8 @@ def add_hard_negatives(
     for frame in [*rng.permutation(preferred), *rng.permutation(dense)]:
         if len(chosen) == count:
             break
-        if (
-            0 <= frame < scene.frames
-            and displacements[frame, chosen].min() >= cell.min_displacement
-        ):
+        is_in_scene = 0 <= frame < scene.frames
+        if is_in_scene and displacements[frame, chosen].min() >= cell.min_displacement:
             chosen.append(int(frame))
     wrong = chosen[1:]
     if len(chosen) < count or any(

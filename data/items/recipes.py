@@ -20,7 +20,7 @@ the next collision, one or two seconds after the prefix.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice, product
@@ -41,7 +41,7 @@ from data.oracle.events import window_group
 from data.records import MATCHED_ANCHOR, SELECTION_SECOND, Candidate, Scene, SelectionItem
 
 EVENT_OBSERVED, WINDOW_OBSERVED = 21, 16
-"""Default numbers of frames of a prefix. The first and last frame of event items differ by 20."""
+"""Numbers of frames of a prefix. The first and last frame of event items differ by 20."""
 TAIL = 10
 """Minimum number of frames after the target of an event item."""
 OFFSETS = (16, 32, 48)
@@ -86,45 +86,31 @@ CELLS_WITHOUT_CONTACTS = {
     "window": tuple(name for name in WINDOW_CELLS if not needs_contacts(name)),
 }
 """The subtypes of each family of the suite `tracks`, whose scenes do not record contacts."""
-OBSERVATIONS = ("event", "window")
-"""Families whose number of observed frames is a setting."""
 
 
-def make_recipe(
-    family: str, subtype: str, observation: Mapping[str, int], second: int | None = SELECTION_SECOND
-) -> Recipe:
-    """Return the recipe of a cell.
-
-    Args:
-        second: Number of frames that time items count as a second; None for the frame rate of each
-            scene.
-        observation: Numbers of observed frames by subtype or family, where they are not the
-            defaults.
-    """
-    observed = observation.get(subtype, observation.get(family))
+def make_recipe(suite: str, family: str, subtype: str) -> Recipe:
+    """Return the recipe of a cell of the suite `dynapix` or `tracks`."""
     if family == "event":
-        return event_recipe(subtype, observed or EVENT_OBSERVED)
+        return event_recipe(subtype)
     if family == "time":
-        timings = partial(time_timings, TIME_CELLS[subtype], second)
-        return Recipe("time", timings, time_fields, frames_after_prefix)
-    return window_recipe(subtype, observed or WINDOW_OBSERVED)
+        timings = partial(time_timings, TIME_CELLS[subtype], suite)
+        return Recipe("time", timings, time_fields, frames_after_prefix, suite=suite)
+    return window_recipe(suite, subtype)
 
 
-def event_recipe(subtype: str, observed: int) -> Recipe:
+def event_recipe(subtype: str) -> Recipe:
     framing, distractors, gap = EVENT_CELLS[subtype]
 
     def timings(scene: Scene) -> list[Timing]:
         lead = gap if framing == "future" else 0
         every = [
-            Timing(stop - observed + 1, stop, stop + gap, event)
+            Timing(stop - EVENT_OBSERVED + 1, stop, stop + gap, event)
             for event in collision_frames(scene)
-            if (stop := event - lead) >= observed - 1 and stop + gap <= scene.frames - 1 - TAIL
+            if EVENT_OBSERVED <= (stop := event - lead) + 1 <= scene.frames - TAIL - gap
         ]
         return [t for t in every if framing == "contact" or is_next(scene, t.stop, t.event)]
 
-    def pools(
-        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
-    ) -> Sequence[Pool]:
+    def pools(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
         if distractors == "cross_scene":
             return [(cross_scene_targets(picker, scene, timings, CROSS_SCENES), 3)]
         if distractors == "same_offset":
@@ -142,10 +128,10 @@ def event_recipe(subtype: str, observed: int) -> Recipe:
     return Recipe("event", timings, lambda timing: fields, pools)
 
 
-def time_timings(seconds: int, second: int | None, scene: Scene) -> list[Timing]:
-    """Return the single timing of a scene, whose prefix is the first second (see `make_recipe`).
-    The target is the first frame after the stated seconds."""
-    second = second or round(scene.fps)
+def time_timings(seconds: int, suite: str, scene: Scene) -> list[Timing]:
+    """Return the single timing of a scene, whose prefix is the first second. The target is the
+    first frame after the stated seconds. In the suite `tracks`, seconds are the scene's own."""
+    second = round(scene.fps) if suite == "tracks" else SELECTION_SECOND
     target = second * (1 + seconds)
     return [Timing(0, second - 1, target)] if target < scene.frames else []
 
@@ -166,23 +152,21 @@ def spell_seconds(count: float) -> str:
     return {0.5: "half a second", 1: "1 second"}.get(count) or f"{count} seconds"
 
 
-def frames_after_prefix(
-    scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
-) -> Sequence[Pool]:
+def frames_after_prefix(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
     """Return pools of the other frames after the prefix."""
     later = picker.rng.permutation(np.arange(timing.stop + 1, scene.frames))
     wrong = scene_candidates(scene, later[later != timing.target], "same_time")
     return balance_in_time(wrong, timing.target, picker.rng)
 
 
-def window_recipe(subtype: str, observed: int) -> Recipe:
+def window_recipe(suite: str, subtype: str) -> Recipe:
     group, window_family, horizon, difficulty = WINDOW_CELLS[subtype]
     is_hard = difficulty == "hard"
     source = "same_near" if is_hard else "same_far"
 
     def timings(scene: Scene) -> list[Timing]:
-        stops = range(observed - 1, scene.frames - horizon)
-        return [Timing(stop - observed + 1, stop, stop + horizon) for stop in stops]
+        stops = range(WINDOW_OBSERVED - 1, scene.frames - horizon)
+        return [Timing(stop - WINDOW_OBSERVED + 1, stop, stop + horizon) for stop in stops]
 
     def subjects(scene: Scene, timing: Timing) -> tuple[int, ...]:
         if window_group(scene, timing.start, timing.stop, horizon) != group:
@@ -190,9 +174,8 @@ def window_recipe(subtype: str, observed: int) -> Recipe:
         visible = visible_objects(scene, timing)
         return tuple(k for k in window_subjects(window_family, scene, timing) if k in visible)
 
-    def pools(
-        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
-    ) -> Sequence[Pool]:
+    def pools(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
+        about = subjects(scene, timing)
         frames = timing.outside_prefix(similar_frames(scene, timing.target, about))
         if not is_hard:
             # Shuffled, because the least similar frames are consecutive and the target would stand
@@ -204,7 +187,7 @@ def window_recipe(subtype: str, observed: int) -> Recipe:
         "subtype": subtype, "question": WINDOW_QUESTION, "distractors": source, "group": group,
         "window_family": window_family, "horizon": horizon, "difficulty": difficulty,
     }  # fmt: skip
-    return Recipe("window", timings, lambda timing: fields, pools, subjects)
+    return Recipe("window", timings, lambda timing: fields, pools, subjects, suite)
 
 
 def window_subjects(window_family: str, scene: Scene, timing: Timing) -> tuple[int, ...]:
@@ -269,10 +252,7 @@ def scene_candidates(scene: Scene, frames: Iterable[int], source: str) -> Iterat
 
 
 def cross_scene_targets(
-    picker: DistractorPicker,
-    scene: Scene,
-    timings: Callable[[Scene], Sequence[Timing]],
-    count: int,
+    picker: DistractorPicker, scene: Scene, timings: Callable[[Scene], Sequence[Timing]], count: int
 ) -> list[Candidate]:
     """Return the first target of up to `count` other scenes of the split and of the scene's
     scenario. Scenes that share more objects with `scene` come first."""

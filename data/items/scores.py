@@ -62,11 +62,8 @@ class CandidateFrames:
     def compare(
         cls, frames: Sequence[tuple[Scene, int]], moments: Sequence[int], images: np.ndarray
     ) -> CandidateFrames:
-        """Compare frames, given as scenes and indices, whose images are (M, H, W, 3) uint8.
-
-        Args:
-            moments: (M,) indices of the frames in time.
-        """
+        """Compare frames, given as scenes and indices, with their indices in time (M,) and their
+        images (M, H, W, 3) uint8."""
         displacement = np.zeros((len(frames), len(frames)))
         for a, b in combinations(range(len(frames)), 2):
             distance = cross_scene_displacement(*frames[a], *frames[b])
@@ -88,25 +85,19 @@ class CandidateFrames:
     def scores(self, candidates: np.ndarray) -> np.ndarray:
         """Return the scores (S, T, 4) of T choices of candidates, (T, 4) indices of frames."""
         one, other = candidates[:, :, None], candidates[:, None, :]
-        return np.stack(
-            [
-                self.displacement[0, candidates],
-                self.pixels[0, candidates],
-                self.displacement[one, other].sum(axis=-1),
-                self.pixels[one, other].sum(axis=-1),
-                *self.single[:, candidates],
-            ]
-        )
+        pairs = self.displacement, self.pixels
+        nearness = [each[0, candidates] for each in pairs]
+        oddness = [each[one, other].sum(axis=-1) for each in pairs]
+        return np.stack([*nearness, *oddness, *self.single[:, candidates]])
 
 
 def _gap(scene: Scene, frame: int) -> float:
     """Return the smallest gap between two visible objects of a frame, simulator units. Gaps below
     `TOUCHING` count as equal."""
     seen = np.flatnonzero(visible_positions(scene)[1][frame])
-    radii = scene.object_radii
+    places, radii = scene.positions[frame], scene.object_radii
     gaps = [
-        np.linalg.norm(scene.positions[frame, a] - scene.positions[frame, b])
-        - (radii[a] + radii[b])
+        np.linalg.norm(places[a] - places[b]) - (radii[a] + radii[b])
         for a, b in combinations(seen.tolist(), 2)
     ]
     return max(float(min(gaps, default=APART)), TOUCHING)
@@ -118,11 +109,8 @@ def nearly_equal(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def rank_shares(scores: np.ndarray) -> np.ndarray:
-    """Return the distribution (..., 4) of the rank of the first of four candidates (..., 4).
-
-    The rank is the number of candidates with lower scores; candidates with equal scores share the
-    ranks.
-    """
+    """Return the distribution (..., 4) of the rank of the first of four candidates (..., 4): the
+    number of candidates with lower scores. Candidates with equal scores share the ranks."""
     target, others = scores[..., :1], scores[..., 1:]
     close = nearly_equal(others, target)
     lower = (others < target) & ~close
@@ -143,11 +131,8 @@ def compare_candidates(scores: np.ndarray) -> np.ndarray:
 
 
 class Balance:
-    """Counts how often the targets of a cell have each rank in each score.
-
-    The counts start at random values near 0, so that the few items of many small cells do not all
-    begin with the same ranks.
-    """
+    """Counts how often the targets of a cell have each rank in each score. The counts start near 0
+    at random, so that the few items of many small cells do not all begin with the same ranks."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.items = 0
@@ -186,8 +171,7 @@ class Balance:
 def compare_item(
     item: SelectionItem, scene_of: Callable[[str], Scene], config: Mapping[str, Any]
 ) -> CandidateFrames:
-    """Compare the last observed frame and the candidates of an item of a benchmark with these
-    settings."""
+    """Compare the last observed frame and the candidates of an item, in a benchmark's settings."""
     frames = [FrameRef(item.scene_id, item.prefix_stop), *item.candidates]
     states = [(scene_of(f.scene_id), f.frame) for f in frames]
     images = np.concatenate([render_small(scene, [frame], config) for scene, frame in states])

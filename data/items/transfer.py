@@ -67,7 +67,9 @@ def make_transfer_recipe(recipe: str, suite: str, family: str, subtype: str) -> 
 
     def timings(scene: Scene) -> list[Timing]:
         if is_event:
-            return event_timings(EVENTS[recipe][subtype](scene))
+            frames = sorted({*EVENTS[recipe][subtype](scene)})
+            stops = [frame - GAP for frame in frames if frame - GAP + 1 >= MIN_PREFIX_FRAMES]
+            return [Timing(max(s - SPAN, 0), s, s + GAP, event=s + GAP) for s in stops]
         # The prefix is the first second. As in the suite `dynapix`, the target is the first frame
         # after the stated seconds; a scene of MoVi-A ends one frame earlier.
         second = round(scene.fps)
@@ -84,9 +86,7 @@ def make_transfer_recipe(recipe: str, suite: str, family: str, subtype: str) -> 
         fixed = {"suite": suite, "subtype": subtype, "distractors": "mixed"}
         return {**fixed, "question": question, **axes}
 
-    def pools(
-        scene: Scene, timing: Timing, about: tuple[int, ...], picker: DistractorPicker
-    ) -> Sequence[Pool]:
+    def pools(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
         own, first = (1, timing.stop) if recipe == "movi_a" else (2, timing.target)
         frames = picker.rng.permutation(np.arange(first + 1, scene.frames))
         wrong = scene_candidates(scene, frames[frames != timing.target], "same_time")
@@ -94,13 +94,3 @@ def make_transfer_recipe(recipe: str, suite: str, family: str, subtype: str) -> 
         return [(wrong, own), (others, 3 - own)]
 
     return Recipe(family, timings, fields, pools, lambda scene, _: (*range(len(scene.objects)),))
-
-
-def event_timings(events: Sequence[int]) -> list[Timing]:
-    """Return a timing for each event, which is its target."""
-    stops = [frame - GAP for frame in sorted({*events})]
-    return [
-        Timing(max(stop - SPAN, 0), stop, stop + GAP, event=stop + GAP)
-        for stop in stops
-        if stop + 1 >= MIN_PREFIX_FRAMES
-    ]

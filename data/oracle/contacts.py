@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+import numpy as np
+
 from data.records import Collision, Scene
 from data.sim.physics import break_frames
 
@@ -20,18 +22,13 @@ def group_contacts(touching: Mapping[Pair, Iterable[int]], fps: float) -> tuple[
     A contact ends when more frames without touch follow than `data.sim.physics.break_frames`
     allows at the frame rate.
     """
-    gap = break_frames(fps)
     contacts = []
-    for (one, other), frames in touching.items():
-        pair = (min(one, other), max(one, other))
-        start = end = None
-        for frame in sorted(frames):
-            if end is not None and frame - end > gap + 1:
-                contacts.append(Collision(start, pair, end))
-                start = None
-            start, end = frame if start is None else start, frame
-        if end is not None:
-            contacts.append(Collision(start, pair, end))
+    for pair, frames in touching.items():
+        touches = np.sort([*frames])
+        ends = np.flatnonzero(np.diff(touches) > break_frames(fps) + 1) + 1
+        for run in np.split(touches, ends):
+            if len(run):
+                contacts.append(Collision(int(run[0]), tuple(sorted(pair)), int(run[-1])))
     return tuple(sorted(contacts, key=lambda contact: (contact.frame, contact.objects)))
 
 

@@ -27,14 +27,12 @@ def visible_positions(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=64)
 def frame_displacements(scene: Scene, about: tuple[int, ...] | None = None) -> np.ndarray:
-    """Return the largest displacement of an object between any two frames, (F, F) px at 336 x 336.
+    """Return the largest displacement of an object of `about` (indices; all by default) between any
+    two frames, (F, F) px at 336 x 336.
 
     Only objects that are visible (see `visible_positions`) in at least one of the two frames count,
     because the edge of an object on the border of the image, or an object behind another one, does
     not suffice to distinguish frames. The image's diagonal is the maximum.
-
-    Args:
-        about: Indices of the objects that count; all by default.
     """
     positions, visible = visible_positions(scene)
     if about is not None:
@@ -86,11 +84,9 @@ def object_match_scores(
 ) -> np.ndarray:
     """Return the object-match score of each frame with frame `target`, (F,); lower is more similar.
 
-    The score is the mean displacement of objects in the image, as a fraction of the image's
-    diagonal. An object that is in view in only one of the frames counts as 1; in neither, as 0.
-
-    Args:
-        about: Indices of the objects that count; all by default.
+    The score is the mean displacement of the objects of `about` (indices; all by default) in the
+    image, as a fraction of the image's diagonal. An object that is in view in only one of the
+    frames counts as 1; in neither, as 0.
     """
     distance = np.linalg.norm(scene.image_positions - scene.image_positions[target], axis=-1)
     share = np.minimum(distance / np.hypot(*scene.image_size), 1.0)

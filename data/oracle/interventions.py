@@ -37,11 +37,8 @@ def last_factual_frame(scene: Scene, removed: int) -> int | None:
 
 
 def removal_displacements(scene: Scene, counterfactual: Scene, removed: int) -> np.ndarray:
-    """Return the displacement of each object by the removal, (F, N) px at 336 x 336.
-
-    It is 0 for the removed object, and for objects that are not visible in the counterfactual
-    frame.
-    """
+    """Return the displacement of each object by the removal, (F, N) px at 336 x 336: 0 for the
+    removed object, and for objects that are not visible in the counterfactual frame."""
     positions, visible = visible_positions(scene)
     others = [k for k in range(len(scene.objects)) if k != removed]
     other_positions, other_visible = visible_positions(counterfactual)

@@ -56,28 +56,28 @@ def compute_visibility(
     scales = scales or [1.0] * len(objects)
     centre, depth = camera.project(positions)
     radius = np.array([BOUNDING_RADIUS[o.shape] * s for o, s in zip(objects, scales, strict=True)])
-    inner = np.array([half_height(o.shape, s) for o, s in zip(objects, scales, strict=True)])
     low, high = _image_bounds(objects, positions, quaternions, scales, camera)
     size = np.array([camera.width, camera.height])
     stride = max(1, round(STRIDE * camera.magnification))
 
     in_front = depth > radius + 0.05
     outside = ~in_front | ((high < 0) | (low > size)).any(-1)
-    inside = ((low >= 0) & (high <= size)).all(-1)
     # In each axis, a ray passes within a stride of a centre that is in the image. It meets the
     # sphere inscribed in the object if the radius in the image is above sqrt(2) strides. A factor
     # of 2 leaves a margin.
+    inner = np.array([half_height(o.shape, s) for o, s in zip(objects, scales, strict=True)])
     is_met = ((centre >= 0) & (centre < size)).all(-1)
     is_met &= camera.focal * inner > 2 * stride * depth
-    in_view = in_front & (inside | is_met)
+    in_view = in_front & (is_met | ((low >= 0) & (high <= size)).all(-1))
 
-    eye = np.asarray(camera.eye)
-    hides = _may_hide(positions - eye, radius)
+    centres = positions - np.asarray(camera.eye)
+    hides = _may_hide(centres, radius) & ~outside[:, :, None] & ~outside[:, None, :]
     hides &= ((low[:, :, None] < high[:, None]) & (high[:, :, None] > low[:, None])).all(-1)
-    hides &= ~outside[:, :, None] & ~outside[:, None, :]
     may_be_hidden = hides.any(-1)
     for box in parts:
-        may_be_hidden |= _box_may_hide(box, low, high, positions, radius, camera)
+        pixels, depths = camera.project(box.corners)
+        overlap = ((low <= pixels.max(axis=0)) & (high >= pixels.min(axis=0))).all(-1)
+        may_be_hidden |= overlap & (depths.min() < depth + radius)
 
     # Rays are needed only for objects that others may hide, and for those that may be out of view.
     pairs = [*map(tuple, np.argwhere(~outside & (may_be_hidden | ~in_view)).tolist())]
@@ -87,7 +87,7 @@ def compute_visibility(
     windows = [_grid_window(low[pair], high[pair], point[pair], stride, camera) for pair in pairs]
     rays = [pixel_rays(camera)[window].reshape(-1, 3) for window in windows]
 
-    intersect = partial(_intersect_objects, objects, np.array(scales), positions - eye, quaternions)
+    intersect = partial(_intersect_objects, objects, np.array(scales), centres, quaternions)
     # Distances are depths, since rays advance by 1 along the optical axis.
     distances = intersect(pairs, rays)
     covered = [np.isfinite(each) for each in distances]
@@ -149,55 +149,22 @@ def _intersect_objects(
 
 
 def _may_hide(centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Return whether object j may hide a part of object i, (F, N, N) by frame, i and j.
+    """Return whether object j may hide a part of object i if they overlap in the image, (F, N, N)
+    by frame, i and j: their bounding spheres intersect, or j is in front of i.
 
-    This requires that their bounding spheres overlap in the image, and that they intersect or j is
-    in front of i. The power of a point is its squared distance from a sphere's centre minus the
-    squared radius. The points with equal powers form a plane, which separates two disjoint spheres.
-    The camera is on the side of the sphere with the lower power, so every ray meets this sphere
-    first.
+    The power of a point is its squared distance from a sphere's centre minus the squared radius.
+    The points with equal powers form a plane, which separates two disjoint spheres. The camera is
+    on the side of the sphere with the lower power, so every ray meets this sphere first.
 
     Args:
         centres: (F, N, 3) positions relative to the camera.
         radius: (N,) radii of the bounding spheres.
     """
-    distance = np.linalg.norm(centres, axis=-1)
-    toward = centres / distance[..., None]
-    cone = np.arcsin(np.minimum(radius / distance, 1))
-    angle = np.arccos(np.clip(np.einsum("fic,fjc->fij", toward, toward), -1, 1))
-    overlap = angle < cone[:, :, None] + cone[:, None, :]
-    power = distance**2 - radius**2
-    in_front = power[:, None, :] < power[:, :, None]
+    power = (centres**2).sum(axis=-1) - radius**2
     apart = np.linalg.norm(centres[:, :, None] - centres[:, None, :], axis=-1)
     intersect = apart < np.add.outer(radius, radius)
-    return overlap & (in_front | intersect) & ~np.eye(len(radius), dtype=bool)
-
-
-def _box_may_hide(
-    box: Box,
-    low: np.ndarray,
-    high: np.ndarray,
-    positions: np.ndarray,
-    radius: np.ndarray,
-    camera: Camera,
-) -> np.ndarray:
-    """Return whether a box may hide a part of each object, (F, N).
-
-    This requires that the box and the object overlap in the image. It also requires that no face of
-    the box has both the camera and the whole object in front of it: otherwise a ray would meet the
-    object before the box.
-
-    Args:
-        low, high: (F, N, 2) corners of rectangles that contain the objects in the image.
-    """
-    pixels, _ = camera.project(box.corners)
-    overlap = ((low <= pixels.max(axis=0)) & (high >= pixels.min(axis=0))).all(-1)
-    to_local = rotation_matrix(box.quaternion)
-    eye = np.subtract(camera.eye, box.position) @ to_local
-    side = np.where(eye > 0, 1, -1)
-    outside = side * ((positions - box.position) @ to_local) - box.half
-    faces_camera = side * eye > box.half
-    return overlap & ~((outside >= radius[:, None]) & faces_camera).any(-1)
+    is_other = ~np.eye(len(radius), dtype=bool)
+    return is_other & (intersect | (power[:, None, :] < power[:, :, None]))
 
 
 @lru_cache(maxsize=16)
@@ -219,33 +186,20 @@ def _image_bounds(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners (F, N, 2), lowest and highest, of rectangles that contain the objects in
     the image. They are valid for objects whose bounding spheres are in front of the camera."""
-    low, high = np.empty((2, *positions.shape[:2], 2))
-    for k, (each, scale) in enumerate(zip(objects, scales, strict=True)):
-        if each.shape == "cube":
-            turned = CORNERS @ np.swapaxes(rotation_matrix(quaternions[:, k]), -1, -2)
-            pixels, _ = camera.project(positions[:, k, None] + CUBE_HALF * scale * turned)
-            bounds = pixels.min(axis=-2), pixels.max(axis=-2)
-        else:
-            radius = BOUNDING_RADIUS[each.shape] * scale
-            bounds = _sphere_bounds(positions[:, k], radius, camera)
-        low[:, k], high[:, k] = bounds
-    return low, high
-
-
-def _sphere_bounds(
-    centres: np.ndarray, radius: float, camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rectangles of `_image_bounds` for a sphere with centres (F, 3)."""
-    local = (centres - np.asarray(camera.eye)) @ camera.axes.T
-    across, depth = local[:, :2], local[:, 2:]
-    # Planes through the camera touch the sphere at these angles to the optical axis.
+    local = (positions - np.asarray(camera.eye)) @ camera.axes.T
+    across, depth = local[..., :2], local[..., 2:]
+    radius = [BOUNDING_RADIUS[o.shape] * s for o, s in zip(objects, scales, strict=True)]
+    # Planes through the camera touch a bounding sphere at these angles to the optical axis.
     angle = np.arctan2(across, depth)
-    spread = np.arcsin(np.minimum(radius / np.hypot(across, depth), 1))
+    spread = np.arcsin(np.minimum(np.array(radius)[:, None] / np.hypot(across, depth), 1))
     middle = np.array([camera.width / 2, camera.height / 2])
-    return (
-        middle + camera.focal * np.tan(angle - spread),
-        middle + camera.focal * np.tan(angle + spread),
-    )
+    low = middle + camera.focal * np.tan(angle - spread)
+    high = middle + camera.focal * np.tan(angle + spread)
+    for k in [k for k, each in enumerate(objects) if each.shape == "cube"]:
+        turned = CORNERS @ np.swapaxes(rotation_matrix(quaternions[:, k]), -1, -2)
+        pixels, _ = camera.project(positions[:, k, None] + CUBE_HALF * scales[k] * turned)
+        low[:, k], high[:, k] = pixels.min(axis=-2), pixels.max(axis=-2)
+    return low, high
 
 
 def _grid_window(

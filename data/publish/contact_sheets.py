@@ -99,10 +99,13 @@ class SheetRows:
 
     def make(self, record: SelectionItem | RetrievalQuery) -> Row:
         """Return the row of an item or a query."""
-        return self._item(record) if isinstance(record, SelectionItem) else self._query(record)
+        heading, cells = (self._item if isinstance(record, SelectionItem) else self._query)(record)
+        frames = sample_prefix_frames(record.prefix_start, record.prefix_stop, PREFIX_FRAMES)
+        prefix = [self._caption_frame(FrameRef(record.scene_id, f), f"frame {f}") for f in frames]
+        return Row(f"{heading}\n{record.question}", prefix, cells)
 
-    def _item(self, item: SelectionItem) -> Row:
-        """Return the prefix and the candidates of an item, with the answer marked."""
+    def _item(self, item: SelectionItem) -> tuple[str, list[CaptionedFrame]]:
+        """Return the heading and the candidates of an item, with the answer marked."""
         values = {name.replace("_", " "): getattr(item, name) for name in HEADING_FIELDS}
         fields = [f"{name} {value}" for name, value in values.items() if value is not None]
         details = [item.split, *fields, f"minimum displacement {item.min_displacement:.0f} px"]
@@ -116,15 +119,11 @@ class SheetRows:
             caption = f"{_describe_frame(item, candidate)}, {distance:.0f} px from {nearest}"
             source, is_answer = f"{letter}: {candidate.source}", letter == item.letter
             cells.append(self._caption_frame(candidate, source, caption, is_answer=is_answer))
-        heading = f"{item.item_id}    {', '.join(details)}\n{item.question}"
-        return Row(heading, self._prefix(item), cells)
+        return f"{item.item_id}    {', '.join(details)}", cells
 
-    def _query(self, query: RetrievalQuery) -> Row:
-        """Return the prefix, the target and the hard negatives of a query.
-
-        The first hard negative of a counterfactual query is the factual frame: the scene with the
-        object, at the target's moment.
-        """
+    def _query(self, query: RetrievalQuery) -> tuple[str, list[CaptionedFrame]]:
+        """Return the heading, the target and the hard negatives of a query. The first one of a
+        counterfactual query is the factual frame: the scene with the object, at the same moment."""
         caption = _describe_frame(query, query.target)
         cells = [self._caption_frame(query.target, "target", caption, is_answer=True)]
         negatives = list(query.hard_negatives)
@@ -139,12 +138,7 @@ class SheetRows:
             distance = f"{self._displacement(query.target, frame):.0f} px away"
             caption = f"{_describe_frame(query, frame)}, {distance}"
             cells.append(self._caption_frame(frame, "wrong time", caption))
-        heading = f"{query.query_id}    {query.split}, anchor {query.anchor}\n{query.question}"
-        return Row(heading, self._prefix(query), cells)
-
-    def _prefix(self, record: SelectionItem | RetrievalQuery) -> list[CaptionedFrame]:
-        frames = sample_prefix_frames(record.prefix_start, record.prefix_stop, PREFIX_FRAMES)
-        return [self._caption_frame(FrameRef(record.scene_id, f), f"frame {f}") for f in frames]
+        return f"{query.query_id}    {query.split}, anchor {query.anchor}", cells
 
     def _caption_frame(
         self, frame: FrameRef, *caption: str, is_answer: bool = False
@@ -157,11 +151,9 @@ class SheetRows:
 
 
 def _describe_frame(record: SelectionItem | RetrievalQuery, frame: FrameRef) -> str:
-    """Describe when a frame occurs: its index and its offset in frames from the end of the prefix.
-
-    The offset is omitted if the frame belongs to another scene. A counterfactual and an alternative
-    future of the scene count as the same scene.
-    """
+    """Describe when a frame occurs: its index and, unless it belongs to another scene, its offset
+    in frames from the end of the prefix. A counterfactual and an alternative future of the scene
+    count as the same scene."""
     is_same_scene = original_scene_id(frame.scene_id) == record.scene_id
     offset = frame.frame - record.prefix_stop
     return f"frame {frame.frame}" + (f" ({offset:+d})" if is_same_scene else "")

@@ -54,31 +54,22 @@ SHARD_GROUPS = 10
 ORIGINS: dict[str, dict[str, str]] = {
     "bullet": {"license": "apache-2.0"},
     "clevrer": {
-        "title": "CLEVRER",
-        "license": "cc0-1.0",
-        "terms": "CC0 1.0",
-        "link": "http://clevrer.csail.mit.edu",
+        "license": "cc0-1.0", "terms": "CC0 1.0",
+        "title": "CLEVRER", "link": "http://clevrer.csail.mit.edu",
     },
     "movi_a": {
-        "title": "MOVi-A",
-        "license": "other",
-        "name": "kubric-movi-a",
-        "terms": "see the link",
+        "license": "other", "name": "kubric-movi-a", "terms": "see the link", "title": "MOVi-A",
         "link": "https://github.com/google-research/kubric/tree/main/challenges/movi",
     },
-    "tracks": {
-        "title": "videos that the builder of this benchmark supplied",
-        "license": "unknown",
-        "terms": "ask the builder",
-    },
     "physion": {
-        "title": "Physion",
-        "license": "other",
-        "name": "physion",
-        "terms": "see the link",
+        "license": "other", "name": "physion", "terms": "see the link", "title": "Physion",
         "link": "https://github.com/cogtoolslab/physics-benchmarking-neurips2021",
     },
-}
+    "tracks": {
+        "license": "unknown", "terms": "ask the builder",
+        "title": "videos that the builder of this benchmark supplied",
+    },
+}  # fmt: skip
 """Licence and source of the scenes by simulator, as the card states them."""
 Shard = dict[str, Any]
 """Entry of a parquet file in export.json: configuration, split, path relative to the export's
@@ -249,7 +240,6 @@ def summarize(shards: Sequence[Shard]) -> pd.DataFrame:
     """Return the rows, size in MB and number of files of each split."""
     import pandas as pd
 
-    files = pd.DataFrame(shards)
-    splits = files.groupby(["configuration", "split"], sort=False)
+    splits = pd.DataFrame(shards).groupby(["configuration", "split"], sort=False)
     summary = splits.agg(rows=("rows", "sum"), MB=("bytes", "sum"), files=("path", "size"))
     return summary.assign(MB=summary["MB"] / 1e6)

@@ -68,20 +68,12 @@ def box_mesh(half: np.ndarray) -> Mesh:
         normals.append(np.tile(np.insert(np.zeros(2), axis, side), (4, 1)))
     triangles = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]
     uvs = np.tile((corners + 1) / 2, (6, 1))
-    return (
-        half * np.concatenate(vertices),
-        np.concatenate(normals),
-        uvs,
-        triangles.reshape(-1, 3),
-    )
+    return half * np.concatenate(vertices), np.concatenate(normals), uvs, triangles.reshape(-1, 3)
 
 
 def texture(material: str) -> np.ndarray:
-    """Return a (64, 64, 3) uint8 texture that multiplies an object's colour.
-
-    The texture of metal imitates the reflection of a bright sky over a dark horizon; that of rubber
-    is uniform.
-    """
+    """Return a (64, 64, 3) uint8 texture that multiplies an object's colour: for metal, it imitates
+    the reflection of a bright sky over a dark horizon; for rubber, it is uniform."""
     if material == "rubber":
         return np.full((64, 64, 3), 215, dtype=np.uint8)
     across, down = np.meshgrid(np.linspace(0, 1, 64), np.linspace(0, 1, 64))

@@ -80,6 +80,7 @@ class BlenderRenderer:
     def render(self, scene: Scene, frame: int) -> Image.Image:
         """Render one frame as an RGB image. Raises UserError if the Blender process ended."""
         positions, quaternions = scene.positions[frame], scene.quaternions[frame]
+        poses = zip(scene.objects, positions.tolist(), quaternions.tolist(), strict=True)
         objects = [
             {
                 "shape": each.shape,
@@ -88,9 +89,7 @@ class BlenderRenderer:
                 "position": position,
                 "quaternion": quaternion,
             }
-            for each, position, quaternion in zip(
-                scene.objects, positions.tolist(), quaternions.tolist(), strict=True
-            )
+            for each, position, quaternion in poses
         ]
         path = self._request(objects, f"rendering frame {frame} of {scene.scene_id}")
         return Image.open(path).convert("RGB")

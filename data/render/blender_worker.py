@@ -64,12 +64,11 @@ class Studio:
     """A Blender scene with ground, lamps, a camera and one body for each appearance."""
 
     def __init__(self, settings: dict[str, Any], path: Path) -> None:
-        """Set up the scene.
+        """Set up the scene, whose rendered frames are written to `path`.
 
         Args:
             settings: width and height (px), focal (px), the camera's eye and axes (right, down,
                 forward), samples, and half_heights by shape.
-            path: File for rendered frames.
         """
         import bpy
 
@@ -84,12 +83,8 @@ class Studio:
         bpy.context.object.data.materials.append(_material("ground", GROUND))
 
     def render(self, objects: list[dict[str, Any]]) -> None:
-        """Render objects to the file.
-
-        Args:
-            objects: Dicts with shape, material, color (linear RGB), position and quaternion
-                (x y z w).
-        """
+        """Render objects to the file: dicts with shape, material, color (linear RGB), position and
+        quaternion (x y z w)."""
         import bpy
 
         for solid in self._solids.values():

@@ -11,7 +11,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -21,7 +20,7 @@ from data.records import MATERIALS, Scene, SceneObject
 from data.render.appearance import RGB, Mesh, box_mesh, mesh, texture
 from data.render.floor import Floor
 from data.sim.camera import Camera
-from data.sim.parts import Box, world_boxes
+from data.sim.parts import world_boxes
 from data.sim.physics import start_bullet
 
 OVERSAMPLING = 2
@@ -29,15 +28,6 @@ NEAR, FAR = 0.1, 50.0
 """Distances of the clipping planes, simulator units."""
 PART = 2**20
 """Value of the mask at parts, which is no handle of an object."""
-
-
-class Layer(NamedTuple):
-    """What is drawn of some bodies: their pixels (H, W) uint32, depths (H, W), 1 where nothing is
-    drawn, and the handle of the body at each pixel (H, W), -1 where there is none."""
-
-    pixels: np.ndarray
-    depth: np.ndarray
-    mask: np.ndarray
 
 
 class BulletRenderer:
@@ -65,9 +55,8 @@ class BulletRenderer:
         # RGBX, because Pillow would premultiply the colours of an RGBA image by alpha.
         fine = Image.frombuffer("RGBX", mask.shape[::-1], layers, "raw", "RGBX", 0, 1)
         *colors, cover = fine.reduce(OVERSAMPLING).split()
-        shade = self._floor.shade(
-            scene.positions[frame], scene.object_scales, self._shadow_boxes[frame]
-        )
+        boxes = self._shadow_boxes[frame]
+        shade = self._floor.shade(scene.positions[frame], scene.object_scales, boxes)
         bands = []
         uncovered = 1 - np.asarray(cover, np.float32) / 255
         world = self._world
@@ -103,13 +92,19 @@ class BulletRenderer:
         """
         pixels, depth, mask = self._draw()
         if self._parts is not None:
-            hidden = self._parts.depth < depth
-            np.copyto(pixels, self._parts.pixels, where=hidden)
+            part_pixels, part_depth, _ = self._parts
+            hidden = part_depth < depth
+            np.copyto(pixels, part_pixels, where=hidden)
             np.copyto(mask, PART, where=hidden)
         return pixels, mask
 
-    def _draw(self) -> Layer:
-        """Draw the bodies of Bullet's world."""
+    def _draw(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Draw the bodies of Bullet's world.
+
+        Returns:
+            Pixels (H, W) uint32; depths (H, W), 1 where nothing is drawn; and the handle of the
+            body at each pixel (H, W), -1 where there is none.
+        """
         _, _, pixels, depth, mask = self._bullet.getCameraImage(
             self._fine.width,
             self._fine.height,
@@ -123,14 +118,14 @@ class BulletRenderer:
             lightSpecularCoeff=0.6,
             renderer=self._bullet.ER_TINY_RENDERER,
         )
-        return Layer(pixels.view(np.uint32)[..., 0], depth, mask)
+        return pixels.view(np.uint32)[..., 0], depth, mask
 
-    def _draw_parts(self) -> Layer:
+    def _draw_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Draw the world's parts. They never move, so that one drawing serves all frames."""
-        handles = [
-            self._add_part(box, part.color)
-            for box, part in zip(world_boxes(self._world), self._world.parts.values(), strict=True)
-        ]
+        handles = []
+        for box, part in zip(world_boxes(self._world), self._world.parts.values(), strict=True):
+            visual = self._add_visual(box_mesh(np.array(box.half)), part.color, shine=0.05)
+            handles.append(self._add_body(visual, "rubber", box.position, box.quaternion))
         layer = self._draw()
         for handle in handles:
             self._bullet.removeBody(handle)
@@ -161,14 +156,11 @@ class BulletRenderer:
             shine = 1.0 if scene_object.material == "metal" else 0.05
             color = RGB[scene_object.color]
             self._visuals[look] = self._add_visual((vertices * scale, *rest), color, shine)
-        handle = self._bullet.createMultiBody(0, -1, self._visuals[look])
-        self._set_texture(handle, scene_object.material)
-        return handle
+        return self._add_body(self._visuals[look], scene_object.material)
 
-    def _add_part(self, box: Box, color: Sequence[float]) -> int:
-        visual = self._add_visual(box_mesh(np.array(box.half)), color, shine=0.05)
-        handle = self._bullet.createMultiBody(0, -1, visual, box.position, box.quaternion)
-        self._set_texture(handle, "rubber")
+    def _add_body(self, visual: int, material: str, *pose: Sequence[float]) -> int:
+        handle = self._bullet.createMultiBody(0, -1, visual, *pose)
+        self._bullet.changeVisualShape(handle, -1, textureUniqueId=self._textures[material])
         return handle
 
     def _add_visual(self, surface: Mesh, color: Sequence[float], shine: float) -> int:
@@ -182,9 +174,6 @@ class BulletRenderer:
             rgbaColor=[*(np.array(color) / 255), 1],
             specularColor=[shine] * 3,
         )
-
-    def _set_texture(self, handle: int, material: str) -> None:
-        self._bullet.changeVisualShape(handle, -1, textureUniqueId=self._textures[material])
 
 
 def _projection(camera: Camera) -> list[float]:

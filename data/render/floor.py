@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from conf.schema import WorldConfig
-from data.sim.camera import Camera
+from data.sim.camera import Camera, pixel_rays
 from data.sim.parts import world_boxes
 from data.sim.shapes import RADIUS
 
@@ -29,8 +29,7 @@ class Floor:
 
     def __init__(self, camera: Camera, world: WorldConfig) -> None:
         self._camera, self._light = camera, world.light.direction
-        columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        rays = camera.rays(columns.astype(float), rows.astype(float))
+        rays = pixel_rays(camera)
         is_sky = rays[..., 2] > -1e-3
         self._is_sky = np.nonzero(is_sky)
         reach = camera.eye[2] / np.where(is_sky, np.inf, -rays[..., 2])
@@ -47,16 +46,9 @@ class Floor:
     def shade(
         self, positions: np.ndarray, scales: Sequence[float], boxes: np.ndarray
     ) -> np.ndarray:
-        """Compute the brightness of the floor with the objects' shadows.
-
-        Args:
-            positions: (N, 3) positions of the objects.
-            scales: (N,) sizes of the objects.
-            boxes: (N, 4) bounding boxes of their shadows, from `shadow_boxes`.
-
-        Returns:
-            (H, W) float32 factors for the colour of the floor.
-        """
+        """Return the brightness of the floor with the shadows of objects at positions (N, 3), as
+        (H, W) float32 factors for its colour. `scales` are the sizes (N,) of the objects, and
+        `boxes` the bounding boxes (N, 4) of their shadows, from `shadow_boxes`."""
         shade = self._lit.copy()
         centres = self._shadow_centres(positions, scales).tolist()
         for (x, y), scale, (left, top, right, bottom) in zip(
@@ -69,26 +61,15 @@ class Floor:
         return shade
 
     def paint(self, shade: np.ndarray, floor: float, background: float) -> np.ndarray:
-        """Return one colour channel (H, W) of the floor, and of the background above the horizon.
-
-        Args:
-            shade: Factors from `shade`.
-            floor, background: The channel's values, 0 to 255.
-        """
+        """Return one colour channel (H, W) of the floor, in `shade`, and of the background above
+        the horizon; `floor` and `background` are its values, 0 to 255."""
         channel = shade * floor
         channel[self._is_sky] = background
         return channel
 
     def shadow_boxes(self, positions: np.ndarray, scales: Sequence[float]) -> np.ndarray:
-        """Compute the bounding boxes of the shadows in the image.
-
-        Args:
-            positions: (..., N, 3) positions of the objects.
-            scales: (N,) sizes of the objects.
-
-        Returns:
-            (..., N, 4) left, top, right and bottom in pixels; right and bottom are exclusive.
-        """
+        """Return the bounding boxes (..., N, 4) of the shadows of objects at positions (..., N, 3)
+        of sizes (N,): left, top, right and bottom in pixels; right and bottom are exclusive."""
         ground = np.zeros(positions.shape)
         ground[..., :2] = self._shadow_centres(positions, scales)
         corners = _REACH * np.array([[-1, -1, 0], [-1, 1, 0], [1, -1, 0], [1, 1, 0]])

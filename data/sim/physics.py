@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from conf.schema import PartConfig, WorldConfig
+from conf.schema import WorldConfig
 from data.records import Landing, SceneObject
-from data.sim.parts import part_box
+from data.sim.parts import world_boxes
 from data.sim.shapes import CUBE_HALF, RADIUS, half_height
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ class Body:
     """An object and its initial state: ground position, yaw in radians, ground velocity."""
 
     object: SceneObject
-    position: Sequence[float] | np.ndarray
-    yaw: float
+    position: Sequence[float] | np.ndarray = (0.0, 0.0)
+    yaw: float = 0.0
     velocity: Sequence[float] | np.ndarray = (0.0, 0.0)
     height: float | None = None
     """Initial height of the centre of a body in the air; None for a body on the floor."""
@@ -58,17 +58,17 @@ class Motion:
     Attributes:
         states: (F, N, 13) positions, quaternions, linear and angular velocities as in `Scene`.
         touching: The frames in which each pair touches.
-        touching_at_start: Whether any two bodies, or a body and a part, touch at the first frame.
-            Such a motion is not simulated: it has the first frame only.
         landings: Landings, on the floor or on a part, of bodies that start in the air.
         is_rejected: Whether the simulation stopped because the caller rejected its contacts.
+        touching_at_start: Whether any two bodies, or a body and a part, touch at the first frame.
+            Such a motion is not simulated: it has the first frame only.
     """
 
     states: np.ndarray
     touching: Touching
-    touching_at_start: bool
     landings: tuple[Landing, ...] = ()
     is_rejected: bool = False
+    touching_at_start: bool = False
 
     @property
     def positions(self) -> np.ndarray:
@@ -118,21 +118,16 @@ class Simulator:
         frames: int | None = None,
         is_rejected: Callable[[Touching], bool] = lambda touching: False,
     ) -> Motion:
-        """Simulate bodies in a world. Equal arguments give bit-identical results.
-
-        Args:
-            frames: Number of frames; that of the world by default.
-            is_rejected: Whether the contacts so far make the motion useless. The simulation then
-                stops, and the result is the motion up to this frame.
-        """
+        """Simulate bodies in a world, by default for its number of frames. Equal arguments give
+        bit-identical results. `is_rejected` says whether the contacts so far make the motion
+        useless: the simulation then stops, and the result is the motion up to this frame."""
         fixed = self._reset(world)
         handles = [self._add_body(body, world) for body in bodies]
         if any(
             self._bullet.getClosestPoints(a, b, TOUCHING)
             for a, b in chain(combinations(handles, 2), product(handles, fixed[1:]))
         ):
-            states = self._state(handles)[None]
-            return Motion(states, {}, touching_at_start=True)
+            return Motion(self._state(handles)[None], {}, touching_at_start=True)
         frames = frames or world.physics.frames
         recorded = np.zeros((frames, len(bodies), 13))
         recorded[0] = self._state(handles)
@@ -149,9 +144,7 @@ class Simulator:
                     if point[1] not in fixed and point[2] not in fixed and point[9] > 0:
                         pairs.add(tuple(sorted(map(handles.index, point[1:3]))))
                 for k in list(in_air):
-                    points = chain.from_iterable(
-                        list_contacts(surface, handles[k]) for surface in fixed
-                    )
+                    points = (p for surface in fixed for p in list_contacts(surface, handles[k]))
                     if any(point[9] > 0 for point in points):
                         in_air.remove(k)
                         landings.append(Landing(frame, k))
@@ -161,13 +154,7 @@ class Simulator:
             if pairs and (rejected := is_rejected(touching)):
                 recorded = recorded[: frame + 1]
                 break
-        return Motion(
-            recorded,
-            dict(touching),
-            touching_at_start=False,
-            landings=tuple(landings),
-            is_rejected=rejected,
-        )
+        return Motion(recorded, dict(touching), tuple(landings), rejected)
 
     def simulate_branches(
         self,
@@ -178,18 +165,13 @@ class Simulator:
         world: WorldConfig,
         frames: int,
     ) -> np.ndarray:
-        """Simulate objects from one state with several choices of their velocities.
-
-        Args:
-            states: (N, 13) states of the objects, such as those at a frame of a scene.
-            velocities: (K, N, 6) linear and angular velocities of each branch, instead of those in
-                `states`.
-            frames: Number of frames, of which the first has the given state.
+        """Simulate objects from states (N, 13) with several choices of their velocities: linear and
+        angular ones (K, N, 6) for K branches.
 
         Returns:
-            (K, frames, N, 13) states, bit-identical for equal arguments. A branch with the
-            velocities of `states` is close to an uninterrupted simulation, but not equal, because
-            Bullet keeps contacts from step to step.
+            (K, frames, N, 13) states, the given ones first, bit-identical for equal arguments. A
+            branch with the velocities of `states` is close to an uninterrupted simulation, but not
+            equal, because Bullet keeps contacts from step to step.
         """
         self._reset(world)
         handles = [
@@ -222,28 +204,19 @@ class Simulator:
             solverResidualThreshold=0,
             deterministicOverlappingPairs=1,
         )
-        floor = bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))
-        bullet.changeDynamics(
-            floor,
-            -1,
-            lateralFriction=physics.floor_friction,
-            restitution=physics.floor_restitution,
-        )
-        return [floor, *(self._add_part(part) for part in world.parts.values())]
-
-    def _add_part(self, part: PartConfig) -> int:
-        bullet, box = self._bullet, part_box(part)
-        form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=box.half)
-        handle = bullet.createMultiBody(0, form, -1, box.position, box.quaternion)
-        bullet.changeDynamics(
-            handle, -1, lateralFriction=part.friction, restitution=part.restitution
-        )
-        return handle
+        surfaces = [(physics.floor_friction, physics.floor_restitution)]
+        fixed = [bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))]
+        for part, box in zip(world.parts.values(), world_boxes(world), strict=True):
+            form = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=box.half)
+            fixed.append(bullet.createMultiBody(0, form, -1, box.position, box.quaternion))
+            surfaces.append((part.friction, part.restitution))
+        for handle, (friction, restitution) in zip(fixed, surfaces, strict=True):
+            bullet.changeDynamics(handle, -1, lateralFriction=friction, restitution=restitution)
+        return fixed
 
     def _add_body(self, body: Body, world: WorldConfig) -> int:
-        height = body.height
-        if height is None:
-            height = half_height(body.object.shape, body.scale)
+        on_floor = half_height(body.object.shape, body.scale)
+        height = on_floor if body.height is None else body.height
         turn = self._bullet.getQuaternionFromEuler([0, 0, body.yaw])
         state = [*body.position, height, *turn, *body.velocity, 0.0, 0.0, 0.0, 0.0]
         return self._add(body.object, body.scale, state, world)

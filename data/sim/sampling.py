@@ -17,7 +17,8 @@ from data.records import COLORS, MATERIALS, SceneObject
 from data.sim import starts
 from data.sim.camera import Camera
 from data.sim.parts import world_boxes
-from data.sim.starts import RejectedError, Sample, SizedObject
+from data.sim.physics import Body
+from data.sim.starts import RejectedError, Sample
 
 STARTS = {"slide": starts.slide, "throw": starts.throw, "strike": starts.strike}
 """Functions that sample the initial states of objects, by `start.kind` of the world."""
@@ -76,38 +77,35 @@ def sample_scene(world: WorldConfig, seed: int, index: int) -> Sample:
 def check_view(world: WorldConfig, camera: Camera) -> None:
     """Raises UserError if the camera does not see `start.middle`, or if a part is not entirely in
     front of the camera and above the floor."""
-    uses_middle = world.start.kind != "strike"
-    if uses_middle and not starts.is_on_screen(np.array(world.start.middle), 0.0, camera):
-        raise UserError(
-            f"world {world.name}: the camera does not see benchmark.world.start.middle="
-            f"{world.start.middle}: change benchmark.world.camera.aim={world.camera.aim} or "
-            "benchmark.world.camera.position",
-            code="impossible-world",
+    problems, start = [], world.start
+    if start.kind != "strike" and not starts.is_on_screen(np.array(start.middle), 0.0, camera):
+        problems.append(
+            f"the camera does not see benchmark.world.start.middle={start.middle}: change "
+            f"benchmark.world.camera.aim={world.camera.aim} or benchmark.world.camera.position"
         )
     for name, box in zip(world.parts, world_boxes(world), strict=True):
+        part, lowest = f"benchmark.world.parts.{name}", box.corners[:, 2].min()
         if camera.project(box.corners)[1].min() < MIN_PART_DEPTH:
-            raise UserError(
-                f"world {world.name}: benchmark.world.parts.{name} is not entirely in front of the "
-                "camera: move it or the camera",
-                code="impossible-world",
+            problems.append(f"{part} is not entirely in front of the camera: move it or the camera")
+        elif lowest < MIN_CORNER_HEIGHT:
+            problems.append(
+                f"{part} reaches {-lowest:.2f} below the floor, where it would be drawn over it: "
+                "raise the z of its position"
             )
-        if (lowest := box.corners[:, 2].min()) < MIN_CORNER_HEIGHT:
-            raise UserError(
-                f"world {world.name}: benchmark.world.parts.{name} reaches {-lowest:.2f} below the "
-                "floor, where it would be drawn over it: raise the z of its position",
-                code="impossible-world",
-            )
+    if problems:
+        raise UserError(f"world {world.name}: {problems[0]}", code="impossible-world")
 
 
-def sample_objects(rng: np.random.Generator, world: WorldConfig) -> list[SizedObject]:
-    """Sample the number of objects in a scene, their distinct appearances and their sizes."""
+def sample_objects(rng: np.random.Generator, world: WorldConfig) -> list[Body]:
+    """Sample the number of objects in a scene, their distinct appearances and their sizes. The
+    bodies have no places yet."""
     settings = world.objects
     every = [SceneObject(*each) for each in product(settings.shapes, MATERIALS, COLORS)]
     count = int(rng.integers(settings.min_count, settings.max_count + 1))
     chosen = [every[k] for k in rng.choice(len(every), count, replace=False)]
     low, high = settings.scale
     scales = rng.uniform(low, high, count).tolist() if low < high else [low] * count
-    return [SizedObject(*each) for each in zip(chosen, scales, strict=True)]
+    return [Body(each, scale=scale) for each, scale in zip(chosen, scales, strict=True)]
 
 
 def check_sample(sample: Sample, world: WorldConfig) -> None:

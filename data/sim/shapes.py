@@ -43,7 +43,7 @@ def intersect_object(
     Args:
         scale: Size of the object, or (P,) sizes, one for each ray.
         origin: (3,) origin of all rays, or (P, 3) origins, in the object's own coordinates.
-        direction: (P, 3) directions, likewise.
+        direction: (P, 3).
     """
     if shape == "cube":
         return intersect_box(CUBE_HALF * np.asarray(scale)[..., None], origin, direction)

@@ -1,7 +1,7 @@
 """The ways in which a scene starts: `slide`, `throw` and `strike`.
 
-Each is a function that samples the initial states of given objects. It raises `RejectedError` if
-the sample is unsuitable; `data.sim.sampling` then samples the scene again.
+Each is a function that samples the initial states of given bodies. It raises `RejectedError` if the
+sample is unsuitable; `data.sim.sampling` then samples the scene again.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from conf.schema import WorldConfig
-from data.records import SceneObject
 from data.sim.camera import Camera
 from data.sim.parts import surface_height, world_boxes
 from data.sim.physics import Body, Motion, Touching, has_repeated, shared_simulator
@@ -59,20 +58,12 @@ class Sample:
     scenario: str = ""
 
 
-@dataclass(frozen=True)
-class SizedObject:
-    """An object and its size, as a multiple of the standard size of its shape."""
-
-    object: SceneObject
-    scale: float
-
-
 def slide(
-    objects: Sequence[SizedObject], world: WorldConfig, camera: Camera, rng: np.random.Generator
+    objects: Sequence[Body], world: WorldConfig, camera: Camera, rng: np.random.Generator
 ) -> Sample:
-    """Sample bodies whose first body slides into the view.
+    """Sample bodies of which the first slides into the view.
 
-    Each further body is placed so that it collides with an earlier body, until the scene has its
+    Each further body is placed so that it collides with an earlier one, until the scene has its
     intended number of collisions; the others rest and touch no other body. A placement by which a
     pair touches at the start or collides twice is rejected.
     """
@@ -85,7 +76,7 @@ class _Slide:
     camera: Camera
     rng: np.random.Generator
 
-    def sample(self, objects: Sequence[SizedObject]) -> Sample:
+    def sample(self, objects: Sequence[Body]) -> Sample:
         intended = int(self.rng.choice(list(COLLISIONS), p=list(COLLISIONS.values())))
         goal = min(intended, self.world.start.max_collisions or intended)
         bodies = [self._entering(objects[0])]
@@ -100,15 +91,12 @@ class _Slide:
             bodies, motion = extended
         return Sample(bodies, motion)
 
-    def _body(
-        self, added: SizedObject, place: np.ndarray, velocity: np.ndarray | None = None
-    ) -> Body:
+    def _body(self, added: Body, place: np.ndarray, velocity: Sequence[float] = (0, 0)) -> Body:
         """Return a body at a place on the floor with a random yaw; by default at rest."""
-        velocity = np.zeros(2) if velocity is None else velocity
         yaw = self.rng.uniform(0, 2 * np.pi)
-        return Body(added.object, place, yaw, velocity, scale=added.scale)
+        return replace(added, position=place, yaw=yaw, velocity=velocity)
 
-    def _entering(self, added: SizedObject) -> Body:
+    def _entering(self, added: Body) -> Body:
         """Sample a body that moves from far away towards the middle."""
         rng, start = self.rng, self.world.start
         middle = np.array(start.middle)
@@ -119,21 +107,16 @@ class _Slide:
         return self._body(added, begin, rng.uniform(*start.speed) * direction)
 
     def _try_body(
-        self, bodies: list[Body], motion: Motion, added: SizedObject, goal: int
+        self, bodies: list[Body], motion: Motion, added: Body, goal: int
     ) -> tuple[list[Body], Motion] | None:
         """Add a body that collides with another body or, once there are `goal` collisions, with
-        none.
-
-        Returns:
-            All bodies and their motion, or None if the sampled body does not fit.
-        """
+        none. Return all bodies and their motion, or None if the sampled body does not fit."""
         is_colliding = len(motion.touching) < goal
         body = (self._colliding if is_colliding else self._resting)(added, motion)
         if body is None:
             return None
         extended = [*bodies, body]
-        # A body at rest usually stays clear of the others, and then need not be simulated with
-        # them.
+        # A body at rest that stays clear of the others need not be simulated with them.
         combined = None if is_colliding else self._combine(motion, body)
         most = self.world.start.max_collisions or math.inf
 
@@ -142,9 +125,8 @@ class _Slide:
             is_repeated = has_repeated(contacts, self.world.physics.fps)
             return is_repeated or len(contacts) > most or (collides and not is_colliding)
 
-        result = combined or shared_simulator().simulate(
-            extended, self.world, is_rejected=is_rejected
-        )
+        simulate = shared_simulator().simulate
+        result = combined or simulate(extended, self.world, is_rejected=is_rejected)
         if result.touching_at_start or result.is_rejected:
             return None
         collides = any(len(bodies) in pair for pair in result.touching)
@@ -169,7 +151,7 @@ class _Slide:
             return None
         return replace(motion, states=np.concatenate([motion.states, alone.states], axis=1))
 
-    def _colliding(self, added: SizedObject, motion: Motion) -> Body | None:
+    def _colliding(self, added: Body, motion: Motion) -> Body | None:
         """Sample a body that should collide with another body on screen: at rest in its path, or
         moving towards its future position. Returns None if the sample is unsuitable."""
         rng, physics, start = self.rng, self.world.physics, self.world.start
@@ -189,7 +171,7 @@ class _Slide:
         direction = unit_vector(rng.uniform(0, 2 * np.pi))
         return self._body(added, place - travel * direction, speed * direction)
 
-    def _resting(self, added: SizedObject, motion: Motion) -> Body | None:
+    def _resting(self, added: Body, motion: Motion) -> Body | None:
         """Sample a body at rest on screen; return None if it is off screen or near another's
         path."""
         rng, (x_min, y_min, x_max, y_max) = self.rng, self.world.start.area
@@ -199,12 +181,12 @@ class _Slide:
             return None
         return self._body(added, place)
 
-    def _is_on_screen(self, place: np.ndarray, added: SizedObject) -> bool:
+    def _is_on_screen(self, place: np.ndarray, added: Body) -> bool:
         return is_on_screen(place, half_height("sphere", added.scale), self.camera)
 
 
 def throw(
-    objects: Sequence[SizedObject], world: WorldConfig, camera: Camera, rng: np.random.Generator
+    objects: Sequence[Body], world: WorldConfig, camera: Camera, rng: np.random.Generator
 ) -> Sample:
     """Sample objects above the floor or above a part that move towards the middle.
 
@@ -222,9 +204,7 @@ def throw(
         if is_resting:
             height = half_height(each.object.shape, each.scale)
             on_part = surface + height + CLEARANCE if surface else None
-            bodies.append(
-                Body(each.object, place, rng.uniform(0, np.pi), height=on_part, scale=each.scale)
-            )
+            bodies.append(replace(each, position=place, yaw=rng.uniform(0, np.pi), height=on_part))
             height += surface
         else:
             height = surface + rng.uniform(*start.height)
@@ -239,7 +219,7 @@ def throw(
 
 
 def strike(
-    objects: Sequence[SizedObject], world: WorldConfig, camera: Camera, rng: np.random.Generator
+    objects: Sequence[Body], world: WorldConfig, camera: Camera, rng: np.random.Generator
 ) -> Sample:
     """Sample a row of objects at rest, and an object that strikes the first object of the row.
 
@@ -254,7 +234,7 @@ def strike(
     for each in row:
         if not is_on_screen(place, RADIUS, camera):
             raise RejectedError(OFF_SCREEN)
-        bodies.append(Body(each.object, place, rng.uniform(0, np.pi), scale=each.scale))
+        bodies.append(replace(each, position=place, yaw=rng.uniform(0, np.pi)))
         step = rng.uniform(*ROW_STEP) * max(world.objects.scale[1], 1.0)
         place = place + step * unit_vector(bearing + rng.normal(0, 0.15))
     if rng.random() < 0.5:
@@ -281,12 +261,8 @@ def _near_middle(world: WorldConfig, rng: np.random.Generator) -> np.ndarray:
 def is_on_screen(place: np.ndarray, height: float, camera: Camera) -> bool:
     """Return whether a point above a ground position is on screen, with a margin of `MARGIN`."""
     pixel, depth = camera.project(np.array([*place, height]))
-    margin = round(MARGIN * camera.magnification)
-    return bool(
-        depth > 1
-        and margin < pixel[0] < camera.width - margin
-        and margin < pixel[1] < camera.height - margin
-    )
+    margin, size = round(MARGIN * camera.magnification), np.array([camera.width, camera.height])
+    return bool(depth > 1 and ((margin < pixel) & (pixel < size - margin)).all())
 
 
 def length(vector: np.ndarray) -> float:

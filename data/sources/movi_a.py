@@ -94,9 +94,6 @@ class Instance(States):
     color_label: Literal[WORDS["color_label"]]
     size_label: Literal[WORDS["size_label"]]
 
-    def describe(self) -> SceneObject:
-        return SceneObject(self.shape, self.material, self.color_label, self.size_label)
-
 
 class Video(Layout):
     resolution: conlist(Annotated[int, Field(gt=0)], min_length=2, max_length=2)
@@ -172,7 +169,7 @@ def read_scene(path: Path, folder: Path, split: str) -> Scene:
     scene = Scene(
         scene_id=_scene_id(path, folder),
         split=split,
-        objects=tuple(each.describe() for each in instances),
+        objects=tuple(SceneObject(*(getattr(each, key) for key in WORDS)) for each in instances),
         collisions=find_contacts(touches, len(instances), FPS),
         positions=array("positions"),
         quaternions=np.where(upright, [0, 0, 0, 1], quaternions),

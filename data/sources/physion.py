@@ -153,12 +153,10 @@ def _find_radii(
     collisions: tuple[Collision, ...],
     positions: np.ndarray,
 ) -> tuple[float, ...]:
-    """Return half of the horizontal extent of each object.
-
-    It is that of its bounds in the first frame. Without bounds, it is that of a model of width 1,
-    as TDW's primitives have it, at the object's scale; without scales, half of the distance on the
-    ground at the object's first contact, or the mean of the others.
-    """
+    """Return half of the horizontal extent of each object: that of its bounds in the first frame.
+    Without bounds, it is that of a model of width 1, as TDW's primitives have it, at the object's
+    scale; without scales, half of the distance on the ground at the object's first contact, or the
+    mean of the others."""
     shape = positions.shape[1:]
     radii = np.full(len(order), np.nan)
     for contact in reversed(collisions):
@@ -219,8 +217,7 @@ def _find_events(
     frames: list[h5py.Group], ids: list[int], positions: np.ndarray, fps: float
 ) -> tuple[tuple[Collision, ...], tuple[Landing, ...]]:
     """Return the contacts of pairs, and each object's first contact with the floor after some
-    frames without any contact. A pair that a file without `states` lists before frame
-    `START_FRAMES` is in contact from the start.
+    frames without any contact.
 
     The file does not assign contact points with walls and the floor to objects, so each is assigned
     to the object that is nearest to it seen from above, among those that touch a wall or the floor.
@@ -314,8 +311,8 @@ def _find(parent: h5py.Group, key: str) -> Any:
 def _read_series(
     frames: list[h5py.Group], key: str, shape: tuple[int, ...], optional: bool = False
 ) -> np.ndarray:
-    """Return a dataset of all frames as an array (F, *shape); with `optional`, the first frame may
-    lack it, for which NaN stands in all frames, and non-finite values stay."""
+    """Return a dataset of all frames as an array (F, *shape). With `optional`, non-finite values
+    stay, and NaN stands for a dataset that the first frame lacks."""
     if optional and not _has(frames[0], key):
         return np.full((len(frames), *shape), np.nan, np.float32)
     return np.stack([_read_array(frame, key, shape, optional=optional) for frame in frames])
@@ -328,8 +325,7 @@ def _read_array(
     dtype: type = np.float32,
     optional: bool = False,
 ) -> np.ndarray:
-    """Return a dataset as an array of `shape`, in which -1 stands for any length, or as it is. With
-    `optional`, non-finite values stay."""
+    """Return a dataset as an array of `shape` (see `finite_array`), or as it is."""
     try:
         values = np.asarray(_find(parent, key)[()])
     except (TypeError, ValueError) as error:

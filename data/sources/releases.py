@@ -45,8 +45,7 @@ LOGGED_PROBLEMS = 5
 
 def list_release(cfg: BenchmarkConfig) -> list[list[Path]]:
     """Return the paths of a release's scenes, at most `cfg.scenes`, by video: all clips of a video
-    belong in one split. Raises UserError as the readers do, and if the release's folder is not
-    set."""
+    belong in one split. Raises UserError as the readers do, and if `cfg.folder` is not set."""
     if cfg.folder is None:
         raise UserError(
             f"benchmark.simulator={cfg.simulator} reads a release: set its folder with "
@@ -91,14 +90,12 @@ def read_release(
         for problem in cfg.find_pixel_problem(*size):
             raise SettingsError(problem)
     if factors:
-        low, high = (f"{bound:.3g}" for bound in (min(factors), max(factors)))
+        bounds = dict.fromkeys(f"{bound(factors):.3g}" for bound in (min, max))
+        other = f", or benchmark.fps={cfg.fps:g} is wrong" if cfg.simulator == "physion" else ""
         log.warning(
-            "velocities of %d scenes of %d were multiplied by %s, so that they agree with the "
-            "positions: the release has another unit of time%s",
-            len(factors),
-            len(split_of),
-            low if low == high else f"{low} to {high}",
-            f", or benchmark.fps={cfg.fps:g} is wrong" if cfg.simulator == "physion" else "",
+            f"velocities of {len(factors)} scenes of {len(split_of)} were multiplied by "
+            f"{' to '.join(bounds)}, so that they agree with the positions: the release has "
+            f"another unit of time{other}"
         )
     if problems and strict:
         raise UserError(
@@ -106,8 +103,7 @@ def read_release(
         )
     for problem in problems[:LOGGED_PROBLEMS]:
         log.warning("left out: %s", problem)
-    if len(problems) > LOGGED_PROBLEMS:
-        more = len(problems) - LOGGED_PROBLEMS
+    if (more := len(problems) - LOGGED_PROBLEMS) > 0:
         log.warning("left out: %d more invalid records of %d", more, len(split_of))
     return scene_ids, {"bad records left out": len(problems)}
 
@@ -142,9 +138,6 @@ def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: 
     else:
         save_scene(scene, scene_path(folder, scene.scene_id))
         rescaled = [w.message for w in caught if isinstance(w.message, RescaledVelocities)]
-        outcome = {
-            "scene_id": scene.scene_id,
-            "factors": [each.factor for each in rescaled],
-            "image_size": scene.image_size,
-        }
+        factors = [each.factor for each in rescaled]
+        outcome = {"scene_id": scene.scene_id, "factors": factors, "image_size": scene.image_size}
     write_bytes(part, json.dumps(outcome).encode())

@@ -48,12 +48,11 @@ def make_scenes(
     names = [scene_prefix(cfg) + f"s{cfg.seed}-{k:06d}" for k in range(cfg.scenes)]
     scene_ids = keep_test_scenes(cfg, split_scenes(cfg, names))
     split_of = {name: split for split, ids in scene_ids.items() for name in ids}
-    jobs = {
-        path: partial(_simulate_one, cfg, index, split_of[name], path)
-        for index, name in enumerate(names)
-        if name in split_of
-        for path in [scene_path(folder, name)]
-    }
+    jobs = {}
+    for index, name in enumerate(names):
+        if name in split_of:
+            path = scene_path(folder, name)
+            jobs[path] = partial(_simulate_one, cfg, index, split_of[name], path)
     workers.write_files(jobs, "simulating scenes", "scene")
     return scene_ids, {}
 
@@ -68,9 +67,8 @@ def scene_prefix(cfg: BenchmarkConfig) -> str:
 def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, list[Element]]:
     """Assign a random share of every `SPLIT_BLOCK` scenes to the test split; the order is kept.
 
-    A scene's split depends only on its index, the seed and the test share, so that a scene has the
-    same split in a smaller and in a larger benchmark, unless a split would be empty: it then gets a
-    scene of the other one.
+    A scene's split depends only on its index, the seed and the test share, not on the number of
+    scenes, unless a split would be empty: it then gets a scene of the other one.
     """
     splits: dict[str, list[Element]] = {split: [] for split in SPLITS}
     for first in range(0, len(scenes), SPLIT_BLOCK):
@@ -95,8 +93,7 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
 
 
 def keep_test_scenes(cfg: BenchmarkConfig, scene_ids: dict[str, list[str]]) -> dict[str, list[str]]:
-    """Keep `cfg.test_scenes` random scenes of the test split, in the same order; nothing uses the
-    others."""
+    """Keep `cfg.test_scenes` random scenes of the test split, in the same order."""
     test = scene_ids["test"]
     order = named_rng(cfg.seed, "test scenes").permutation(len(test))
     chosen = {*order[: cfg.test_scenes].tolist()}

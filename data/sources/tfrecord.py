@@ -24,8 +24,8 @@ HEADER, FOOTER = 12, 4
 
 
 def record_ranges(path: Path) -> list[range]:
-    """Return the range of bytes in the file that contains the data of each record. The last one may
-    reach beyond the end of the file: the records after it cannot be located."""
+    """Return the range of bytes that contains the data of each record. The last one may reach
+    beyond the end of the file: the records after it cannot be located."""
     size, start, ranges = path.stat().st_size, 0, []
     with open(path, "rb") as file:
         while start < size:

@@ -179,8 +179,7 @@ def _name_object(text: Path, names: Names, own: VideoNames, key: int, track: Tra
 
 
 def _check_track(text: Path, key: int, track: Track, times: np.ndarray, video: Video) -> None:
-    """Refuse a box beyond the video, and a jump between two frames of which the second is one of
-    `times`."""
+    """Refuse a box beyond the video, and a jump to a frame of `times` from the one before."""
     if track.frames[-1] >= (total := len(video.times)):
         raise RecordError(
             f"{text}: line {track.lines[-1]}: frame {track.frames[-1] + 1} is beyond the {total} "

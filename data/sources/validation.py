@@ -112,10 +112,9 @@ def scene_id(*parts: str) -> str:
 def check_unique_scenes(
     folder: Path, paths: list[Path], id_of: Callable[[Path], str], contents: str
 ) -> list[Path]:
-    """Check that a release has scenes and none of them twice, and return `paths`, one per scene.
-
-    `id_of` returns the scene id of a path, and `contents` describes what the folder should contain.
-    """
+    """Return `paths`, one per scene, of a release. Raises UserError if there are none, or if
+    `id_of`, which returns the scene id of a path, is equal for two. `contents` describes what the
+    folder should contain."""
     if not folder.is_dir():
         raise UserError(
             f"folder {folder} does not exist: choose the folder that contains {contents}",
@@ -144,11 +143,8 @@ def check_unique_objects(where: str, ids: Sequence[int]) -> None:
 
 
 def finite_array(values: Any, shape: tuple[int, ...], optional: bool = False) -> np.ndarray:
-    """Return numbers as an array of `shape`, in which -1 stands for any length.
-
-    With `optional`, non-finite numbers may stand for what is not recorded. Raises ValueError if
-    they do not fit the shape, or not all of them are finite numbers.
-    """
+    """Return numbers as an array of `shape`, in which -1 stands for any length. Raises ValueError
+    if they do not fit it, or if some are non-finite, unless `optional` permits these."""
     try:
         array = np.asarray(values, np.float64).reshape(shape)
     except (TypeError, ValueError) as error:
@@ -162,8 +158,8 @@ def finite_array(values: Any, shape: tuple[int, ...], optional: bool = False) ->
 def find_contacts(
     touches: Iterable[tuple[int, Sequence[int]]], count: int, fps: float
 ) -> tuple[Collision, ...]:
-    """Return the contacts of two of `count` objects, from the frames in which pairs touch. Another
-    index stands for what is no object, such as the floor."""
+    """Return the contacts of `count` objects, from the frames in which pairs of indices touch.
+    Another index stands for what is no object, such as the floor."""
     touching: dict[tuple[int, int], list[int]] = defaultdict(list)
     for frame, pair in touches:
         one, other = sorted(pair)
@@ -195,10 +191,9 @@ def reconcile_velocities(scene: Scene, path: Path) -> Scene:
     """Return a scene whose velocities agree with its positions and its frame rate.
 
     Velocities of another unit of time are multiplied by the factor that explains the difference,
-    with the warning `RescaledVelocities`; without such a factor, the record is invalid. Where an
-    object lacks velocities, they are the central differences of its positions or of its
-    orientations: if some are non-finite, or if all are zero although it moves, as a simulator
-    records them for what it does not simulate as a rigid body.
+    with the warning `RescaledVelocities`; without such a factor, RecordError is raised. An object
+    lacks velocities if some are non-finite, or if all are zero although it moves, as a simulator
+    records them for what is no rigid body. They are then derived from positions or orientations.
     """
     norms = np.linalg.norm(scene.quaternions, axis=-1)
     if (wrong := np.argwhere(np.abs(norms - 1) > 0.01)).size:
@@ -241,9 +236,8 @@ def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
     """Return the factor by which velocities are to be multiplied to agree with the displacements
     between frames, and how much those of each object still deviate (N,), as a share.
 
-    Compared are central differences, in frames in which an object moves, hardly turns, and does not
+    Frames are compared in which an object moves, hardly turns, has finite velocities, and does not
     begin or end a contact. If there are few, the factor is 1; an object with few deviates by 0.
-    Velocities that are NaN are left out.
     """
     moved, turned = (rates[1:-1] for rates in _find_rates(scene))
     velocities = scene.velocities[1:-1].astype(float)
@@ -271,8 +265,8 @@ def compare_velocities(scene: Scene) -> tuple[float, np.ndarray]:
 
 
 def _find_rates(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return linear and angular velocities (F, N, 3) from the differences of positions and of
-    orientations: central ones, and one-sided ones in the first and the last frame."""
+    """Return linear and angular velocities (F, N, 3) by central differences of positions and of
+    orientations; in the first and the last frame, by one-sided ones."""
     from scipy.spatial.transform import Rotation
 
     frames = np.arange(scene.frames)

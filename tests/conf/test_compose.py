@@ -30,12 +30,6 @@ def test_unknown_key_suggests_the_nearest(override, suggested):
         compose("train.sft", SftCommand, [override])
 
 
-@pytest.mark.parametrize("override", ["={window: 20}", ".window=20"])
-def test_dict_of_values_takes_new_keys(override):
-    cfg = compose("data.build", BuildCommand, [f"benchmark.selection.observation{override}"])
-    assert cfg.benchmark.selection.observation == {"window": 20}
-
-
 def test_removed_key_names_its_replacement(monkeypatch):
     monkeypatch.setitem(REMOVED_KEYS, "train.old", "use train.new instead")
     with raises_user_error("unknown-key", contains=("train.old", "use train.new instead")):

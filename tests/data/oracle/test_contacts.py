@@ -67,7 +67,7 @@ def test_targets_of_events_are_at_the_next_collision(touched: tuple[Scene, Touch
     timings: list[Timing] = MATCHED.timings(scene)
     for subtype, (framing, *_) in EVENT_CELLS.items():
         if framing == "future":
-            timings += make_recipe("event", subtype, {}).timings(scene)
+            timings += make_recipe("dynapix", "event", subtype).timings(scene)
     for recipe, subtype in (("movi_a", "contact"), ("physion", "A1_contact")):
         timings += make_transfer_recipe(recipe, recipe, "event", subtype).timings(scene)
     # Builder 6 asks for the frame half a second after the next collision.

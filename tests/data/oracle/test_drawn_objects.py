@@ -56,7 +56,7 @@ def pixels_alone(renderer: BulletRenderer, scene: Scene, frame: int, index: int)
     for k, handle in enumerate(handles):
         if k != index:
             renderer._bullet.resetBasePositionAndOrientation(handle, far, [0, 0, 0, 1])
-    return int((renderer._draw().mask == handles[index]).sum())
+    return int((renderer._draw()[2] == handles[index]).sum())
 
 
 def test_background_is_drawn_above_the_horizon() -> None:

@@ -99,7 +99,6 @@ def test_visibility_is_the_same_if_all_rays_are_cast(monkeypatch: pytest.MonkeyP
 
     scenes = record()
     monkeypatch.setattr(visibility, "_may_hide", all_pairs)
-    monkeypatch.setattr(visibility, "_box_may_hide", lambda box, low, *rest: low[..., 0] > -2)
     monkeypatch.setattr(visibility, "_image_bounds", whole_image)
     hidden = 0
     for scene, other in zip(scenes, record(), strict=True):

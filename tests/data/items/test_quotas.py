@@ -1,4 +1,4 @@
-"""Settings of the selection track: observed frames, quotas, test scenes, minimum displacement."""
+"""Settings of the selection track: quotas, test scenes, minimum displacement."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ from conf.schema import (
     SelectionConfig,
 )
 from conf.schema.benchmark import divide_window_quotas
-from data.build import check_quota_names, ensure_items
+from data.build import ensure_items
 from data.frames.frame_cache import FrameReader
 from data.parallel import Workers
 from data.records import original_scene_id
 from data.sources.scenes import scene_prefix, split_scenes
 from data.store import DATABASES
-from tests.user_errors import raises_user_error
 
 
 def config(**selection) -> BenchmarkConfig:
@@ -31,25 +30,6 @@ def config(**selection) -> BenchmarkConfig:
     cfg.retrieval.counterfactual_source = 0
     cfg.selection = SelectionConfig(**selection)
     return cfg
-
-
-@pytest.mark.slow
-def test_observation_sets_the_frames_of_a_family_or_of_a_subtype(tmp_path: Path) -> None:
-    cfg = config(
-        event={"contact_offset": Quota(test=2), "contact_match": Quota(test=2)},
-        window={"G1_A_h8_easy": Quota(test=2), "G2_A_h24_easy": Quota(test=2)},
-        observation={"window": 20, "G2_A_h24_easy": 24, "contact_match": 12},
-    )
-    observed = {
-        item.subtype: item.prefix_stop - item.prefix_start + 1
-        for item in ensure_items(cfg, tmp_path, Workers(1)).selection()
-    }
-    assert observed == {
-        "contact_offset": 21,
-        "contact_match": 12,
-        "G1_A_h8_easy": 20,
-        "G2_A_h24_easy": 24,
-    }
 
 
 @pytest.mark.slow
@@ -122,13 +102,6 @@ def test_test_scenes_that_are_not_chosen_are_not_made(tmp_path: Path) -> None:
         *store.scene_ids("train"), *store.scene_ids("test"),
     }  # fmt: skip
     assert {f.scene_id for f in store.database()} <= {*store.scene_ids("test")}
-
-
-def test_unknown_names_and_lengths_of_observations_are_refused() -> None:
-    with raises_user_error("unknown-option", contains="selection.observation.in_1s"):
-        check_quota_names(config(observation={"in_1s": 20}))
-    (problem,) = SelectionConfig(observation={"window": 3}).check("benchmark.selection.")
-    assert "benchmark.selection.observation.window=3" in problem
 
 
 def test_quota_is_divided_among_cells_without_a_quota_of_their_own() -> None:
