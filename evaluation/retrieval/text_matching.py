@@ -32,8 +32,8 @@ from evaluation.generators.response_log import (
 from evaluation.retrieval.exact_search import Ranks
 from evaluation.retrieval.standard_test import rank_targets
 from models.fingerprints import settings_key
-from models.student.answer_parser import strip_thought
 from models.student.prompts import Sample
+from models.student.response_text import strip_thought
 from teacher.sections import SECTIONS, split_sections
 
 TEXTS = "texts"

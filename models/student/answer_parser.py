@@ -10,14 +10,14 @@ correction, or a letter in passing, are no answer. docs/evaluation.md lists what
 
 from __future__ import annotations
 
-import json
 import re
-import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 from data.records import LETTERS
+from models.student.answer_records import AnswerRecord, read_records
+from models.student.response_text import clean_response
 
 
 class Reason(StrEnum):
@@ -51,45 +51,6 @@ def _compile(pattern: str) -> re.Pattern[str]:
     """Compile a pattern without regard to case, in which "~" stands for white space."""
     return re.compile(pattern.replace("~", r"\s{1,9}"), re.IGNORECASE)
 
-
-# Cleaning.
-_INVISIBLE = re.compile(
-    "\x1b\\[[\\d;]{0,9}m|[\0\xad\u061c\u200b-\u200f\u202a-\u202e\u2060-\u2069\ufe0e\ufe0f\ufeff]"
-)
-_SYMBOLS = str.maketrans(
-    dict.fromkeys("✓✔✅☑", " yes ") | dict.fromkeys("✗✘❌✖", " no ") | dict.fromkeys("“”", '"')
-    | dict.fromkeys("‘’", "'") | {"→": "->", "⇒": "->", "🅰": "A", "🅱": "B"}
-)  # fmt: skip
-_LOOK_ALIKE = re.compile(r"(?<![^\W_])[ΑАΒВС](?![^\W_])")
-_LATIN = str.maketrans("ΑАΒВС", "AABBC")
-_TURN_END = _compile(r"</s>|<\|?(?:im_end|eot_id|end_of_turn|end.of.sentence|endoftext|end)\|?>")
-_TEMPLATE_TOKEN = _compile(r"<\|(?:im_)?start\|>\s*(?:assistant)?|<\|[^|<>\n]{1,30}\|>|<s>")
-_THOUGHT = r"(?:\w{1,9}:)?(?:think(?:ing)?|thoughts?|reasoning|reflection|analysis|scratch_?pad)"
-_THOUGHT_START = _compile(
-    rf"[<◁]{_THOUGHT}(?:\s[^<>]{{0,80}})?[>▷]|\[THINK\]|<\|(?:begin_of_|start_)?th(?:ought|inking)\|>"
-    r"|```(?:thinking|thoughts?|reasoning)\b|<\|channel\|>\s{0,9}(?:analysis|commentary)\b"
-)
-_THOUGHT_END = _compile(
-    rf"[<◁]/{_THOUGHT}[>▷]|\[/THINK\]|<\|(?:end_of_|end_|/)th(?:ought|inking)\|>|<\|channel\|>\s{{0,9}}final\b"
-)
-_FENCED_THOUGHT = _compile(r"```(?:thinking|thoughts?|reasoning)\b[^`]*```")
-
-# Records.
-_COMMENT = re.compile(r'("(?:[^"\\\n]|\\.)*")|(?<![:\w/])//[^\n]*|/\*.{0,500}?\*/', re.DOTALL)
-_RECORD_START = _compile(r"""\{\s*(?:["']|(?:forced[ _-]?)?choice\s*:)""")
-_STRING = r""""(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*'"""
-_VALUE = (
-    rf"""(?:{_STRING}|\[[^\[\]{{}}]*\]|[^"'\[\]{{}},\n]){{1,200}}?"""
-    r"""(?=\s*(?:[,}\n]|$|["']\w+["']\s*:))"""
-)
-_WRAPPER = r"[a-z_ ]{0,20}(?:answer|response|result|output|record|arguments|parameters)"
-_TOKEN = re.compile(
-    r"""(?:(?P<quote>["'])|(?<![\w"']))(?:(?P<key>(?:forced[ _-]?)?choice)|"""
-    rf"""(?P<other>(?:final_?)?(?:answer|choice)|letter)|(?P<wrapper>{_WRAPPER}))"""
-    rf"""(?(quote)(?P=quote))\s*:\s*(?:(?P<nested>(?={{))|(?(wrapper)(?!))(?P<value>{_VALUE})?)"""
-    rf"""|{_STRING}|[{{}}]|["']""",
-    re.IGNORECASE,
-)
 
 # Statements: the words that announce a letter, those before it, and those after it.
 _NOUN = r"(?:option|candidate|image|choice|frame|letter|picture|panel|photo|number|answer)"
@@ -223,111 +184,61 @@ def parse_choice(raw: str, truncated: bool = False) -> ParsedAnswer:
         truncated: Whether generation stopped at the token limit, so that the last word may be
             incomplete.
     """
-    text = strip_thought(_INVISIBLE.sub("", unicodedata.normalize("NFKC", raw)))
+    text = clean_response(raw)
     if text is None:
         return ParsedAnswer(None, Reason.CUT_OFF)
-    text = _LOOK_ALIKE.sub(lambda found: found[0].translate(_LATIN), text.translate(_SYMBOLS))
-    text = next(filter(str.strip, _TURN_END.split(text)), "")
-    choices, others, record, flag, (whole, rest) = _read_records(text)
-    if choices:
-        answer = _agreed(map(_read_value, choices))
-        other = _agreed(map(_read_value, others)).letter
-        if answer.letter:
-            answer = _read_prose(rest, answer)
-        if answer.letter and other not in (None, answer.letter):
-            answer = ParsedAnswer(None, Reason.SEVERAL)
-        broken = answer.reason in (None, Reason.MALFORMED) and flag
-        return ParsedAnswer(answer.letter, broken or answer.reason, None if flag else record)
-    if flag is Reason.CUT_OFF:
-        return ParsedAnswer(None, flag)
+    records, after = read_records(text)
+    own = _choose_records(records)
+    others = [value for record in records for value in record.others]
+    is_cut = any(not record.is_complete for record in records)
+    if own:
+        return _read_choices(own, others, after, is_cut)
+    if is_cut:
+        return ParsedAnswer(None, Reason.CUT_OFF)
     # With "xx" appended, a last word that may have been cut off cannot be read as a letter.
-    answer = _read_prose(whole + ("xx" if truncated else ""))
+    prose = "\n".join([*(record.before for record in records), after])
+    answer = _read_prose(f"{prose}xx" if truncated else prose)
     if answer.reason is Reason.NO_ANSWER:
         answer = _agreed(map(_read_value, others))
     is_cut = truncated and answer.reason is Reason.NO_ANSWER
     return ParsedAnswer(None, Reason.CUT_OFF) if is_cut else answer
 
 
-def strip_thought(text: str) -> str | None:
-    """Return the text after the last end of a thought, such as `</think>`, or before it if nothing
-    follows; None if a later thought is not closed."""
-    *before, response = _THOUGHT_END.split(_FENCED_THOUGHT.sub("", text))
-    if before and not response.strip():
-        response = _THOUGHT_START.split(before[-1])[0]
-    return None if _THOUGHT_START.search(response) else response
+def _choose_records(records: list[AnswerRecord]) -> list[AnswerRecord]:
+    """Return the records with a choice. A record that the text before it calls an example does not
+    count, and neither does the template of the prompt or a record that a later one corrects."""
+    own: list[AnswerRecord] = []
+    for record in records:
+        if record.choices and not _is_reported(record.before.strip()[-200:], ""):
+            replaces = own and (
+                _CORRECTING.search(record.before) or _read_value(own[0].choices[0]).letter is None
+            )
+            own = [record] if replaces else [*own, record]
+    return own
 
 
-def _read_records(text: str) -> tuple[list, list, str | None, Reason | None, tuple[str, str]]:
-    """Return the choices of all records (None for an unreadable one), the values of other keys, the
-    only record, what is wrong with the records, and the texts before and after the last record.
-
-    A record that the text before it calls an example, or that the text after it corrects, does not
-    count.
-    """
-    choices, others, records, prose, flag, position = [], [], [], "", None, 0
-    plain = _COMMENT.sub(lambda found: found[1] or "", text) if "{" in text else text
-    if '"{\\"' in plain:  # a record within a string, as the arguments of tool calls are written
-        plain = plain.replace('"{\\"', '{"').replace('}"', "}").replace('\\"', '"')
-    while match := _RECORD_START.search(plain, position):
-        between, start = plain[position : match.start()], match.start()
-        found, end = _read_record(plain, start)
-        position, prose = end or len(plain), f"{prose}\n{between}"
-        flag = flag if end else Reason.CUT_OFF
-        if _is_reported(between.strip()[-200:], ""):
-            continue
-        values = [value for is_key, value in found if is_key]
-        others += [value for is_key, value in found if not is_key]
-        if not values:
-            continue
-        if choices and (_CORRECTING.search(between) or _read_value(choices[0]).letter is None):
-            choices, records = [], []
-        choices += values
-        records.append(plain[start:position])
-        flag = flag or (None if text == plain and _is_json(records[-1]) else Reason.MALFORMED)
-    only = records[0] if len(records) == 1 else None
-    return choices, others, only, flag, (f"{prose}\n{plain[position:]}", plain[position:])
-
-
-def _read_record(text: str, start: int) -> tuple[list[tuple[bool, str | None]], int | None]:
-    """Return the values in the record that begins at `start` with whether they are choices (None
-    for an unreadable one), and the record's end (None if it is cut off).
-
-    A record has a choice at its outermost level, or in an object that contains the record. Then
-    choices at deeper levels count too: another record may begin inside one that was broken off.
-    """
-    found, depth, outermost, is_record = [], 0, 1, False
-    for token in _TOKEN.finditer(text, start):
-        if token[0] in "\"'":
-            break
-        value, is_key = token["value"], token["key"] is not None
-        is_cut = value and token.end() == len(text) and value.strip()[-1] not in "\"']"
-        if (token["wrapper"] or is_key) and token["nested"] is not None:
-            outermost = max(outermost, depth + 1)
-            is_record |= is_key and depth == 1
-        elif not is_cut and (is_key or (token["other"] and value and depth <= outermost)):
-            found.append((is_key or (depth > 1 and is_record), value))
-            is_record |= is_key and depth <= outermost
-        depth += (token[0] == "{") - (token[0] == "}")
-        if depth == 0:
-            break
-    if not is_record:
-        found = [each for each in found if not each[0]]
-    return found, token.end() if depth == 0 else None
-
-
-def _is_json(text: str) -> bool:
-    try:
-        json.loads(text)
-    except (ValueError, RecursionError):
-        return False
-    return True
+def _read_choices(
+    records: list[AnswerRecord], others: list[str | None], after: str, is_cut: bool
+) -> ParsedAnswer:
+    """Combine the choices of records with what the text after them says."""
+    answer = _agreed(_read_value(choice) for record in records for choice in record.choices)
+    other = _agreed(map(_read_value, others)).letter
+    if answer.letter and other not in (None, answer.letter):
+        answer = ParsedAnswer(None, Reason.SEVERAL)
+    if answer.letter:
+        answer = _read_prose(after, answer)
+    is_valid = all(record.is_valid for record in records)
+    damage = Reason.CUT_OFF if is_cut else None if is_valid else Reason.MALFORMED
+    broken = answer.reason in (None, Reason.MALFORMED) and damage
+    record = records[0].text if len(records) == 1 and damage is None else None
+    return ParsedAnswer(answer.letter, broken or answer.reason, record)
 
 
 def _read_prose(prose: str, answer: ParsedAnswer | None = None) -> ParsedAnswer:
     """Read the statements of a text in order, after an answer that was given before it."""
     prose = _TAG.sub(r"\nAnswer: \g<value>\n", _STRUCK.sub(" ", prose))
     boxed = {one or two for one, two in _BOXED.findall(prose)}
-    prose = re.sub(r"\bans\.", "answer:", _TEMPLATE_TOKEN.sub(" ", prose), flags=re.IGNORECASE)
+    prose = re.sub(r"\bans\.", "answer:", prose, flags=re.IGNORECASE)
     sentences = [s for s in map(_strip_markup, _SENTENCE.split(prose)) if re.search(r"\w|=>", s)]
     is_given, rank, k, is_next, is_reopened, is_cut = answer is not None, 0, 0, True, False, False
     plain: list[str] = []
@@ -442,8 +353,6 @@ def _read_value(value: str | None) -> ParsedAnswer:
     has turned"; None stands for an unreadable value."""
     if value is None:
         return ParsedAnswer(None, Reason.MALFORMED)
-    if "\\u" in value and _is_json(value):
-        value = str(json.loads(value))
     value = _strip_markup(value)[:400]
     match, positions = _STATEMENT.match(value), _positions(value)
     letter = match and match["letter"]
