@@ -44,7 +44,7 @@ class BulletRenderer:
         self._textures = self._load_textures()
         self._visuals: dict[tuple[SceneObject, float], int] = {}
         self._parts = self._draw_parts() if world.parts else None
-        self._scene_id: str | None = None
+        self._scene: Scene | None = None
         self._handles: list[int] = []
 
     def render(self, scene: Scene, frame: int) -> Image.Image:
@@ -69,7 +69,7 @@ class BulletRenderer:
 
     def pose(self, scene: Scene, frame: int) -> list[int]:
         """Move the objects to their poses at a frame, and return their handles in the mask."""
-        if scene.scene_id != self._scene_id:
+        if scene is not self._scene:
             self._load(scene)
         for handle, scene_object, place, turn in zip(
             self._handles,
@@ -147,7 +147,7 @@ class BulletRenderer:
             self._add(*each) for each in zip(scene.objects, scene.object_scales, strict=True)
         ]
         self._shadow_boxes = self._floor.shadow_boxes(scene.positions, scene.object_scales)
-        self._scene_id = scene.scene_id
+        self._scene = scene
 
     def _add(self, scene_object: SceneObject, scale: float) -> int:
         look = scene_object, scale

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +61,16 @@ def test_shadow_is_confined_to_its_box() -> None:
     lit = floor.shade(middle[:0], [], boxes[:0])
     darker = floor.shade(middle, [1.0], floor.shadow_boxes(middle, [1.0])) < lit
     assert 0 < darker.mean() < 0.5
+
+
+def test_scenes_with_one_id_have_their_own_shadows(scene: Scene) -> None:
+    """Alternative futures of a scene are compared under one id before they are saved."""
+    other = replace(simulate_scene(1, 0), scene_id=scene.scene_id)
+    renderer = BulletRenderer(96, 64, CLEVRER)
+    renderer.render(scene, 100)
+    after = np.asarray(renderer.render(other, 100))
+    alone = np.asarray(BulletRenderer(96, 64, CLEVRER).render(other, 100))
+    np.testing.assert_array_equal(after, alone)
 
 
 def test_rendering_many_scenes_does_not_leak_memory(scene: Scene) -> None:
