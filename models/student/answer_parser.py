@@ -60,20 +60,23 @@ _OWN = (
     r"[\s_]+)"
 )
 _FOREIGN = (
-    r"(?:答案|正解|答え|回答|정답|réponse|respuesta|antwort|ответ|risposta|resposta|odpowiedź|cevap|jawaban|"
-    r"đáp~án)(?:~\w+)?"
+    r"(?:答案|正解|答え|回答|정답|réponse|respuesta|antwort|ответ|risposta|resposta|odpowiedź|"
+    r"cevap|jawaban|đáp~án)(?:~\w+)?"
 )
 _IS = (
     r"(?:\b(?:is|are|was|remains?|becomes?|lautet|est|es|ist|è"
-    r"|(?:would|should|must|will|has~to|have~to|would~have~to|seems~to|appears~to)~be)\b|是|为|は|은|는)"
+    r"|(?:would|should|must|will|has~to|have~to|would~have~to|seems~to|appears~to)~be)\b"
+    r"|是|为|は|은|는)"
 )
 _HEAD = _compile(
     rf"(?:\b(?:{_OWN}{{0,4}}(?:answer|ans|choice|final|pick|selection|selected|verdict|conclusion|"
-    rf"guess|output|result)|{_OWN}{{1,4}}(?:match|{_NOUN}))\b|{_FOREIGN})[*_`]*(?:\s?\([^()\n]{{0,60}}\)|,[^,:\n]{{1,60}},"
+    rf"guess|output|result)|{_OWN}{{1,4}}(?:match|{_NOUN}))\b|{_FOREIGN})[*_`]*"
+    r"(?:\s?\([^()\n]{0,60}\)|,[^,:\n]{1,60},"
     r"|~(?:to|for|of|in|here|by|with|based|among|i|one)\b[^.:;?!=\n]{0,60}?){0,2}"
     rf"[*_`]*\s{{0,3}}(?:{_IS}\s{{0,3}}:?|[:=]|[-–—/]>?(?!\w)|\.{{1,9}}(?=\s?\w\b)|=>)"
     r"|\b(?:i|we)(?:'d|'ll|~(?:would|will|must|have~to|had~to|therefore|thus)){0,3}"
-    r"~(?:choose|chose|pick|select|go(?:~with)?|opt~for|vote~for|settle~on|answer(?:~with)?)\b\s{0,3}:?"
+    r"~(?:choose|chose|pick|select|go(?:~with)?|opt~for|vote~for|settle~on|answer(?:~with)?)\b"
+    r"\s{0,3}:?"
     r"|\bchang(?:e|ed|ing)~(?:my~answer|my~choice|it|that)~to\b|[选選](?:择|択)?\s{0,3}:?"
 )
 _HEADING = _compile(rf"^[\s*_#>-]*(?:the~|my~)?{_OWN}{{0,4}}(?:answer|choice)[\s*_#:`]*$")
@@ -97,11 +100,12 @@ _OWN_WORDS = _compile(r"\b(?:requested|required|if~i~(?:must|have~to|had~to))\b"
 _BEFORE_LETTER = (
     r"(?:(?:(?:i|we|it|this|that|the|is|it's|that's|must|has|have|be|to|should|would|i'd|say|think|"
     r"believe|guess|go|going|choose|pick|select|with|for|probably|most|more|likely|clearly|because|"
-    r"definitely|certainly|surely|indeed|fits|matches|shows|which|therefore|thus|hence|so|now|simply|just|only|best|correct|"
-    rf"right|final|closest|my|one|either|both|{_NOUN})\b|[^\x00-\x7f]{{1,9}})[\s:,.#=-]*){{0,12}}"
+    r"definitely|certainly|surely|indeed|fits|matches|shows|which|therefore|thus|hence|so|now|"
+    rf"simply|just|only|best|correct|right|final|closest|my|one|either|both|{_NOUN})\b|[^\x00-\x7f]{{1,9}})[\s:,.#=-]*){{0,12}}"
 )
 _STATEMENT = _compile(
-    rf"[\s\-•.:,=>#]*(?:[^,\d]{{1,60}},\s)??{_BEFORE_LETTER}(?P<letter>[a-z0-9])(?![a-z0-9_])(?!'\w)\s*(?P<rest>.*)$"
+    rf"[\s\-•.:,=>#]*(?:[^,\d]{{1,60}},\s)??{_BEFORE_LETTER}"
+    r"(?P<letter>[a-z0-9])(?![a-z0-9_])(?!'\w)\s*(?P<rest>.*)$"
 )
 _POSITION = _compile(
     r"\b(?:(?P<ordinal>first|second|third|fourth)~(?:image|picture|candidate|option|frame|panel)"
@@ -116,21 +120,23 @@ _NAMED = re.compile(
     r"(?<![a-zA-Z0-9_'])([B-HJ-Z]|A(?!\s+(?!(?:or|and|vs|to|is|as)\b)[a-z]))(?![\w'])"
 )
 _AND_OR = _compile(
-    rf"(?:[\W_]|或|和|また?は|또는|или|\b(?:or|and|oder|ou|vs|to|possibly|maybe|perhaps|likely|probably|clearly|definitely|also|either|both|but|the|{_NOUN})\b)*"
+    r"(?:[\W_]|或|和|また?は|또는|или|\b(?:or|and|oder|ou|vs|to|possibly|maybe|perhaps|likely|"
+    rf"probably|clearly|definitely|also|either|both|but|the|{_NOUN})\b)*"
 )
 _ALONE = _compile(rf"(?:{_AND_OR.pattern}(?<![\w'])[a-z0-9](?![\w'])){{1,4}}[\s.,;!?)。]*")
 _EXCUSE = _compile(
     r"\b(?:because|since|as|due|though|although|while|whereas|unlike|instead|rather|not|no|than|"
-    r"second~choice|runner|wrong|incorrect|earl(?:y|ier)|lat(?:e|er)|ruled?\sout|too|cannot|never|neither|reject\w*|"
-    r"eliminat\w*|exclud\w*)\b|n't\b"
+    r"second~choice|runner|wrong|incorrect|earl(?:y|ier)|lat(?:e|er)|ruled?\sout|too|cannot|never|"
+    r"neither|reject\w*|eliminat\w*|exclud\w*)\b|n't\b"
 )
 _REASON = _compile(r"\W*(?:because|since|as|due|though|although|while)\b")
 _FALSE = r"(?:wrong|incorrect|false|impossible|rejected|excluded|eliminated|ruled~out|implausible)"
 _NOT = r"(?:not|never|cannot|can't|doesn't|isn't|won't|hardly)"
 _WITHDRAWAL = _compile(
-    rf"^\W*(?:(?:wait|but|so|no|oh|actually)\b\W*){{0,3}}(?:which|this|that|it|that's|it's|SELF)\b\W*(?:\w+~){{0,2}}?(?:"
-    rf"{_FALSE}\b|{_NOT}~(?:(?:be|quite|really)~)?(?:fit|match|work|hold|follow|right|correct|true|"
-    rf"valid|possible|plausible|it\b|the~answer))|^\W*(?:{_FALSE}|not~(?!SELF\b|[A-D]\b)\w+)\W*$|no[,.]~none\b"
+    r"^\W*(?:(?:wait|but|so|no|oh|actually)\b\W*){0,3}(?:which|this|that|it|that's|it's|SELF)\b"
+    rf"\W*(?:\w+~){{0,2}}?(?:{_FALSE}\b|{_NOT}~(?:(?:be|quite|really)~)?(?:fit|match|work|hold|"
+    rf"follow|right|correct|true|valid|possible|plausible|it\b|the~answer))"
+    rf"|^\W*(?:{_FALSE}|not~(?!SELF\b|[A-D]\b)\w+)\W*$|no[,.]~none\b"
     r"|^\W*(?:(?:oh|ah|hmm+|wait|but|actually|well|sorry|no|nope)\b\W*)+$"
     r"|\b(?:i~doubt|so~i~thought|scratch~that|take~(?:it|that)~back|never~mind|"
     r"chang\w+~my~(?:answer|choice|mind)|disregard|ignore|typo|placeholder|withdraw|retract)\b"
@@ -147,8 +153,9 @@ _WEAK_REFUSAL = _compile(
     r"\bsorry\b|(?:hard~to|do(?:~not|n't))~(?:determine|tell|answer|decide|know|see)"
 )
 _RIVAL = _compile(
-    rf"\b(?:i~meant~|(?:it|this|that|edit|correction)(?:(?:'s|~is|~must~be|~has~to~be|~should~be|~(?:could|may|"
-    rf"might)(?:~\w+){{0,3}}?~be)~|\s?:\s?))(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])(?=\W*$|[,;])"
+    r"\b(?:i~meant~|(?:it|this|that|edit|correction)(?:(?:'s|~is|~must~be|~has~to~be|~should~be|"
+    r"~(?:could|may|might)(?:~\w+){0,3}?~be)~|\s?:\s?))"
+    rf"(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])(?=\W*$|[,;])"
     r"|(?<![\w'])(?P<subject>[A-D]):?~(?:(?:also|still)~)?(?:(?:fits|matches|agrees)\b|(?:is|seems"
     r"|looks)~(?:(?:just|equally|also|as|more|the|a|far|much|too)~){0,3}(?:likely|plausible|"
     r"possible|probable|right|correct|better|best|closest|answer|match)\b)"
@@ -156,7 +163,8 @@ _RIVAL = _compile(
 _CONCLUSION = _compile(
     rf"\b(?:match|matches|image|one|frame|candidate|option|state|future|it|this)\b[^.:;\n]{{0,40}}?~"
     rf"(?:is|must~be|has~to~be)~(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])\W*$"
-    r"|(?<![\w'])(?P<subject>[A-D])~(?:is|must~be)~the~(?:one|only|correct|right|best|match|closest)\b"
+    r"|(?<![\w'])(?P<subject>[A-D])~(?:is|must~be)~the~"
+    r"(?:one|only|correct|right|best|match|closest)\b"
 )
 _VERDICT = _compile(rf"\W*(?:{_NOUN}~)?(?P<letter>[A-D])\b[\s).,:=*_-]+(?P<verdict>\w.*)")
 _YES = _compile(r"\b(?:yes|match(?:es)?|fits|correct|right|true|best)\b")
