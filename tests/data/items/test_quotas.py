@@ -63,13 +63,13 @@ def test_displacements_below_a_pixel_are_refused() -> None:
 def test_test_scenes_that_cannot_carry_a_quota_are_refused() -> None:
     cfg = config(time={"in_2s": Quota(0, 12)}, event={"contact_match": Quota(0, 9)})
     cfg.retrieval.builders = {"1": Quota(0, 30), "5": Quota(0, 11)}
-    cfg.retrieval.counterfactual = Quota(0, 41)
+    cfg.retrieval.counterfactual = Quota(0, 51)
     cfg.retrieval.database = 1281
     cfg.test_scenes = 10
     problems = [*cfg.find_problems("benchmark.")]
     refused = (
         "selection.time.in_2s.test=12", "retrieval.builders.5.test=11",
-        "retrieval.counterfactual.test=41", "retrieval.database=1281",
+        "retrieval.counterfactual.test=51", "retrieval.database=1281",
     )  # fmt: skip
     assert len(problems) == len(refused)
     for name, problem in zip(refused, problems, strict=True):
