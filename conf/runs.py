@@ -34,8 +34,9 @@ RESULT_NEUTRAL_KEYS = {
         for setting in ("concurrency", "timeout", "unreachable_timeout")
     ),
 }  # fmt: skip
-"""Keys that do not change the result of a run, or only by rounding. Their values may differ when a
-run is resumed, and they are not part of the run's name."""
+"""Keys that do not change the result of a run, or only by rounding (with dropout, the micro-batches
+also determine the random numbers). Their values may differ when a run is resumed, and they are not
+part of the run's name."""
 
 LOCK = ".lock"
 """Name of the file that is locked while a process uses a folder."""
@@ -281,7 +282,8 @@ def compare_settings(before: Any, now: Any) -> list[str]:
     return [
         f"{key} was {before.get(key, 'absent')} and is now {now.get(key, 'absent')}"
         for key in sorted((before.keys() | now.keys()) - RESULT_NEUTRAL_KEYS)
-        if before.get(key) != now.get(key)
+        # A removed or a new dict of values that is empty changes nothing.
+        if before.get(key, "{}") != now.get(key, "{}")
     ]
 
 

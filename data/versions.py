@@ -13,7 +13,7 @@ SIMULATOR = "4"
 """Version of the simulated scenes."""
 ROLLING = "2"
 """Version of the scenes of worlds with rolling friction; a change of it concerns these alone."""
-READERS = {"clevrer": "2", "movi_a": "2", "physion": "2", "tracks": "1"}
+READERS = {"clevrer": "3", "movi_a": "3", "physion": "3", "tracks": "2"}
 """Versions of the readers of other simulators' releases."""
 RENDERERS = {"bullet": "bullet-1", "blender": "blender-1, bpy 4.2.23, 32 samples"}
 """Versions of the renderers. Blender gives other pixels with another release or more samples."""

@@ -261,7 +261,9 @@ class BenchmarkConfig(Settings):
         counterfactual = self.retrieval.counterfactual.test
         quotas["retrieval.counterfactual"] = (counterfactual, len(COUNTERFACTUAL_SECONDS))
         limits = {f"{name}.test": limit for name, limit in quotas.items()}
-        limits["retrieval.database"] = (self.retrieval.database, self.world.physics.frames)
+        has_queries = any(quota.train + quota.test for quota in builders.values())
+        if has_queries and self.simulator == "bullet":
+            limits["retrieval.database"] = (self.retrieval.database, self.world.physics.frames)
         for name, (quota, most) in limits.items():
             if quota > most * self.test_scenes:
                 yield (

@@ -142,8 +142,8 @@ class DistillTrainConfig(StudentTrainConfig):
     temperature: float = setting(1.0, above=0)
     """Temperature at which responses are sampled."""
     sampling_batch: int | None = setting(None, least=1)
-    """Number of responses that a rank samples at once; changes memory and speed, not the result.
-    null samples all responses of a step."""
+    """Number of responses that a rank samples at once; changes memory and speed, and probabilities
+    by rounding. null samples all responses of a step."""
     beta: float = setting(1.0, least=0, most=1)
     """Divergence of the student from the teacher: 1 is the reverse Kullback-Leibler divergence, 0
     the forward one, and between them the generalised Jensen-Shannon divergence with this weight of
@@ -193,8 +193,8 @@ class ReinforceTrainConfig(TrainConfig):
     temperature: float = setting(1.0, above=0)
     """Temperature at which responses are sampled."""
     sampling_batch: int | None = setting(None, least=1)
-    """Number of responses that a rank samples at once; changes memory and speed, not the result.
-    null samples all responses of a step."""
+    """Number of responses that a rank samples at once; changes memory and speed, and probabilities
+    by rounding. null samples all responses of a step."""
     validation_items: int = setting(16, least=1)
     """Number of items of held-out training scenes on which the rewards are measured."""
     rewards: RewardWeights = field(default_factory=RewardWeights)

@@ -132,9 +132,12 @@ def _read_one(cfg: BenchmarkConfig, path: Path, split: str, folder: Path, part: 
             "release",
             code="unreadable-file",
         ) from error
-    except (OSError, ValueError) as error:
+    except UserError:
+        raise
+    except Exception as error:
         # A library's own error of a record that a reader does not check.
-        outcome = {"problem": f"{getattr(error, 'filename', None) or path}: {error}"}
+        where = getattr(error, "filename", None) or path
+        outcome = {"problem": f"{where}: {type(error).__name__}: {error}"}
     else:
         save_scene(scene, scene_path(folder, scene.scene_id))
         rescaled = [w.message for w in caught if isinstance(w.message, RescaledVelocities)]

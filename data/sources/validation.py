@@ -126,7 +126,7 @@ def check_unique_scenes(
     for path in paths:
         original = Path(*(COPY.sub("", part) for part in path.parts))
         others = [first.setdefault(key, path) for key in (id_of(path), path.resolve())]
-        others += [original] if original in listed else []
+        others += [original] if original in listed and _may_be_copy(path, original) else []
         if other := next((other for other in others if other != path), None):
             raise UserError(
                 f"{folder} contains scene {id_of(path)} twice, as {other} and as {path}: "
@@ -134,6 +134,15 @@ def check_unique_scenes(
                 code="duplicate-scene",
             )
     return paths
+
+
+def _may_be_copy(copy: Path, original: Path) -> bool:
+    """Return whether a scene named as a copy may be one. Parts of a file, such as the clips of a
+    video, are copies only if the files have the same size: videos are often numbered."""
+    if copy.exists():
+        return True
+    files = (next(p for p in each.parents if p.exists()) for each in (copy, original))
+    return len({file.stat().st_size for file in files}) == 1
 
 
 def check_unique_objects(where: str, ids: Sequence[int]) -> None:

@@ -134,13 +134,15 @@ _FALSE = r"(?:wrong|incorrect|false|impossible|rejected|excluded|eliminated|rule
 _NOT = r"(?:not|never|cannot|can't|doesn't|isn't|won't|hardly)"
 _WITHDRAWAL = _compile(
     r"^\W*(?:(?:wait|but|so|no|oh|actually)\b\W*){0,3}(?:which|this|that|it|that's|it's|SELF)\b"
-    rf"\W*(?:\w+~){{0,2}}?(?:{_FALSE}\b|{_NOT}~(?:(?:be|quite|really)~)?(?:fit|match|work|hold|"
-    rf"follow|right|correct|true|valid|possible|plausible|it\b|the~answer))"
+    rf"\W*(?:\w+~){{0,2}}?(?:{_FALSE}|{_NOT}~(?:(?:be|quite|really)~)?(?:fit|match|work|hold|"
+    r"follow|right|correct|true|valid|possible|plausible|it|the~answer))\b"
+    r"(?!~(?:that|for|to~(?:tell|say|be))\b|[^.!?]{0,20}\b[A-D]\b)"
     rf"|^\W*(?:{_FALSE}|not~(?!SELF\b|[A-D]\b)\w+)\W*$|no[,.]~none\b"
     r"|^\W*(?:(?:oh|ah|hmm+|wait|but|actually|well|sorry|no|nope)\b\W*)+$"
     r"|\b(?:i~doubt|so~i~thought|scratch~that|take~(?:it|that)~back|never~mind|"
-    r"chang\w+~my~(?:answer|choice|mind)|disregard|ignore|typo|placeholder|withdraw|retract)\b"
-    rf"|\bSELF~(?:is|was|must~be)~(?:\w+~)?(?:{_FALSE}|{_NOT})\b|^\W*(?:if|unless|provided)\b"
+    r"chang\w+~my~(?:answer|choice|mind)|(?:disregard|ignore)~(?:that|this|it|my|the~(?:line|answer|letter|above))|typo|placeholder|"
+    r"withdraw|retract)\b"
+    rf"|\bSELF~(?:is|was|must~be)~(?:\w+~)?(?:{_FALSE}|{_NOT})\b"
 )
 _REFUSAL = _compile(
     r"^(?:none|null|n/?a|nil|no|neither|unknown|unsure|abstain|refused?|declined?|pass)\W*$"
@@ -149,6 +151,8 @@ _REFUSAL = _compile(
     r"|refuse~to|(?:not~enough|insufficient)~(?:information|evidence|data)"
     r"|\bnone~of\b|\bor~none\b|\bno~(?:correct|valid|suitable|clear)~\w+"
 )
+_OTHERS = _compile(r"\b(?:others?|remaining|rest)\b|(?<![\w'])[A-D](?![\w'])")
+_CONDITION = _compile(r"\W*(?:if|unless|provided)\b")
 _WEAK_REFUSAL = _compile(
     r"\bsorry\b|(?:hard~to|do(?:~not|n't))~(?:determine|tell|answer|decide|know|see)"
 )
@@ -158,7 +162,7 @@ _RIVAL = _compile(
     rf"(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])(?=\W*$|[,;])"
     r"|(?<![\w'])(?P<subject>[A-D]):?~(?:(?:also|still)~)?(?:(?:fits|matches|agrees)\b|(?:is|seems"
     r"|looks)~(?:(?:just|equally|also|as|more|the|a|far|much|too)~){0,3}(?:likely|plausible|"
-    r"possible|probable|right|correct|better|best|closest|answer|match)\b)"
+    r"possible|probable|right|correct|better|best|closest|answer|match)\b(?!~(?:only|if)\b))"
 )
 _CONCLUSION = _compile(
     rf"\b(?:match|matches|image|one|frame|candidate|option|state|future|it|this)\b[^.:;\n]{{0,40}}?~"
@@ -316,9 +320,8 @@ def _react(answer: ParsedAnswer, sentence: str, is_next: bool) -> ParsedAnswer:
     sentence = sentence[:400]
     own = re.sub(rf"(?<![\w']){answer.letter}(?![\w'])", "SELF", sentence)
     taken_back = _WITHDRAWAL.search(own)
-    if (taken_back and (is_next or "SELF" in taken_back[0])) or (
-        is_next and _REFUSAL.search(sentence)
-    ):
+    refuses = is_next and _REFUSAL.search(sentence) and not _OTHERS.search(sentence)
+    if refuses or (taken_back and (is_next or "SELF" in taken_back[0])):
         return ParsedAnswer(None, Reason.REFUSAL)
     named = {
         found["said"] or found["subject"]
@@ -384,7 +387,12 @@ def _read_value(value: str | None) -> ParsedAnswer:
         return ParsedAnswer(None, Reason.SEVERAL)
     own = re.sub(rf"(?<![\w']){letter}(?![\w'])", "SELF", rest)
     refused = _REFUSAL.search(own.strip(" ,.;?!")) and not _REASON.match(own)
-    if _WITHDRAWAL.search(own) or _WITHDRAWAL.search(f"it {own}") or refused:
+    if (
+        refused
+        or _CONDITION.match(own)
+        or _WITHDRAWAL.search(own)
+        or _WITHDRAWAL.search(f"it {own}")
+    ):
         return ParsedAnswer(None, Reason.REFUSAL)
     return ParsedAnswer(letter) if letter in LETTERS else ParsedAnswer(None, Reason.BAD_LETTER)
 

@@ -80,6 +80,13 @@ def test_settings_of_memory_may_change_when_a_run_resumes(tmp_path, trainer):
     assert len(json.loads((run.folder / "run.json").read_text())["earlier_starts"]) == 1
 
 
+def test_an_empty_dict_that_is_no_setting_any_more_changes_nothing(tmp_path):
+    run = Run("r", tmp_path / "r")
+    open_run(run, SETTINGS | {"track": {"observation": {}, "lr": 1.0}}, "train.sft")
+    (run.folder / "metrics.jsonl").touch()
+    open_run(run, SETTINGS | {"track": {"lr": 1.0}}, "train.sft")
+
+
 @pytest.mark.parametrize("name", ["run.json", "config.yaml"])
 def test_damaged_records_are_named(tmp_path, name):
     run = Run("r", tmp_path / "r")

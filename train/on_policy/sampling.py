@@ -55,7 +55,7 @@ class ResponseSampler:
             UserError: Memory runs out.
         """
         model.eval()
-        size = self._batch or len(prompts)
+        size = self._batch or max(len(prompts), 1)
         when = f"while sampling {min(size, len(prompts))} responses at once"
         advice = "lower train.sampling_batch, and run the same command: the run goes on"
         with explain_out_of_memory(when, advice):

@@ -64,8 +64,8 @@ class HeldOutAnswers:
         train, student = self._train, self._student
         first = [samples[k] for k in range(min(train.generated_items, len(samples)))]
         limit = response_token_limit(mode, student.max_new_tokens)
-        when = f"while generating {BATCH} answers after step {step}"
-        lower = "lower student.max_new_tokens, or set train.generated_items=0, in another run"
+        when = f"while generating {min(BATCH, len(first))} answers after step {step}"
+        lower = "set train.generated_items=0 in another run (run=NAME)"
 
         def answer(batch: list[Sample]) -> list[GeneratedText]:
             inputs = self._collator([replace(sample, response=None) for sample in batch])

@@ -74,6 +74,10 @@ def test_test_scenes_that_cannot_carry_a_quota_are_refused() -> None:
     assert len(problems) == len(refused)
     for name, problem in zip(refused, problems, strict=True):
         assert f"benchmark.{name}: a scene gives at most" in problem
+    cfg = config(time={"in_1s": Quota(0, 5)})
+    cfg.retrieval.database, cfg.test_scenes = 10_000, 5
+    # Without queries, there is no database.
+    assert not [*cfg.find_problems("benchmark.")]
 
 
 @pytest.mark.slow

@@ -169,11 +169,11 @@ def test_an_error_of_a_library_leaves_its_record_out(tmp_path, monkeypatch, capl
     path = write_clevrer(tmp_path / "release")
 
     def read_scene(*_: object) -> None:
-        raise ValueError("what no reader expects")
+        raise KeyError("what no reader expects")
 
     monkeypatch.setattr(releases.READERS["clevrer"], "read_scene", read_scene)
     cfg = replace(config(tmp_path / "release"), simulator="clevrer")
     splits = {"train": [], "test": [path]}
     _, counts = read_release(cfg, splits, tmp_path / "built", Workers(1), strict=False)
     assert counts == {"bad records left out": 1}
-    assert f"{path}: what no reader expects" in caplog.text
+    assert f"{path}: KeyError: 'what no reader expects'" in caplog.text

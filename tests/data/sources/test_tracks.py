@@ -95,6 +95,13 @@ def test_a_video_is_cut_into_clips_with_their_own_objects_and_frames(tmp_path: P
         assert np.asarray(image).mean() == pytest.approx(brightness, abs=2)
 
 
+def test_numbered_videos_are_no_copies(tmp_path: Path) -> None:
+    for name, frames in (("street", 40), ("street (2)", 60)):
+        write_tracked_video(tmp_path, name, frames)
+    scenes = [f"{path.parent.name}/{path.name}" for path in tracks.list_scenes(tmp_path)]
+    assert scenes == ["street (2).mp4/000000", "street.mp4/000000"]
+
+
 def test_the_rate_and_nouns_of_classes_may_be_given(tmp_path: Path) -> None:
     write_tracked_video(tmp_path, frames=40)
     names = {"classes": {1: "cyclist", 3: "dog"}, "videos": {"street": {"fps": 12.5}}}

@@ -92,6 +92,24 @@ def test_null_settings_are_those_of_the_students_training() -> None:
     assert inherit_settings(DistillCommand(train=given), trained).train == given
 
 
+def test_responses_do_not_depend_on_how_many_are_sampled_at_once(
+    settings, student, micro_store
+) -> None:
+    trained = read_trained_settings(student, SftCommand, "student")
+    cfg = replace(trained.student, quantization="none", max_new_tokens=8)
+    model, processor = loading.load_student(cfg, "fp32", list)
+    rationales = ensure_rationales(micro_store, trained.teacher)
+    training, _ = paired_prompts.load_datasets(settings, trained, micro_store, rationales)
+    prompts = [training[k].student for k in range(5)]
+    found = []
+    for size in (None, 2):
+        train_settings = replace(settings.train, sampling_batch=size)
+        sampler = distillation.ResponseSampler(processor, cfg, train_settings)
+        found.append([text.text for text in sampler.sample(model, prompts, range(5))])
+        assert sampler.sample(model, [], []) == []
+    assert found[0] == found[1]
+
+
 def test_datasets_can_be_sent_to_worker_processes(settings, student, micro_store) -> None:
     trained = read_trained_settings(student, SftCommand, "student")
     rationales = ensure_rationales(micro_store, trained.teacher)
