@@ -123,7 +123,11 @@ def test_datasets_can_be_sent_to_worker_processes(settings, student, micro_store
     assert ours.student.content == theirs.student.content
 
 
-def test_a_killed_run_samples_the_same_responses(settings, tmp_path, monkeypatch) -> None:
+LESS_MEMORY = {"micro_batch": 1, "sampling_batch": 3, "gradient_checkpointing": True}
+
+
+@pytest.mark.parametrize("changes", [{}, LESS_MEMORY], ids=["same", "less memory"])
+def test_a_killed_run_samples_the_same_responses(settings, tmp_path, monkeypatch, changes) -> None:
     sampled: dict[str, list[tuple[int, ...]]] = {"whole": [], "resumed": []}
     sample = distillation.ResponseSampler.sample
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
@@ -139,12 +143,12 @@ def test_a_killed_run_samples_the_same_responses(settings, tmp_path, monkeypatch
     shutil.copytree(whole / "checkpoint-2", resumed / "checkpoint-2")
     shutil.copy(whole / "metrics.jsonl", resumed)
     current = "resumed"
-    run_distill(settings, resumed)
+    run_distill(replace(settings, train=replace(settings.train, **changes)), resumed)
     assert len(sampled["whole"]) == 16
     assert len(set(sampled["whole"])) > 8
     assert sampled["resumed"] == sampled["whole"][8:]
     for first, second in zip(read_journal(whole), read_journal(resumed), strict=True):
-        assert first == pytest.approx(second, rel=1e-4)
+        assert first == pytest.approx(second, rel=1e-2 if changes else 1e-4)
     losses = [r for r in read_journal(whole) if "loss" in r]
     assert len(losses) == 4
     assert all(r["loss"] > 0 and 0 <= r["sampled_parse_rate"] <= 1 for r in losses)

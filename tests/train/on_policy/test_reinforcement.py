@@ -60,8 +60,13 @@ def short_rewards(monkeypatch) -> None:
     monkeypatch.setitem(reinforcement.REWARDS, "answer", lambda r: -len(r.text) / 10)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"micro_batch": 1, "sampling_batch": 3, "gradient_checkpointing": True}],
+    ids=["same", "less memory"],
+)
 def test_a_killed_run_samples_the_same_responses(
-    settings, tmp_path, monkeypatch, short_rewards
+    settings, tmp_path, monkeypatch, short_rewards, changes
 ) -> None:
     sampled: dict[str, list[tuple[int, ...]]] = {"whole": [], "resumed": []}
     sample = reinforcement.ResponseSampler.sample
@@ -79,7 +84,7 @@ def test_a_killed_run_samples_the_same_responses(
     shutil.copytree(whole / "checkpoint-2", resumed / "checkpoint-2")
     shutil.copy(whole / "metrics.jsonl", resumed)
     current = "resumed"
-    run_reinforce(settings, resumed)
+    run_reinforce(replace(settings, train=replace(settings.train, **changes)), resumed)
     assert len(sampled["whole"]) == 4 * 8
     assert sampled["resumed"] == sampled["whole"][16:]
     steps = [r for r in read_journal(whole) if "reward" in r]
