@@ -12,7 +12,8 @@ import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Mapping
-from dataclasses import asdict, astuple
+from copy import copy
+from dataclasses import asdict
 from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
@@ -181,7 +182,9 @@ def _with_reserve(cfg: BenchmarkConfig, name: str, quota: Quota) -> Quota:
         factor = QUERY_RESERVE
     elif cfg.distractors == "balanced" and name != MATCHED_ANCHOR:
         factor = RESERVE
-    return Quota(*(math.ceil(factor * n) for n in astuple(quota)))
+    made = copy(quota)
+    made.train, made.test = (math.ceil(factor * n) for n in (quota.train, quota.test))
+    return made
 
 
 def _is_query_cell(name: str) -> bool:
