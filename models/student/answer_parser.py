@@ -70,14 +70,15 @@ _IS = (
 )
 _HEAD = _compile(
     rf"(?:\b(?:{_OWN}{{0,4}}(?:answer|ans|choice|final|pick|selection|selected|verdict|conclusion|"
-    rf"guess|output|result)|{_OWN}{{1,4}}(?:match|{_NOUN}))\b|{_FOREIGN})[*_`]*"
+    rf"guess|output|result)|{_OWN}{{1,4}}(?:match|fit|{_NOUN}))\b|{_FOREIGN})[*_`]*"
     r"(?:\s?\([^()\n]{0,60}\)|,[^,:\n]{1,60},"
     r"|~(?:to|for|of|in|here|by|with|based|among|i|one)\b[^.:;?!=\n]{0,60}?){0,2}"
     rf"[*_`]*\s{{0,3}}(?:{_IS}\s{{0,3}}:?|[:=]|[-–—/]>?(?!\w)|\.{{1,9}}(?=\s?\w\b)|=>)"
     r"|\b(?:i|we)(?:'d|'ll|~(?:would|will|must|have~to|had~to|therefore|thus)){0,3}"
     r"~(?:choose|chose|pick|select|go(?:~with)?|opt~for|vote~for|settle~on|answer(?:~with)?)\b"
     r"\s{0,3}:?"
-    r"|\bchang(?:e|ed|ing)~(?:my~answer|my~choice|it|that)~to\b|[选選](?:择|択)?\s{0,3}:?"
+    r"|\bchang(?:e|ed|ing)~(?:my~answer|my~choice|it|that)~to\b"
+    r"|(?<!候)[选選](?![项項](?!\s*(?:是|为|:|[A-D]\W*$)))(?:择|択)?\s{0,3}:?"
 )
 _HEADING = _compile(rf"^[\s*_#>-]*(?:the~|my~)?{_OWN}{{0,4}}(?:answer|choice)[\s*_#:`]*$")
 _CORRECTING = _compile(
@@ -86,15 +87,25 @@ _CORRECTING = _compile(
 )
 _REVISING = _compile(rf"\b(?:{_REVISED}|actually|instead|on~reflection|after~all|chang\w+|must)\b")
 _REOPENING = _compile(
-    r"\W*(?:wait|scratch~that|on~second~thought|on~reflection|let~me~correct|correction)\b"
+    r"\W*(?:hmm+\W{1,3})?(?:wait|let~me~(?:double[- ]?check|re-?check|re-?examine)|scratch~that|"
+    r"on~second~thought|on~reflection|let~me~correct|correction)\b"
 )
 _REPORTED = _compile(
     r"\b(?:some(?:one|body)?|others?|reader|people|they|he|she|you|your|whether|if|unless|suppose|"
     r"assuming|otherwise|wrote|writes|says|said|reads|caption|claim\w*|thinks|another|user|might|"
-    r"could|may|seems?|tempt\w+|not|never|doubt|such~as|e\.?g|for~(?:example|instance)|example|"
-    r"format|template|instructions?|like~this|in~the~form|(?:first|second|third|initial|previous|"
+    r"could|may|seems?|tempt\w+|not|never|(?<!no )(?<!without a )doubt|such~as|e\.?g|"
+    r"for~(?:example|instance)|example|format|template|instructions?|like~this|in~the~form|(?:first|second|third|initial|previous|"
     r"earlier|original|other|alternative|naive|wrong|incorrect|next|no|any|every|each)~"
     rf"(?:guess|pick|selection|{_NOUN}))(?=\W|$)|n't\b|^\W*had\b"
+)
+_CAUSE = _compile(
+    r"\W*(?:since|because|as|given|after|based~on|compared|unlike|considering|taking|from|thus|"
+    r"though|although|while)\b[^:]*,~(?=(?:(?:and|thus|therefore|hence|then)~)*(?:the|my|i|we|i'd|i'll)\b)"
+)
+_SOURCE = _compile(
+    r"\b(?:if|unless|suppos\w+|assum\w+|whether|otherwise|some(?:one|body)?|others?(?!~\w)|people|"
+    r"he|she|reader|model|user|teacher|caption|wrote|written|sa(?:y|ys|id)|states?|stated|reads|"
+    r"claim\w*|think\w*|argu\w+|example|instance|e\.?g|format|template|instructions?|question)\b"
 )
 _OWN_WORDS = _compile(r"\b(?:requested|required|if~i~(?:must|have~to|had~to))\b")
 _BEFORE_LETTER = (
@@ -133,7 +144,7 @@ _REASON = _compile(r"\W*(?:because|since|as|due|though|although|while)\b")
 _FALSE = r"(?:wrong|incorrect|false|impossible|rejected|excluded|eliminated|ruled~out|implausible)"
 _NOT = r"(?:not|never|cannot|can't|doesn't|isn't|won't|hardly)"
 _WITHDRAWAL = _compile(
-    r"^\W*(?:(?:wait|but|so|no|oh|actually)\b\W*){0,3}(?:which|this|that|it|that's|it's|SELF)\b"
+    r"^\W*(?:(?:wait|but|so|no|oh|actually)\b\W*){0,3}(?:i~(?:think|believe)~)?(?:which|this|that|it|that's|it's|SELF)\b"
     rf"\W*(?:\w+~){{0,2}}?(?:{_FALSE}|{_NOT}~(?:(?:be|quite|really)~)?(?:fit|match|work|hold|"
     r"follow|right|correct|true|valid|possible|plausible|it|the~answer))\b"
     r"(?!~(?:that|for|to~(?:tell|say|be))\b|[^.!?]{0,20}\b[A-D]\b)"
@@ -142,7 +153,7 @@ _WITHDRAWAL = _compile(
     r"|\b(?:i~doubt|so~i~thought|scratch~that|take~(?:it|that)~back|never~mind|"
     r"chang\w+~my~(?:answer|choice|mind)|(?:disregard|ignore)~(?:that|this|it|my|the~(?:line|answer|letter|above))|typo|placeholder|"
     r"withdraw|retract)\b"
-    rf"|\bSELF~(?:is|was|must~be)~(?:\w+~)?(?:{_FALSE}|{_NOT})\b"
+    rf"|\bSELF~(?:(?:is|was|must~be)~(?:\w+~)?(?:{_FALSE}|{_NOT})|(?:cannot|can't|couldn't|could~not)~be)\b"
 )
 _REFUSAL = _compile(
     r"^(?:none|null|n/?a|nil|no|neither|unknown|unsure|abstain|refused?|declined?|pass)\W*$"
@@ -151,6 +162,13 @@ _REFUSAL = _compile(
     r"|refuse~to|(?:not~enough|insufficient)~(?:information|evidence|data)"
     r"|\bnone~of\b|\bor~none\b|\bno~(?:correct|valid|suitable|clear)~\w+"
 )
+_ASIDE = _compile(
+    r"(?:determine|tell|decide|identify|say|information~to~\w+|see)~(?:you~)?(?:(?:much|more|"
+    r"anything)~)?(?:about~)?(?:the(?!~(?:answer|letter|correct|right|best|match|future|next|"
+    r"candidate|option|image|frame))|its?~\w+|how~(?!to)|whether~(?!th|it|[A-D]\b)|more~about)\b"
+    r"|\bnone~of~the~(?!candidates|options|images|above|answers|choices|four|frames|pictures)"
+    r"|\bno~clear~\w+~of\b"
+)
 _OTHERS = _compile(r"\b(?:others?|remaining|rest)\b|(?<![\w'])[A-D](?![\w'])")
 _CONDITION = _compile(r"\W*(?:if|unless|provided)\b")
 _WEAK_REFUSAL = _compile(
@@ -158,12 +176,19 @@ _WEAK_REFUSAL = _compile(
 )
 _RIVAL = _compile(
     r"\b(?:i~meant~|(?:it|this|that|edit|correction)(?:(?:'s|~is|~must~be|~has~to~be|~should~be|"
-    r"~(?:could|may|might)(?:~\w+){0,3}?~be)~|\s?:\s?))"
+    r"~(?:could|may|might)(?:~(?!not\b|never\b)\w+){0,3}?~be)~|\s?:\s?(?:(?:could|may|might)(?:~(?!not\b)\w+){0,3}?~be~)?))"
     rf"(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])(?=\W*$|[,;])"
     r"|(?<![\w'])(?P<subject>[A-D]):?~(?:(?:also|still)~)?(?:(?:fits|matches|agrees)\b|(?:is|seems"
     r"|looks)~(?:(?:just|equally|also|as|more|the|a|far|much|too)~){0,3}(?:likely|plausible|"
-    r"possible|probable|right|correct|better|best|closest|answer|match)\b(?!~(?:only|if)\b))"
+    r"possible|probable|right|correct|better|best|closest|answer|match)\b(?!~(?:only|if|about|until|of~the|alternative|(?:to~be~)?an?~(?:\w+~)?(?:frame|image|state)|the~frame|intermediate|earlier|later)\b))"
 )
+_CONTRAST = _compile(
+    r"\w:?~(?:also~)?(?:fits|matches|agrees|(?:is|seems|looks)~(?:also~)?(?:plausible|possible))\b"
+    r"(?![^.]*\b(?:equally|just~as|as~well|later|sure|decide|tell|know|exclude)\b)"
+    r"[^.]*\b(?:but|yet|except|until|only|neither)\b"
+)
+_SUPERIOR = _compile(r"\b(?:better|best|correct|right|answer|closest)\b")
+_CONCESSION = _compile(r"\W*(?:while|although|though|even~though)\b")
 _CONCLUSION = _compile(
     rf"\b(?:match|matches|image|one|frame|candidate|option|state|future|it|this)\b[^.:;\n]{{0,40}}?~"
     rf"(?:is|must~be|has~to~be)~(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])\W*$"
@@ -320,13 +345,15 @@ def _react(answer: ParsedAnswer, sentence: str, is_next: bool) -> ParsedAnswer:
     sentence = sentence[:400]
     own = re.sub(rf"(?<![\w']){answer.letter}(?![\w'])", "SELF", sentence)
     taken_back = _WITHDRAWAL.search(own)
-    refuses = is_next and _REFUSAL.search(sentence) and not _OTHERS.search(sentence)
+    is_aside = _OTHERS.search(sentence) or _ASIDE.search(sentence)
+    refuses = is_next and _REFUSAL.search(sentence) and not is_aside
     if refuses or (taken_back and (is_next or "SELF" in taken_back[0])):
         return ParsedAnswer(None, Reason.REFUSAL)
     named = {
         found["said"] or found["subject"]
         for rule in (_RIVAL, _CONCLUSION)
         for found in rule.finditer(sentence)
+        if not _is_conceded(found, sentence)
     }
     named |= {*_positions(sentence)} if not _EXCUSE.search(sentence) else set()
     alone = _NAMED.findall(sentence)
@@ -335,6 +362,12 @@ def _react(answer: ParsedAnswer, sentence: str, is_next: bool) -> ParsedAnswer:
     if _EXCUSE.search(sentence) and not alone:
         named = set()
     return answer if named <= {answer.letter} else ParsedAnswer(None, Reason.SEVERAL)
+
+
+def _is_conceded(rival: re.Match[str], sentence: str) -> bool:
+    """Return whether a sentence speaks for another candidate only to reject it."""
+    is_concession = _CONCESSION.match(sentence) and not _SUPERIOR.search(rival[0])
+    return bool(rival["subject"] and (is_concession or _CONTRAST.match(sentence[rival.start() :])))
 
 
 def _read_without_statement(sentences: list[str]) -> ParsedAnswer:
@@ -349,6 +382,10 @@ def _read_without_statement(sentences: list[str]) -> ParsedAnswer:
     is_single = len(sentences) == 1
     found = [_read_value(line) for line in {first, last} if _ALONE.fullmatch(line)]
     said = [*_CONCLUSION.finditer(last), *(_RIVAL.finditer(last) if is_single else ())]
+    names = {each["said"] or each["subject"] for each in said}
+    others = {*_NAMED.findall(last), *re.findall(r"\b(A)\W*$", last)} - names
+    if others and not _EXCUSE.search(last):
+        said = []
     if not found and not _is_reported(last, ""):
         found = [ParsedAnswer((each["said"] or each["subject"]).upper()) for each in said]
     if not found and any(map(_REFUSAL.search, sentences)):
@@ -376,7 +413,8 @@ def _read_value(value: str | None) -> ParsedAnswer:
     ):
         match = None
     if match is None or (letter.isdigit() and positions):
-        if positions and not _EXCUSE.search(value):
+        names_letter = re.match(rf"(?:{_NOUN}\s)?[A-D]\b", value, re.IGNORECASE)
+        if positions and not names_letter and not _EXCUSE.search(value):
             return _agreed(map(ParsedAnswer, positions))
         refused = _REFUSAL.search(value) or _WEAK_REFUSAL.search(value)
         return ParsedAnswer(None, Reason.REFUSAL if refused else Reason.NO_ANSWER)
@@ -420,6 +458,9 @@ def _is_reported(words: str, previous: str) -> bool:
     """Return whether a statement is an example, a condition or somebody else's, by the words up to
     the letter and the sentence before."""
     text = re.split(r"\b(?:but|so|however)\b|;", words, flags=re.IGNORECASE)[-1]
+    clause = _CAUSE.match(text)
+    if clause and not _SOURCE.search(clause[0]):
+        text = text[clause.end() :]
     if re.search(r"(?::|like|as|e\.?g\.?,?)\s*$", previous):
         text = previous[-200:]
     return bool(_REPORTED.search(text) and not _OWN_WORDS.search(text))
