@@ -52,7 +52,7 @@ def _compile(pattern: str) -> re.Pattern[str]:
     return re.compile(pattern.replace("~", r"\s{1,9}"), re.IGNORECASE)
 
 
-# Statements: the words that announce a letter, those before it, and those after it.
+# The head of a statement: the words that announce a letter.
 _NOUN = r"(?:option|candidate|image|choice|frame|letter|picture|panel|photo|number|answer)"
 _REVISED = r"(?:revised|corrected|updated|new|real|true|actual)"
 _OWN = (
@@ -81,6 +81,7 @@ _HEAD = _compile(
     r"|(?<!候)[选選](?![项項](?!\s*(?:是|为|:|[A-D]\W*$)))(?:择|択)?\s{0,3}:?"
 )
 _HEADING = _compile(rf"^[\s*_#>-]*(?:the~|my~)?{_OWN}{{0,4}}(?:answer|choice)[\s*_#:`]*$")
+# What makes a later record or statement replace an earlier one.
 _CORRECTING = _compile(
     rf"\b(?:{_REVISED}|actually|instead|reflection|second~thought|after~all|chang\w+|must|forced|"
     r"wait|correction|mistake|error|meant|sorry|let~me)\b"
@@ -90,17 +91,21 @@ _REOPENING = _compile(
     r"\W*(?:hmm+\W{1,3})?(?:wait|let~me~(?:double[- ]?check|re-?check|re-?examine)|scratch~that|"
     r"on~second~thought|on~reflection|let~me~correct|correction)\b"
 )
+# Words before a statement that is an example, a condition or somebody else's. A clause such as
+# "Since the cube has not moved," is skipped, unless it names a source.
 _REPORTED = _compile(
     r"\b(?:some(?:one|body)?|others?|reader|people|they|he|she|you|your|whether|if|unless|suppose|"
     r"assuming|otherwise|wrote|writes|says|said|reads|caption|claim\w*|thinks|another|user|might|"
     r"could|may|seems?|tempt\w+|not|never|(?<!no )(?<!without a )doubt|such~as|e\.?g|"
-    r"for~(?:example|instance)|example|format|template|instructions?|like~this|in~the~form|(?:first|second|third|initial|previous|"
+    r"for~(?:example|instance)|example|format|template|instructions?|like~this|in~the~form|"
+    r"(?:first|second|third|initial|previous|"
     r"earlier|original|other|alternative|naive|wrong|incorrect|next|no|any|every|each)~"
     rf"(?:guess|pick|selection|{_NOUN}))(?=\W|$)|n't\b|^\W*had\b"
 )
 _CAUSE = _compile(
     r"\W*(?:since|because|as|given|after|based~on|compared|unlike|considering|taking|from|thus|"
-    r"though|although|while)\b[^:]*,~(?=(?:(?:and|thus|therefore|hence|then)~)*(?:the|my|i|we|i'd|i'll)\b)"
+    r"though|although|while)\b[^:]*,~"
+    r"(?=(?:(?:and|thus|therefore|hence|then)~)*(?:the|my|i|we|i'd|i'll)\b)"
 )
 _SOURCE = _compile(
     r"\b(?:if|unless|suppos\w+|assum\w+|whether|otherwise|some(?:one|body)?|others?(?!~\w)|people|"
@@ -108,11 +113,13 @@ _SOURCE = _compile(
     r"claim\w*|think\w*|argu\w+|example|instance|e\.?g|format|template|instructions?|question)\b"
 )
 _OWN_WORDS = _compile(r"\b(?:requested|required|if~i~(?:must|have~to|had~to))\b")
+# The value of a statement: what may stand between its head and its letter, and after the letter.
 _BEFORE_LETTER = (
     r"(?:(?:(?:i|we|it|this|that|the|is|it's|that's|must|has|have|be|to|should|would|i'd|say|think|"
     r"believe|guess|go|going|choose|pick|select|with|for|probably|most|more|likely|clearly|because|"
     r"definitely|certainly|surely|indeed|fits|matches|shows|which|therefore|thus|hence|so|now|"
-    rf"simply|just|only|best|correct|right|final|closest|my|one|either|both|{_NOUN})\b|[^\x00-\x7f]{{1,9}})[\s:,.#=-]*){{0,12}}"
+    rf"simply|just|only|best|correct|right|final|closest|my|one|either|both|{_NOUN})\b"
+    r"|[^\x00-\x7f]{1,9})[\s:,.#=-]*){0,12}"
 )
 _STATEMENT = _compile(
     rf"[\s\-•.:,=>#]*(?:[^,\d]{{1,60}},\s)??{_BEFORE_LETTER}"
@@ -127,6 +134,7 @@ _AFTER_A = _compile(
     r"$|[^\w\s]|[^\x00-\x7f]|(?:or|and|vs|to|yes|no|because|since|as|due|which|that|where|if|shows?|"
     r"match\w*|fits?|is|was|seems|looks|agrees|with|near|at|in|on|by|xx)\b"
 )
+# Other letters: those that are named, alternatives, and reasons for which one is named.
 _NAMED = re.compile(
     r"(?<![a-zA-Z0-9_'])([B-HJ-Z]|A(?!\s+(?!(?:or|and|vs|to|is|as)\b)[a-z]))(?![\w'])"
 )
@@ -140,20 +148,24 @@ _EXCUSE = _compile(
     r"second~choice|runner|wrong|incorrect|earl(?:y|ier)|lat(?:e|er)|ruled?\sout|too|cannot|never|"
     r"neither|reject\w*|eliminat\w*|exclud\w*)\b|n't\b"
 )
+# What takes a letter back (SELF stands for it) or refuses to answer.
 _REASON = _compile(r"\W*(?:because|since|as|due|though|although|while)\b")
 _FALSE = r"(?:wrong|incorrect|false|impossible|rejected|excluded|eliminated|ruled~out|implausible)"
 _NOT = r"(?:not|never|cannot|can't|doesn't|isn't|won't|hardly)"
 _WITHDRAWAL = _compile(
-    r"^\W*(?:(?:wait|but|so|no|oh|actually)\b\W*){0,3}(?:i~(?:think|believe)~)?(?:which|this|that|it|that's|it's|SELF)\b"
+    r"^\W*(?:(?:wait|but|so|no|oh|actually)\b\W*){0,3}(?:i~(?:think|believe)~)?"
+    r"(?:which|this|that|it|that's|it's|SELF)\b"
     rf"\W*(?:\w+~){{0,2}}?(?:{_FALSE}|{_NOT}~(?:(?:be|quite|really)~)?(?:fit|match|work|hold|"
     r"follow|right|correct|true|valid|possible|plausible|it|the~answer))\b"
     r"(?!~(?:that|for|to~(?:tell|say|be))\b|[^.!?]{0,20}\b[A-D]\b)"
     rf"|^\W*(?:{_FALSE}|not~(?!SELF\b|[A-D]\b)\w+)\W*$|no[,.]~none\b"
     r"|^\W*(?:(?:oh|ah|hmm+|wait|but|actually|well|sorry|no|nope)\b\W*)+$"
     r"|\b(?:i~doubt|so~i~thought|scratch~that|take~(?:it|that)~back|never~mind|"
-    r"chang\w+~my~(?:answer|choice|mind)|(?:disregard|ignore)~(?:that|this|it|my|the~(?:line|answer|letter|above))|typo|placeholder|"
+    r"chang\w+~my~(?:answer|choice|mind)|"
+    r"(?:disregard|ignore)~(?:that|this|it|my|the~(?:line|answer|letter|above))|typo|placeholder|"
     r"withdraw|retract)\b"
-    rf"|\bSELF~(?:(?:is|was|must~be)~(?:\w+~)?(?:{_FALSE}|{_NOT})|(?:cannot|can't|couldn't|could~not)~be)\b"
+    rf"|\bSELF~(?:(?:is|was|must~be)~(?:\w+~)?(?:{_FALSE}|{_NOT})|"
+    r"(?:cannot|can't|couldn't|could~not)~be)\b"
 )
 _REFUSAL = _compile(
     r"^(?:none|null|n/?a|nil|no|neither|unknown|unsure|abstain|refused?|declined?|pass)\W*$"
@@ -174,13 +186,17 @@ _CONDITION = _compile(r"\W*(?:if|unless|provided)\b")
 _WEAK_REFUSAL = _compile(
     r"\bsorry\b|(?:hard~to|do(?:~not|n't))~(?:determine|tell|answer|decide|know|see)"
 )
+# Sentences without a head: those that speak for a letter, conclusions, and verdicts.
 _RIVAL = _compile(
     r"\b(?:i~meant~|(?:it|this|that|edit|correction)(?:(?:'s|~is|~must~be|~has~to~be|~should~be|"
-    r"~(?:could|may|might)(?:~(?!not\b|never\b)\w+){0,3}?~be)~|\s?:\s?(?:(?:could|may|might)(?:~(?!not\b)\w+){0,3}?~be~)?))"
+    r"~(?:could|may|might)(?:~(?!not\b|never\b)\w+){0,3}?~be)~|\s?:\s?"
+    r"(?:(?:could|may|might)(?:~(?!not\b)\w+){0,3}?~be~)?))"
     rf"(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])(?=\W*$|[,;])"
     r"|(?<![\w'])(?P<subject>[A-D]):?~(?:(?:also|still)~)?(?:(?:fits|matches|agrees)\b|(?:is|seems"
     r"|looks)~(?:(?:just|equally|also|as|more|the|a|far|much|too)~){0,3}(?:likely|plausible|"
-    r"possible|probable|right|correct|better|best|closest|answer|match)\b(?!~(?:only|if|about|until|of~the|alternative|(?:to~be~)?an?~(?:\w+~)?(?:frame|image|state)|the~frame|intermediate|earlier|later)\b))"
+    r"possible|probable|right|correct|better|best|closest|answer|match)\b"
+    r"(?!~(?:only|if|about|until|of~the|alternative|(?:to~be~)?an?~(?:\w+~)?(?:frame|image|state)|"
+    r"the~frame|intermediate|earlier|later)\b))"
 )
 _CONTRAST = _compile(
     r"\w:?~(?:also~)?(?:fits|matches|agrees|(?:is|seems|looks)~(?:also~)?(?:plausible|possible))\b"
@@ -198,6 +214,7 @@ _CONCLUSION = _compile(
 _VERDICT = _compile(rf"\W*(?:{_NOUN}~)?(?P<letter>[A-D])\b[\s).,:=*_-]+(?P<verdict>\w.*)")
 _YES = _compile(r"\b(?:yes|match(?:es)?|fits|correct|right|true|best)\b")
 _NO = _compile(r"\b(?:no|not|wrong|incorrect|false|mismatch|reject\w*|too)\b|n't\b")
+# Markup.
 _TAG = _compile(
     r"<(?P<tag>(?:final_?)?(?:answer|choice))(?:\s[^<>]{0,80})?>(?P<value>[^<>]{0,200})</(?P=tag)>"
 )
