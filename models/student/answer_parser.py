@@ -188,7 +188,7 @@ _WEAK_REFUSAL = _compile(
 )
 # Sentences without a head: those that speak for a letter, conclusions, and verdicts.
 _RIVAL = _compile(
-    r"\b(?:i~meant~|(?:it|this|that|edit|correction)(?:(?:'s|~is|~must~be|~has~to~be|~should~be|"
+    r"\b(?:i~meant~|(?:argue|case)~for~|(?:it|this|that|edit|correction)(?:(?:'s|~is|~must~be|~has~to~be|~should~be|"
     r"~(?:could|may|might)(?:~(?!not\b|never\b)\w+){0,3}?~be)~|\s?:\s?"
     r"(?:(?:could|may|might)(?:~(?!not\b)\w+){0,3}?~be~)?))"
     rf"(?:\w+~)?(?:the~)?(?:{_NOUN}~)?(?P<said>[A-D])(?=\W*$|[,;])"
