@@ -40,6 +40,9 @@ MATCHED_ANCHOR = "matched_anchor"
 """Name of the suite of the matched-anchor items."""
 COUNTERFACTUAL, ALTERNATIVE = "-without-", "-alt-"
 """What follows the id of a scene in the ids of its counterfactuals and alternative futures."""
+CONTACT, GHOST = "contact", "ghost"
+"""The distractors of items that only contact physics solves, and the one of them in which the two
+objects pass through each other."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ READERS = {"clevrer": "3", "movi_a": "3", "physion": "3", "tracks": "2"}
 """Versions of the readers of other simulators' releases."""
 RENDERERS = {"bullet": "bullet-1", "blender": "blender-1, bpy 4.2.23, 32 samples"}
 """Versions of the renderers. Blender gives other pixels with another release or more samples."""
-BUILDERS = {"paper": "9", "balanced": "11"}
+BUILDERS = {"paper": "9", "balanced": "11", "contact": "1"}
 """Versions of the items and queries, by the recipe of the distractors."""
 
 

@@ -16,7 +16,7 @@ from conf.schema.world import WorldConfig
 
 RENDERERS = ("bullet", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion", "tracks")
-DISTRACTORS = ("paper", "balanced")
+DISTRACTORS = ("paper", "balanced", "contact")
 RECIPES = ("dynapix", "movi_a", "physion", "tracks")
 WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
 """Window families of each group (see `data.items.recipes`). B and G2 need a later collision."""
@@ -108,8 +108,9 @@ class BenchmarkConfig(Settings):
     Physion (physion), or without contacts (tracks). null takes the recipe of `simulator`; that of
     bullet is dynapix."""
     distractors: str = setting("paper", DISTRACTORS)
-    """Distractors of selection items: as in the paper (paper), or frames of other futures of the
-    scene, chosen so that only a prediction of its motion reveals the target (balanced)."""
+    """Distractors of selection items: as in the paper (paper); frames of other futures of the
+    scene, chosen so that only a prediction of its motion reveals the target (balanced); or frames
+    of other outcomes of a collision, chosen so that only contact physics reveals it (contact)."""
     folder: str | None = path(None)
     """Folder of the release or of the tracked videos, if `simulator` reads one."""
     fps: float = setting(30.0, above=0)
@@ -179,10 +180,10 @@ class BenchmarkConfig(Settings):
                 f"{physics.fps}: the recipe dynapix needs {SCENE_FRAMES} frames at {SCENE_FPS} per "
                 f"second; set them, or set {group}recipe=movi_a or physion"
             )
-        if self.distractors == "balanced" and (recipe != "dynapix" or self.simulator != "bullet"):
+        if self.distractors != "paper" and (recipe != "dynapix" or self.simulator != "bullet"):
             yield (
-                f"{group}distractors=balanced with {simulator} and {group}recipe={recipe}: "
-                "balanced distractors are frames of simulated futures; set "
+                f"{group}distractors={self.distractors} with {simulator} and {group}recipe="
+                f"{recipe}: these distractors are frames of simulated futures; set "
                 f"{group}simulator=bullet and {group}recipe=dynapix, or {group}distractors=paper"
             )
         if recipe == "tracks":

@@ -11,25 +11,37 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data.items.scores import SCORES, compare_candidates, order_target_first, rank_shares
+from data.items.contact import has_ghost
+from data.items.scores import compare_candidates, order_target_first, rank_shares
 from data.records import SelectionItem
 
-SIMPLE = tuple(f"{score}, {end}" for score in SCORES for end in ("lowest", "highest"))
-"""Names of the simple strategies."""
 PENALTY = 1e-2
 """Weight of the squared coefficients in the loss of the logistic model."""
 
 
-def score_simple_strategies(scores: np.ndarray, answers: np.ndarray) -> np.ndarray:
-    """Return the score of each simple strategy on each item, (N, 2 S): 1 / m if the target is among
-    m candidates with the best score, otherwise 0.
+def score_simple_strategies(
+    names: Sequence[str], scores: np.ndarray, answers: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the score of each simple strategy on each item, (N,): 1 / m if the target is among m
+    candidates with the best score, otherwise 0.
 
     Args:
+        names: Names of the S scores.
         scores: (N, S, 4) scores of the candidates.
         answers: (N,) indices of the targets.
     """
     shares = rank_shares(order_target_first(scores, answers))
-    return np.stack([shares[..., 0], shares[..., 3]], axis=-1).reshape(len(scores), -1)
+    ends = {"lowest": 0, "highest": 3}
+    return {
+        f"{name}, {end}": shares[:, k, rank]
+        for k, name in enumerate(names)
+        for end, rank in ends.items()
+    }
+
+
+def score_not_the_ghost(items: Sequence[SelectionItem]) -> np.ndarray:
+    """Return the expected score (N,) of a guess that excludes the ghost where it is a candidate."""
+    return np.array([1 / 3 if has_ghost(item) else 1 / 4 for item in items])
 
 
 def fit_logistic(features: np.ndarray, answers: np.ndarray) -> np.ndarray:

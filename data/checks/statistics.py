@@ -11,10 +11,14 @@ import pandas as pd
 from tqdm import tqdm
 
 from data.checks.baselines import score_scene_alone, score_velocity
-from data.checks.shortcuts import SIMPLE, score_logistic_model, score_simple_strategies
-from data.items.scores import CandidateFrames, compare_item
+from data.checks.shortcuts import (
+    score_logistic_model,
+    score_not_the_ghost,
+    score_simple_strategies,
+)
+from data.items.scores import COLLISION_SCORES, SCORES, CandidateFrames, compare_item
 from data.oracle.contacts import collisions_in
-from data.records import LETTERS, SPLITS, SelectionItem
+from data.records import CONTACT, LETTERS, SPLITS, SelectionItem
 from data.store import Store
 
 LOGISTIC, VELOCITY = "logistic model of all scores", "velocity"
@@ -66,7 +70,11 @@ def measure_shortcuts(
     """Return the accuracy of each shortcut on the items of the test split, by category, given the
     scores (N, S, 4) of the items' candidates."""
     answers = np.array([item.answer for item in items])
-    right = pd.DataFrame(score_simple_strategies(scores, answers), columns=list(SIMPLE))
+    is_contact = any(item.distractors == CONTACT for item in items)
+    names = (*SCORES, *COLLISION_SCORES) if is_contact else SCORES
+    right = pd.DataFrame(score_simple_strategies(names, scores, answers))
+    if is_contact:
+        right["not the ghost"] = score_not_the_ghost(items)
     right[LOGISTIC] = score_logistic_model(items, scores, answers)
     right[VELOCITY] = [score_velocity(item, store) for item in items]
     if blind:

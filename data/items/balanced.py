@@ -24,6 +24,7 @@ from conf.schema import WorldConfig
 from data.items.futures import (
     Group,
     alternative_scene,
+    branches_of_velocities,
     joint_groups,
     moving_objects,
     sample_velocities,
@@ -90,25 +91,24 @@ class BalancedPicker(DistractorPicker):
             moments += self._wrong_moment(scene, timing, about)
             if len(moments) == 1:
                 return None
-        count, quarter = FUTURES[family], int(self.balance.counts_of("nearness").argmin())
+        count, quarter = FUTURES[family], int(self.balance.excess_of("nearness").argmin())
         velocities = sample_velocities(scene, timing.stop, groups, count, quarter, self.rng)
-        futures = simulate_futures(scene, timing.stop, max(moments), velocities, self.world)
+        branches = branches_of_velocities(scene, timing.stop, velocities)
+        motions = simulate_futures(scene, timing.stop, max(moments), branches, self.world)
+        futures = np.stack([motion.states for motion in motions])
         name = f"{scene.scene_id}{ALTERNATIVE}{cell['subtype']}-{timing.stop}"
         frames, frame_moments = self._candidate_frames(scene, name, timing.stop, moments, futures)
         displacement = frame_displacements(frames, about)
         choices = _choices(len(moments), len(futures))
-        choices = _distinct(choices, displacement, self.cell.min_displacement)
+        choices = distinct_choices(choices, displacement, self.cell.min_displacement)
         choices = _of_difficulty(choices, displacement, NEAREST.get(cell["distractors"]))
         if not len(choices):
             return None
-        states = [(frames, k) for k in range(frames.frames)]
-        images = render_small(frames, range(frames.frames), {"world": asdict(self.world)})
-        compared = CandidateFrames.compare(states, frame_moments, images)
-        best = self.balance.choose(compared.scores(choices))
-        if best is None:
+        chosen = self._choose(self.balance, frames, frame_moments, choices)
+        if chosen is None:
             return None
         candidates = []
-        for frame in choices[best].tolist():
+        for frame in chosen:
             moment = frame_moments[frame]
             if frame <= len(moments):
                 source = "target" if frame == TARGET else "same_time"
@@ -116,12 +116,38 @@ class BalancedPicker(DistractorPicker):
                 continue
             index = (frame - TARGET - len(moments)) % len(futures)
             other = f"{name}-{index}"
-            future = alternative_scene(scene, other, timing.stop, futures[index], self.world)
-            save_scene(future, scene_path(self.folder, other))
+            self._save(scene, other, timing.stop, futures[index])
             candidates.append(Candidate(other, moment, "alternative"))
-        pairs = frame_displacements(frames)[np.ix_(choices[best], choices[best])]
-        least = float(pairs[np.triu_indices(4, 1)].min())
+        least = least_displacement(frames, chosen)
         return new_item(recipe, scene, timing, candidates, least, distractors="alternative")
+
+    def _choose(
+        self,
+        balance: Balance,
+        frames: Scene,
+        moments: Sequence[int],
+        choices: np.ndarray,
+        further: Sequence[np.ndarray] = (),
+        eligible: Sequence[int] = (0, 1, 2, 3),
+    ) -> list[int] | None:
+        """Return the choice of candidates (T, 4) that balances the ranks of the targets best, or
+        None (see `Balance.choose`).
+
+        Args:
+            frames: The frames from which candidates are chosen, the last observed one first.
+            moments: Their frame indices in time.
+            further: Further scores of these frames.
+        """
+        states = [(frames, k) for k in range(frames.frames)]
+        images = render_small(frames, range(frames.frames), {"world": asdict(self.world)})
+        compared = CandidateFrames.compare(states, moments, images, further)
+        best = balance.choose(compared.scores(choices), eligible)
+        return None if best is None else choices[best].tolist()
+
+    def _save(self, scene: Scene, name: str, stop: int, states: np.ndarray) -> None:
+        """Save an alternative future: a scene with the states (F, N, 13) from frame `stop` on."""
+        future = alternative_scene(scene, name, stop, states, self.world)
+        save_scene(future, scene_path(self.folder, name))
 
     def _candidate_frames(
         self, scene: Scene, name: str, stop: int, moments: Sequence[int], futures: np.ndarray
@@ -165,8 +191,8 @@ class BalancedPicker(DistractorPicker):
         horizon = timing.target - timing.stop
         least = horizon / (scene.frames - 1 - timing.stop)
         share = self.rng.uniform(least, LARGEST_SHARE)
-        counts = self.balance.counts_of("moment")
-        lead = horizon * share if counts[0] >= counts[3] else horizon / share
+        excess = self.balance.excess_of("moment")
+        lead = horizon * share if excess[0] >= excess[3] else horizon / share
         moment = timing.stop + int(lead)
         shift = frame_displacements(scene, about)[timing.target, moment]
         return [moment] if shift >= self.cell.min_displacement else []
@@ -183,11 +209,17 @@ def _choices(moments: int, futures: int) -> np.ndarray:
     return np.array([[TARGET, TARGET + 1, first + k, first + futures + k] for k in range(futures)])
 
 
-def _distinct(choices: np.ndarray, displacement: np.ndarray, least: float) -> np.ndarray:
-    """Return the choices whose candidates all differ by at least `least` px."""
+def distinct_choices(choices: np.ndarray, displacement: np.ndarray, least: float) -> np.ndarray:
+    """Return the choices (T, 4) of frames that all differ by at least `least` px."""
     pairs = displacement[choices[:, :, None], choices[:, None, :]]
     pairs[:, np.arange(4), np.arange(4)] = np.inf
     return choices[pairs.min(axis=(1, 2)) >= least]
+
+
+def least_displacement(frames: Scene, chosen: Sequence[int]) -> float:
+    """Return the smallest displacement of an object between two of the chosen frames, px."""
+    pairs = frame_displacements(frames)[np.ix_(chosen, chosen)]
+    return float(pairs[np.triu_indices(len(chosen), 1)].min())
 
 
 def _of_difficulty(

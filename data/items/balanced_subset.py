@@ -19,7 +19,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data.items.scores import compare_candidates, rank_shares
+from data.items.scores import compare_candidates, rank_excess
 
 RESERVE = 1.15
 """Factor on the quota of a balanced cell: the number of items from which its items are chosen."""
@@ -32,7 +32,11 @@ SWEEPS = 30
 
 
 def choose_items(
-    scores: np.ndarray, cells: Sequence[str], quotas: dict[str, int], rng: np.random.Generator
+    scores: np.ndarray,
+    cells: Sequence[str],
+    quotas: dict[str, int],
+    rng: np.random.Generator,
+    eligible: Sequence[int] = (0, 1, 2, 3),
 ) -> list[int]:
     """Return the indices of the items to keep, in ascending order, up to the quota of each cell.
 
@@ -42,9 +46,10 @@ def choose_items(
     Args:
         scores: (N, S, 4) scores of the candidates of N items of one family, the target first.
         cells: The cell of each item, a key of `quotas`.
+        eligible: The candidates that could be the target as far as their kind tells.
     """
     cell_of = np.array(cells)
-    deviations = item_deviations(scores)
+    deviations = item_deviations(scores, eligible)
     kept = np.zeros(len(cells), dtype=bool)
     for cell, quota in quotas.items():
         kept[np.flatnonzero(cell_of == cell)[:quota]] = True
@@ -64,13 +69,14 @@ def choose_items(
     return np.flatnonzero(kept).tolist()
 
 
-def item_deviations(scores: np.ndarray) -> np.ndarray:
+def item_deviations(scores: np.ndarray, eligible: Sequence[int] = (0, 1, 2, 3)) -> np.ndarray:
     """Return for each item (N, D) by how much its target differs from a target without shortcuts:
-    its relative scores in standard deviations, and for each rank, whether it has the rank, less a
-    quarter. `scores` are those of the candidates (N, S, 4), the target first."""
+    its relative scores in standard deviations, and for each rank, whether it has the rank. Both are
+    relative to the mean of the eligible candidates. `scores` are those of the candidates (N, S, 4),
+    the target first."""
     relative = compare_candidates(scores)
-    relative = relative - relative.mean(axis=-1, keepdims=True)
+    relative = relative - relative[..., list(eligible)].mean(axis=-1, keepdims=True)
     scatter = np.einsum("nfc,ngc->fg", relative, relative) / relative[:, 0].size
     whiten = np.linalg.cholesky(np.linalg.inv(scatter + RIDGE * np.eye(len(scatter))))
-    ranks = rank_shares(scores).reshape(len(scores), -1) - 1 / 4
+    ranks = rank_excess(scores, eligible).reshape(len(scores), -1)
     return np.concatenate([relative[..., 0] @ whiten, math.sqrt(RANK_WEIGHT) * ranks], axis=1)

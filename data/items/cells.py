@@ -23,14 +23,23 @@ import numpy as np
 
 from conf.files import write_bytes
 from conf.schema import BenchmarkConfig, Quota
-from data.items import recipes, transfer
+from data.items import contact, recipes, transfer
 from data.items.balanced import BalancedPicker
 from data.items.balanced_subset import RESERVE, choose_items
+from data.items.contact import ContactPicker
 from data.items.pickers import CellInputs, DistractorPicker, Recipe, fill_quota, shuffle_candidates
 from data.items.queries import make_counterfactual_queries, make_future_queries
-from data.items.scores import compare_item, order_target_first
+from data.items.scores import compare_item
 from data.parallel import Workers
-from data.records import FAMILIES, MATCHED_ANCHOR, RetrievalQuery, Scene, SelectionItem
+from data.records import (
+    CONTACT,
+    FAMILIES,
+    GHOST,
+    MATCHED_ANCHOR,
+    RetrievalQuery,
+    Scene,
+    SelectionItem,
+)
 from data.seeded_order import named_rng
 from data.store import PARTS, SCENES_FOLDER, hash_files, load_scene, part_path, scene_path
 from data.versions import component_versions
@@ -56,7 +65,6 @@ def make_items_and_queries(
     """
     quotas = {name: _with_reserve(cfg, name, quota) for name, quota in cell_quotas(cfg).items()}
     settings = cfg.seed, cfg.selection.min_displacement, cfg.retrieval.hard_negatives
-    is_balanced = cfg.distractors == "balanced"
     recipe = cfg.item_recipe, cfg.suite, cfg.distractors
     if cfg.simulator != "bullet":
         # A release may have changed since a killed build, while its scenes keep their ids.
@@ -70,7 +78,7 @@ def make_items_and_queries(
         paths[name] = path = part_path(folder, [*inputs, name, asdict(quota)])
         jobs[path] = partial(_make_cell, cfg, name, cell, path)
         sizes[path] = quota.train + quota.test
-    if is_balanced:
+    if is_balanced(cfg):
         # The alternative futures of balanced items have the same names for other settings: a result
         # from before a change of settings may refer to futures that were simulated since.
         for path in {*(folder / PARTS).glob("*.json")} - jobs.keys():
@@ -86,9 +94,13 @@ def make_items_and_queries(
             made = [SelectionItem.from_row(row) for row in part["rows"]]
             items += made
             scores |= zip((i.item_id for i in made), part.get("scores", []), strict=False)
-            reason = "no suitable distractors" if is_balanced else "too alike"
+            reason = "no suitable distractors" if is_balanced(cfg) else "too alike"
             dropped[f"items dropped, {reason}/{name.partition('/')[0]}"] += part["dropped"]
-    return _choose_balanced(cfg, items, scores) if is_balanced else items, queries, dict(dropped)
+    return (
+        _choose_balanced(cfg, items, scores) if is_balanced(cfg) else items,
+        queries,
+        dict(dropped),
+    )
 
 
 def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> None:
@@ -103,18 +115,27 @@ def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) ->
         by_time, dropped = fill_quota(name, recipes.MATCHED, cell)
         made = [paired for item in by_time for paired in recipes.make_pair(item)]
     else:
-        balanced = partial(BalancedPicker, world=cfg.world, folder=path.parents[1])
-        picker = {"paper": DistractorPicker, "balanced": balanced}[cfg.distractors]
-        made, dropped = fill_quota(subtype, cell_recipe(cfg, group, subtype), cell, picker)
-        if cfg.distractors == "balanced":
+        pickers = {"paper": DistractorPicker, "balanced": BalancedPicker, CONTACT: ContactPicker}
+        make_picker = pickers[cfg.distractors]
+        if is_balanced(cfg):
+            make_picker = partial(make_picker, world=cfg.world, folder=path.parents[1])
+        made, dropped = fill_quota(subtype, cell_recipe(cfg, group, subtype), cell, make_picker)
+        if is_balanced(cfg):
             compared = (compare_item(item, cell.scene_of, asdict(cfg)) for item in made)
             part["scores"] = [each.item_scores().tolist() for each in compared]
     part |= {"rows": [asdict(row) for row in made], "dropped": dropped}
     write_bytes(path, json.dumps(part).encode())
 
 
+def is_balanced(cfg: BenchmarkConfig) -> bool:
+    """Return whether the distractors of a benchmark are simulated, and its items balanced."""
+    return cfg.distractors != "paper"
+
+
 def cell_recipe(cfg: BenchmarkConfig, family: str, subtype: str) -> Recipe:
     """Return the recipe of a cell of a benchmark's suite."""
+    if cfg.distractors == CONTACT:
+        return contact.make_contact_recipe(subtype)
     if cfg.item_recipe in transfer.CELLS:
         return transfer.make_transfer_recipe(cfg.item_recipe, cfg.suite, family, subtype)
     return recipes.make_recipe(cfg.suite, family, subtype)
@@ -122,6 +143,8 @@ def cell_recipe(cfg: BenchmarkConfig, family: str, subtype: str) -> Recipe:
 
 def list_subtypes(cfg: BenchmarkConfig) -> Mapping[str, tuple[str, ...]]:
     """Return the subtypes of each family of a benchmark's suite."""
+    if cfg.distractors == CONTACT:
+        return {"event": (*contact.CELLS,), "time": (), "window": ()}
     own = {"dynapix": recipes.CELLS, "tracks": recipes.CELLS_WITHOUT_CONTACTS}
     return (own | transfer.CELLS)[cfg.item_recipe]
 
@@ -135,16 +158,20 @@ def _choose_balanced(
     pools: dict[tuple[str, ...], list[SelectionItem]] = defaultdict(list)
     for item in items:
         if item.item_id in scores:
-            pools[item.split, item.family, item.difficulty or ""].append(item)
+            kind = item.difficulty or (GHOST if contact.has_ghost(item) else "")
+            pools[item.split, item.family, kind].append(item)
     chosen: dict[str, SelectionItem] = {}
     quotas = family_quotas(cfg)
-    for (split, family, difficulty), pool in pools.items():
-        rng = named_rng(cfg.seed, "pool", split, family, difficulty)
+    for (split, family, kind), pool in pools.items():
+        rng = named_rng(cfg.seed, "pool", split, family, kind)
         own = np.array([scores[item.item_id] for item in pool])
-        answers = np.array([item.answer for item in pool])
+        order = np.array([contact.order_candidates(item) for item in pool])
+        ordered = np.take_along_axis(own, order[:, None], axis=-1)
         wanted = {subtype: getattr(quota, split) for subtype, quota in quotas[family].items()}
-        ordered, cells = order_target_first(own, answers), [item.subtype for item in pool]
-        kept = choose_items(ordered, cells, wanted, rng)
+        if cfg.distractors == CONTACT:
+            wanted = {k: contact.share_of_quota(n, kind == GHOST) for k, n in wanted.items()}
+        eligible = contact.eligible_candidates(kind == GHOST)
+        kept = choose_items(ordered, [item.subtype for item in pool], wanted, rng, eligible)
         for _, cell in groupby((pool[k] for k in kept), key=lambda item: item.subtype):
             chosen |= {item.item_id: item for item in shuffle_candidates([*cell], rng)}
     return [
@@ -180,7 +207,7 @@ def _with_reserve(cfg: BenchmarkConfig, name: str, quota: Quota) -> Quota:
     factor = 1.0
     if _is_query_cell(name):
         factor = QUERY_RESERVE
-    elif cfg.distractors == "balanced" and name != MATCHED_ANCHOR:
+    elif is_balanced(cfg) and name != MATCHED_ANCHOR:
         factor = RESERVE
     made = copy(quota)
     made.train, made.test = (math.ceil(factor * n) for n in (quota.train, quota.test))

@@ -16,7 +16,7 @@ from conf.schema import WorldConfig
 from data.oracle.contacts import collisions_in
 from data.oracle.displacement import visible_positions
 from data.records import Scene
-from data.sim.physics import shared_simulator
+from data.sim.physics import Branch, Motion, shared_simulator
 from data.sources.scenes import oracle_arrays
 
 MOVING = 0.1
@@ -86,14 +86,14 @@ def sample_velocities(
         angles = rng.uniform(-MAX_TURN, MAX_TURN, count) - rng.uniform(-MAX_TURN, MAX_TURN)
         for changed, factor, angle in zip(velocities, factors, angles, strict=True):
             if len(group) == 1:
-                changed[group] = factor * _turn(changed[group[0]], angle)
+                changed[group] = factor * turn_velocity(changed[group[0]], angle)
             else:
                 mean = changed[group].mean(axis=0)
-                changed[group, :3] += (factor * _turn(mean, angle) - mean)[:3]
+                changed[group, :3] += (factor * turn_velocity(mean, angle) - mean)[:3]
     return velocities
 
 
-def _turn(velocity: np.ndarray, angle: float) -> np.ndarray:
+def turn_velocity(velocity: np.ndarray, angle: float) -> np.ndarray:
     """Rotate a linear and an angular velocity (6,) about the vertical."""
     cos, sin = np.cos(angle), np.sin(angle)
     x, y, z = velocity.reshape(2, 3).T
@@ -101,14 +101,19 @@ def _turn(velocity: np.ndarray, angle: float) -> np.ndarray:
 
 
 def simulate_futures(
-    scene: Scene, frame: int, last: int, velocities: np.ndarray, world: WorldConfig
-) -> np.ndarray:
-    """Simulate a scene from `frame` to `last` with other velocities (K, N, 6) at `frame`; return
-    states (K, last - frame + 1, N, 13)."""
+    scene: Scene, frame: int, last: int, branches: Sequence[Branch], world: WorldConfig
+) -> list[Motion]:
+    """Simulate other continuations of a scene from `frame` to `last`."""
     states, count = scene_states(scene)[frame].astype(float), last - frame + 1
     return shared_simulator().simulate_branches(
-        scene.objects, scene.object_scales, states, velocities, world, count
+        scene.objects, scene.object_scales, states, branches, world, count
     )
+
+
+def branches_of_velocities(scene: Scene, frame: int, velocities: np.ndarray) -> list[Branch]:
+    """Return continuations of a scene with other velocities (K, N, 6) at a frame."""
+    poses = scene_states(scene)[frame, :, :7].astype(float)
+    return [Branch(np.concatenate([poses, own], axis=-1)) for own in velocities]
 
 
 def scene_states(scene: Scene) -> np.ndarray:

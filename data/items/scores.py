@@ -15,12 +15,15 @@ import numpy as np
 from PIL import Image
 
 from data.frames.frame_cache import render_frames
+from data.oracle.contacts import next_collision
 from data.oracle.displacement import (
+    MODEL_SIZE,
     cross_scene_displacement,
     object_displacements,
     visible_positions,
 )
-from data.records import FrameRef, Scene, SelectionItem
+from data.records import CONTACT, FrameRef, Scene, SelectionItem
+from data.sim.camera import Camera
 
 SCORES = (
     "nearness", "pixel nearness", "oddness", "pixel oddness", "moment", "travel", "visible", "gap",
@@ -29,6 +32,11 @@ SCORES = (
 it, sums of displacements and of pixel differences from the other candidates, index of the frame,
 sum of the displacements of all objects since the last observed frame, number of visible objects,
 and the smallest gap between two of them."""
+COLLISION_SCORES = ("velocity", "striker", "struck", "deflection", "pair distance")
+"""Further scores of the candidates of contact items: mean distance of the objects in the image from
+their positions at constant velocity, distances of the two objects of the collision from where they
+would meet at constant velocity, angle between the first part of this distance and the velocity of
+the faster object (the striker), and distance between the two objects."""
 TOUCHING = 0.05
 """Gap (simulator units) below which two objects count as touching."""
 APART = 10.0
@@ -50,7 +58,8 @@ class CandidateFrames:
     Attributes:
         displacement: (M, M) displacement between two frames, px at 336 x 336.
         pixels: (M, M) mean difference of pixels.
-        single: (4, M) moment, travel, number of visible objects and gap of each frame.
+        single: (S', M) moment, travel, number of visible objects and gap of each frame, and what
+            `collision_scores` returns for contact items.
     Frame 0 is the last observed frame.
     """
 
@@ -60,10 +69,14 @@ class CandidateFrames:
 
     @classmethod
     def compare(
-        cls, frames: Sequence[tuple[Scene, int]], moments: Sequence[int], images: np.ndarray
+        cls,
+        frames: Sequence[tuple[Scene, int]],
+        moments: Sequence[int],
+        images: np.ndarray,
+        further: Sequence[np.ndarray] = (),
     ) -> CandidateFrames:
-        """Compare frames, given as scenes and indices, with their indices in time (M,) and their
-        images (M, H, W, 3) uint8."""
+        """Compare frames, given as scenes and indices, with their indices in time (M,), their
+        images (M, H, W, 3) uint8 and further scores of single frames (M,)."""
         displacement = np.zeros((len(frames), len(frames)))
         for a, b in combinations(range(len(frames)), 2):
             distance = cross_scene_displacement(*frames[a], *frames[b])
@@ -74,6 +87,7 @@ class CandidateFrames:
             [sum(object_displacements(*frames[0], *frame)) for frame in frames],
             [visible_positions(scene)[1][frame].sum() for scene, frame in frames],
             [_gap(scene, frame) for scene, frame in frames],
+            *further,
         ]
         pixels = np.stack([np.abs(flat - image).mean(axis=-1) for image in flat])
         return cls(displacement, pixels, np.array(single, dtype=float))
@@ -103,15 +117,56 @@ def _gap(scene: Scene, frame: int) -> float:
     return max(float(min(gaps, default=APART)), TOUCHING)
 
 
+def constant_velocity_positions(
+    scene: Scene, frame: int, seconds: float, camera: Camera
+) -> np.ndarray:
+    """Return where the objects (N, 2) are in the image if they keep their velocities of a frame for
+    some seconds, px of the camera's image."""
+    return camera.project(scene.positions[frame] + seconds * scene.velocities[frame])[0]
+
+
+def collision_scores(
+    scene: Scene,
+    stop: int,
+    moment: int,
+    frames: Sequence[tuple[Scene, int]],
+    camera: Camera,
+) -> np.ndarray:
+    """Return the `COLLISION_SCORES` (5, M) of frames that show the objects of a scene at a moment
+    after its next collision after frame `stop`."""
+    collision = next_collision(scene, stop)
+    assert collision is not None
+    velocities = scene.velocities[stop, collision.objects, :2]
+    pair = np.array(collision.objects)[np.argsort(-np.linalg.norm(velocities, axis=-1))]
+    ahead = (collision.frame - stop) / scene.fps
+    meeting = scene.positions[stop, pair] + ahead * scene.velocities[stop, pair]
+    places = np.stack([other.positions[frame, pair] for other, frame in frames])
+    moved = (places - meeting)[..., :2]
+    travel = np.linalg.norm(moved, axis=-1)
+    heading = scene.velocities[stop, pair[0], :2]
+    cosine = moved[:, 0] @ heading / np.maximum(travel[:, 0] * np.linalg.norm(heading), 1e-6)
+    expected = constant_velocity_positions(scene, stop, (moment - stop) / scene.fps, camera)
+    scale = MODEL_SIZE / np.array(scene.image_size)
+    away = np.stack([(other.image_positions[frame] - expected) * scale for other, frame in frames])
+    return np.stack(
+        [
+            np.linalg.norm(away, axis=-1).mean(axis=-1),
+            *travel.T,
+            np.degrees(np.arccos(np.clip(cosine, -1, 1))),
+            np.linalg.norm(places[:, 0] - places[:, 1], axis=-1),
+        ]
+    )
+
+
 def nearly_equal(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return whether scores differ by less than the precision of the stored positions."""
     return np.isclose(one, other, rtol=1e-4, atol=1e-3)
 
 
-def rank_shares(scores: np.ndarray) -> np.ndarray:
-    """Return the distribution (..., 4) of the rank of the first of four candidates (..., 4): the
-    number of candidates with lower scores. Candidates with equal scores share the ranks."""
-    target, others = scores[..., :1], scores[..., 1:]
+def rank_shares(scores: np.ndarray, candidate: int = 0) -> np.ndarray:
+    """Return the distribution (..., 4) of the rank of one of four candidates (..., 4): the number
+    of candidates with lower scores. Candidates with equal scores share the ranks."""
+    target, others = scores[..., [candidate]], np.delete(scores, candidate, axis=-1)
     close = nearly_equal(others, target)
     lower = (others < target) & ~close
     first, count = lower.sum(axis=-1), close.sum(axis=-1) + 1
@@ -134,38 +189,49 @@ class Balance:
     """Counts how often the targets of a cell have each rank in each score. The counts start near 0
     at random, so that the few items of many small cells do not all begin with the same ranks."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self, rng: np.random.Generator, names: Sequence[str] = SCORES) -> None:
         self.items = 0
-        start = rng.uniform(-START, START, (len(SCORES), 4))
-        self.counts = start - start.mean(axis=-1, keepdims=True)
+        self.names = names
+        start = rng.uniform(-START, START, (len(names), 4))
+        self.excess = start - start.mean(axis=-1, keepdims=True)
+        """How often the targets have each rank, less how often they would have it by chance."""
 
-    def counts_of(self, score: str) -> np.ndarray:
-        """Return the number of targets with each rank (4,) in a score."""
-        return self.counts[SCORES.index(score)]
+    def excess_of(self, score: str) -> np.ndarray:
+        """Return the excess of each rank (4,) in a score."""
+        return self.excess[self.names.index(score)]
 
-    def choose(self, scores: np.ndarray) -> int | None:
+    def choose(self, scores: np.ndarray, eligible: Sequence[int] = (0, 1, 2, 3)) -> int | None:
         """Return the choice of candidates that keeps the counts of ranks most even, and count it.
 
         Args:
             scores: (S, T, 4) scores of T choices; the first of four candidates is the target.
+            eligible: The candidates that could be the target as far as their kind tells. By chance,
+                the target has the rank of each of them equally often.
 
         Returns:
             The index of the choice, or None if each would make the count of a rank differ too much
-            from a quarter of the items (see `LIMIT`) and the counts less even as a whole.
+            from its chance (see `LIMIT`) and the counts less even as a whole.
         """
-        shares = rank_shares(scores).swapaxes(0, 1)
-        excess = self.counts + shares - (self.items + 1) / 4
+        excess = self.excess + rank_excess(scores, eligible).swapaxes(0, 1)
         unevenness = (excess**2).sum(axis=(1, 2))
         # Without the second condition, a cell could reach counts at which it refuses every item.
-        allowed = (np.abs(excess).max(axis=(1, 2)) <= LIMIT + TOLERANCE * self.items) | (
-            unevenness < ((self.counts - self.items / 4) ** 2).sum()
-        )
+        bound = LIMIT + TOLERANCE * self.items
+        allowed = (np.abs(excess).max(axis=(1, 2)) <= bound) | (unevenness < (self.excess**2).sum())
         if not allowed.any():
             return None
         best = int(np.where(allowed, unevenness, np.inf).argmin())
-        self.counts = self.counts + shares[best]
+        self.excess = excess[best]
         self.items += 1
         return best
+
+
+def rank_excess(scores: np.ndarray, eligible: Sequence[int] = (0, 1, 2, 3)) -> np.ndarray:
+    """Return the distribution of the target's rank (see `rank_shares`), less the mean distribution
+    of the eligible candidates, (..., 4)."""
+    if len(eligible) == 4:
+        return rank_shares(scores) - 1 / 4
+    chance = np.mean([rank_shares(scores, k) for k in eligible], axis=0)
+    return rank_shares(scores) - chance
 
 
 def compare_item(
@@ -175,7 +241,12 @@ def compare_item(
     frames = [FrameRef(item.scene_id, item.prefix_stop), *item.candidates]
     states = [(scene_of(f.scene_id), f.frame) for f in frames]
     images = np.concatenate([render_small(scene, [frame], config) for scene, frame in states])
-    return CandidateFrames.compare(states, [f.frame for f in frames], images)
+    further: Sequence[np.ndarray] = ()
+    if item.distractors == CONTACT:
+        camera = Camera.from_settings(config["world"]["camera"])
+        own = scene_of(item.scene_id)
+        further = [*collision_scores(own, item.prefix_stop, item.target_frame, states, camera)]
+    return CandidateFrames.compare(states, [f.frame for f in frames], images, further)
 
 
 def render_small(scene: Scene, frames: Sequence[int], config: Mapping[str, Any]) -> np.ndarray:

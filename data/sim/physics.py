@@ -9,7 +9,7 @@ import ctypes
 import os
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -49,6 +49,23 @@ class Body:
     """Initial height of the centre of a body in the air; None for a body on the floor."""
     scale: float = 1.0
     """Size, as a multiple of the standard size of the shape."""
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A continuation of a simulation: the states from which it starts, and what else changes.
+
+    Attributes:
+        states: (N, 13) positions, quaternions, linear and angular velocities at the start.
+        masses: (N,) factors of the objects' masses; empty for 1.
+        restitution: Factor of the restitution of all objects.
+        passing: Two objects that pass through each other, if any.
+    """
+
+    states: np.ndarray
+    masses: Sequence[float] = ()
+    restitution: float = 1.0
+    passing: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -128,10 +145,78 @@ class Simulator:
             for a, b in chain(combinations(handles, 2), product(handles, fixed[1:]))
         ):
             return Motion(self._state(handles)[None], {}, touching_at_start=True)
-        frames = frames or world.physics.frames
-        recorded = np.zeros((frames, len(bodies), 13))
-        recorded[0] = self._state(handles)
         in_air = {k for k, body in enumerate(bodies) if body.height is not None}
+        frames = frames or world.physics.frames
+        return self._run(handles, fixed, world, frames, in_air, is_rejected)
+
+    def simulate_branches(
+        self,
+        objects: Sequence[SceneObject],
+        scales: Sequence[float],
+        states: np.ndarray,
+        branches: Sequence[Branch],
+        world: WorldConfig,
+        frames: int,
+    ) -> list[Motion]:
+        """Simulate several continuations of a scene, whose objects have the states (N, 13).
+
+        Equal arguments give bit-identical results. A branch with the states of the scene is close
+        to an uninterrupted simulation, but not equal, because Bullet keeps contacts from step to
+        step.
+        """
+        fixed = self._reset(world)
+        handles = [
+            self._add(*each, world) for each in zip(objects, scales, states.tolist(), strict=True)
+        ]
+        start = self._bullet.saveState()
+        motions = []
+        for branch in branches:
+            self._bullet.restoreState(start)
+            for handle, old, new in zip(handles, states, branch.states, strict=True):
+                if not np.array_equal(old[:7], new[:7]):
+                    self._bullet.resetBasePositionAndOrientation(handle, new[:3], new[3:7])
+                self._bullet.resetBaseVelocity(handle, new[7:10].tolist(), new[10:13].tolist())
+            with self._changed(handles, branch):
+                motions.append(self._run(handles, fixed, world, frames))
+        self._bullet.removeState(start)
+        return motions
+
+    @contextmanager
+    def _changed(self, handles: Sequence[int], branch: Branch) -> Iterator[None]:
+        """Apply what a branch changes besides the states, which a saved state does not include."""
+        bullet = self._bullet
+        infos = [bullet.getDynamicsInfo(handle, -1) for handle in handles]
+        masses = branch.masses or [1.0] * len(handles)
+        for handle, info, factor in zip(handles, infos, masses, strict=True):
+            if factor != 1:
+                bullet.changeDynamics(handle, -1, mass=info[0] * factor)
+            if branch.restitution != 1:
+                bullet.changeDynamics(handle, -1, restitution=info[5] * branch.restitution)
+        if branch.passing:
+            one, two = (handles[k] for k in branch.passing)
+            bullet.setCollisionFilterPair(one, two, -1, -1, 0)
+        yield
+        for handle, info, factor in zip(handles, infos, masses, strict=True):
+            if factor != 1:
+                bullet.changeDynamics(handle, -1, mass=info[0])
+            if branch.restitution != 1:
+                bullet.changeDynamics(handle, -1, restitution=info[5])
+        if branch.passing:
+            bullet.setCollisionFilterPair(one, two, -1, -1, 1)
+
+    def _run(
+        self,
+        handles: Sequence[int],
+        fixed: Sequence[int],
+        world: WorldConfig,
+        frames: int,
+        in_air: Iterable[int] = (),
+        is_rejected: Callable[[Touching], bool] = lambda touching: False,
+    ) -> Motion:
+        """Simulate from the present state of the bodies, which is the first of `frames` frames."""
+        recorded = np.zeros((frames, len(handles), 13))
+        recorded[0] = self._state(handles)
+        in_air = {*in_air}
         touching: dict[tuple[int, int], list[int]] = defaultdict(list)
         landings, rejected = [], False
         step, list_contacts = self._bullet.stepSimulation, self._bullet.getContactPoints
@@ -155,41 +240,6 @@ class Simulator:
                 recorded = recorded[: frame + 1]
                 break
         return Motion(recorded, dict(touching), tuple(landings), rejected)
-
-    def simulate_branches(
-        self,
-        objects: Sequence[SceneObject],
-        scales: Sequence[float],
-        states: np.ndarray,
-        velocities: np.ndarray,
-        world: WorldConfig,
-        frames: int,
-    ) -> np.ndarray:
-        """Simulate objects from states (N, 13) with several choices of their velocities: linear and
-        angular ones (K, N, 6) for K branches.
-
-        Returns:
-            (K, frames, N, 13) states, the given ones first, bit-identical for equal arguments. A
-            branch with the velocities of `states` is close to an uninterrupted simulation, but not
-            equal, because Bullet keeps contacts from step to step.
-        """
-        self._reset(world)
-        handles = [
-            self._add(*each, world) for each in zip(objects, scales, states.tolist(), strict=True)
-        ]
-        start = self._bullet.saveState()
-        recorded = np.zeros((len(velocities), frames, len(handles), 13))
-        for branch, own in zip(recorded, velocities.tolist(), strict=True):
-            self._bullet.restoreState(start)
-            for handle, velocity in zip(handles, own, strict=True):
-                self._bullet.resetBaseVelocity(handle, velocity[:3], velocity[3:])
-            branch[0] = self._state(handles)
-            for frame in range(1, frames):
-                for _ in range(world.physics.substeps):
-                    self._bullet.stepSimulation()
-                branch[frame] = self._state(handles)
-        self._bullet.removeState(start)
-        return recorded
 
     def _reset(self, world: WorldConfig) -> list[int]:
         """Empty Bullet's world, add the floor and the parts, and return their handles."""

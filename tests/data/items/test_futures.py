@@ -10,6 +10,7 @@ import pytest
 from data.items.futures import (
     MOVING,
     alternative_scene,
+    branches_of_velocities,
     joint_groups,
     moving_objects,
     sample_velocities,
@@ -34,24 +35,31 @@ def single_groups(scene: Scene, frame: int) -> list[tuple[int, ...]]:
     return [(k,) for k in moving_objects(scene, frame, range(len(scene.objects)))]
 
 
+def simulate(scene: Scene, frame: int, last: int, velocities: np.ndarray) -> np.ndarray:
+    """The states (K, F, N, 13) of futures with these velocities."""
+    branches = branches_of_velocities(scene, frame, velocities)
+    motions = simulate_futures(scene, frame, last, branches, CLEVRER)
+    return np.stack([motion.states for motion in motions])
+
+
 def test_branch_with_the_true_velocities_continues_the_scene(scene: Scene) -> None:
     true = np.concatenate([scene.velocities[40], scene.angular_velocities[40]], axis=-1)
-    (states,) = simulate_futures(scene, 40, 70, true[None].astype(float), CLEVRER)
+    (states,) = simulate(scene, 40, 70, true[None].astype(float))
     np.testing.assert_allclose(states[:, :, :3], scene.positions[40:71], atol=0.01)
 
 
 def test_futures_do_not_depend_on_earlier_simulations(scene: Scene) -> None:
     velocities = sample_velocities(scene, 40, single_groups(scene, 40), 4, 1, rng())
-    first = simulate_futures(scene, 40, 60, velocities, CLEVRER)
+    first = simulate(scene, 40, 60, velocities)
     simulate_scene(0, 5)
-    np.testing.assert_array_equal(simulate_futures(scene, 40, 60, velocities, CLEVRER), first)
+    np.testing.assert_array_equal(simulate(scene, 40, 60, velocities), first)
     shared_simulator.cache_clear()
-    np.testing.assert_array_equal(simulate_futures(scene, 40, 60, velocities, CLEVRER), first)
+    np.testing.assert_array_equal(simulate(scene, 40, 60, velocities), first)
 
 
 def test_alternative_scene_joins_past_and_future(scene: Scene) -> None:
     velocities = sample_velocities(scene, 50, single_groups(scene, 50), 1, 0, rng())
-    (states,) = simulate_futures(scene, 50, 64, velocities, CLEVRER)
+    (states,) = simulate(scene, 50, 64, velocities)
     other = alternative_scene(scene, "other", 50, states, CLEVRER)
     assert other.frames == 65
     np.testing.assert_array_equal(other.positions[:51], scene.positions[:51])

@@ -1,0 +1,226 @@
+"""Makes selection items that only contact physics solves: distractors are other outcomes of one
+collision.
+
+The prefix ends shortly before a collision, and the candidates show the same moment after it. In the
+distractors, one thing about the collision differs. `ghost`: the two objects pass through each
+other, as constant velocity predicts. `mass`: one of the two has another mass. `bounce`: both have
+another restitution. `aim`: the faster object comes from a slightly different direction.
+
+The true outcome is one more sample of the distribution of the others, and the scores that involve
+no contact physics do not reveal it (`data.items.scores`). The ghost cannot be the target. It stands
+in a share of the items (`GHOST_SHARE`), whose targets are balanced among the other three
+candidates: if it stood in most items, excluding it would reveal too much, and if the targets of
+the items without it made up for this, its absence would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+
+from conf.schema import WorldConfig
+from data.items.balanced import (
+    TARGET,
+    TRIES,
+    BalancedPicker,
+    distinct_choices,
+    least_displacement,
+)
+from data.items.futures import (
+    scene_states,
+    scene_with_states,
+    simulate_futures,
+    turn_velocity,
+)
+from data.items.pickers import Recipe, Timing, new_item
+from data.items.recipes import EVENT_QUESTION
+from data.items.scores import COLLISION_SCORES, SCORES, Balance, collision_scores
+from data.oracle.contacts import is_next, next_collision, touching_pairs
+from data.oracle.displacement import frame_displacements, visible_positions
+from data.records import ALTERNATIVE, CONTACT, GHOST, Candidate, Scene, SelectionItem
+from data.sim.camera import Camera
+from data.sim.physics import Branch, Motion
+
+CELLS = {"collision_gap10": 10, "collision_gap16": 16, "collision_gap26": 26}
+"""Frames from the collision to the target, by subtype."""
+OBSERVED = 21
+"""Number of frames of a prefix, as in the other event items."""
+LEAD = 3
+"""Number of frames from the end of the prefix to the collision."""
+MASSES, BOUNCES, AIMS = 5, 2, 4
+"""Numbers of outcomes with another mass, restitution and direction from which the distractors of an
+item are chosen."""
+LOG_MASSES = np.log(16.0)
+"""Logarithm of the ratio between the largest and the smallest mass."""
+MAX_BOUNCE = 1.4
+"""Maximum factor of the restitution."""
+DIRECTIONS = np.radians(50)
+"""Range of the directions of the faster object."""
+GHOST_SHARE = 0.25
+"""Share of the items in which the ghost is a distractor."""
+STRAY = 1 / 3
+"""Maximum displacement, as a share of the minimum between candidates, of the target from its
+simulation from the end of the prefix."""
+TRUE = TARGET + 1
+"""Index of the simulated true outcome among the frames from which candidates are chosen."""
+APART = 0.95
+"""Minimum distance of the objects of a ghost, as a share of the sum of their radii."""
+
+
+def make_contact_recipe(subtype: str) -> Recipe:
+    """Return the recipe of a cell of contact items."""
+    gap = CELLS[subtype]
+    fields = {
+        "subtype": subtype, "question": EVENT_QUESTION, "framing": "future", "distractors": CONTACT,
+        "gap": LEAD + gap,
+    }  # fmt: skip
+    return Recipe("event", partial(collision_timings, gap), lambda timing: fields, lambda *_: [])
+
+
+def collision_timings(gap: int, scene: Scene) -> list[Timing]:
+    """Return the timings whose prefix ends `LEAD` frames before the next collision, of two objects
+    that are then visible and apart."""
+    visible, found = visible_positions(scene)[1], []
+    for collision in scene.collisions:
+        stop, target = collision.frame - LEAD, collision.frame + gap
+        if not OBSERVED <= stop + 1 <= scene.frames - LEAD - gap:
+            continue
+        is_alone = is_next(scene, stop, collision.frame)
+        is_apart = collision.objects not in touching_pairs(scene, stop, stop)
+        if is_alone and is_apart and visible[stop, list(collision.objects)].all():
+            found.append(Timing(stop - OBSERVED + 1, stop, target, collision.frame))
+    return found
+
+
+@dataclass(kw_only=True)
+class ContactPicker(BalancedPicker):
+    """Makes the contact items of one cell and one split."""
+
+    def __post_init__(self) -> None:
+        names = (*SCORES, *COLLISION_SCORES)
+        self.balances = {with_ghost: Balance(self.rng, names) for with_ghost in (False, True)}
+
+    def make_item(
+        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+    ) -> SelectionItem | None:
+        self._tries[scene.scene_id] += 1
+        if self._tries[scene.scene_id] > TRIES:
+            return None
+        item = self._make_from_outcomes(recipe, scene, timing, about)
+        self.dropped += item is None
+        return item
+
+    def _make_from_outcomes(
+        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+    ) -> SelectionItem | None:
+        """Make an item from new outcomes, or return None if no choice of them is suitable."""
+        stop, target, least = timing.stop, timing.target, self.cell.min_displacement
+        pair = next_collision(scene, stop).objects
+        sources, branches = zip(*sample_outcomes(scene, stop, pair, self.rng), strict=True)
+        motions = simulate_futures(scene, stop, target, branches, self.world)
+        frames = outcome_frames(scene, timing, motions, self.world)
+        displacement = frame_displacements(frames, about)
+        if displacement[TARGET, TRUE] > STRAY * least:
+            return None
+        suitable = [
+            TRUE + k
+            for k, (source, motion) in enumerate(zip(sources, motions, strict=True))
+            if k and is_suitable(source, pair, motion, frames.object_radii)
+        ]
+        with_ghost = self._wants_ghost()
+        choices = [
+            (TARGET, *chosen)
+            for chosen in combinations(suitable, 3)
+            if (sources[chosen[-1] - TRUE] == GHOST) == with_ghost
+        ]
+        choices = distinct_choices(np.array(choices, int).reshape(-1, 4), displacement, least)
+        if not len(choices):
+            return None
+        moments = [stop, *[target] * (frames.frames - 1)]
+        shown = [(frames, k) for k in range(frames.frames)]
+        camera = Camera.from_settings(self.world.camera)
+        further = collision_scores(scene, stop, target, shown, camera)
+        balance, eligible = self.balances[with_ghost], eligible_candidates(with_ghost)
+        chosen = self._choose(balance, frames, moments, choices, further, eligible)
+        if chosen is None:
+            return None
+        candidates = [Candidate(scene.scene_id, target)]
+        for k in (frame - TRUE for frame in chosen[1:]):
+            name = f"{scene.scene_id}{ALTERNATIVE}{recipe.fields(timing)['subtype']}-{stop}-{k}"
+            self._save(scene, name, stop, motions[k].states)
+            candidates.append(Candidate(name, target, sources[k]))
+        return new_item(recipe, scene, timing, candidates, least_displacement(frames, chosen))
+
+    def _wants_ghost(self) -> bool:
+        """Return whether the next item should have the ghost, to keep its share."""
+        ghosts, others = self.balances[True].items, self.balances[False].items
+        return ghosts < GHOST_SHARE * (ghosts + others + 1)
+
+
+def sample_outcomes(
+    scene: Scene, stop: int, pair: tuple[int, int], rng: np.random.Generator
+) -> Iterator[tuple[str, Branch]]:
+    """Sample outcomes of the collision of a pair after frame `stop`, each with what differs in it:
+    the true outcome first, and the ghost last.
+
+    As in `data.items.futures.sample_velocities`, masses and directions have a random distance from
+    a centre, and so have the true ones.
+    """
+    states = scene_states(scene)[stop].astype(float)
+    yield "target", Branch(states)
+    heavier = int(rng.choice(pair))
+    for change in LOG_MASSES * (rng.uniform(size=MASSES) - rng.uniform()):
+        masses = np.where(np.arange(len(states)) == heavier, np.exp(change), 1.0)
+        yield "mass", Branch(states, masses=masses.tolist())
+    for factor in rng.uniform(0, MAX_BOUNCE, BOUNCES):
+        yield "bounce", Branch(states, restitution=float(factor))
+    striker = max(pair, key=lambda k: np.linalg.norm(states[k, 7:9]))
+    for angle in DIRECTIONS * (rng.uniform(size=AIMS) - rng.uniform()):
+        aimed = states.copy()
+        aimed[striker, 7:] = turn_velocity(states[striker, 7:], angle)
+        yield "aim", Branch(aimed)
+    yield GHOST, Branch(states, passing=pair)
+
+
+def outcome_frames(
+    scene: Scene, timing: Timing, motions: Sequence[Motion], world: WorldConfig
+) -> Scene:
+    """Return as a scene the last observed frame, the target and the last frame of each motion."""
+    own = scene_states(scene)[[timing.stop, timing.target]]
+    others = [motion.states[-1] for motion in motions]
+    return scene_with_states(scene, "outcomes", np.stack([*own, *others]), world)
+
+
+def is_suitable(source: str, pair: tuple[int, int], motion: Motion, radii: Sequence[float]) -> bool:
+    """Return whether an outcome is plausible: the two objects of the collision touch, or have
+    passed through each other."""
+    if source != GHOST:
+        return pair in motion.touching
+    one, other = motion.positions[-1, list(pair)]
+    return bool(np.linalg.norm(one - other) > APART * sum(radii[k] for k in pair))
+
+
+def eligible_candidates(with_ghost: bool) -> tuple[int, ...]:
+    """Return which of four candidates, the target first and the ghost last, could be the target as
+    far as their kind tells."""
+    return (0, 1, 2) if with_ghost else (0, 1, 2, 3)
+
+
+def order_candidates(item: SelectionItem) -> list[int]:
+    """Return the indices of an item's candidates, the target first and the ghost last."""
+    return sorted(range(4), key=lambda k: (k != item.answer, item.candidates[k].source == GHOST))
+
+
+def has_ghost(item: SelectionItem) -> bool:
+    """Return whether the ghost is a distractor of an item."""
+    return any(candidate.source == GHOST for candidate in item.candidates)
+
+
+def share_of_quota(quota: int, with_ghost: bool) -> int:
+    """Return how many items of a quota have the ghost, or do not have it."""
+    with_it = round(GHOST_SHARE * quota)
+    return with_it if with_ghost else quota - with_it
