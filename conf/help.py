@@ -21,7 +21,7 @@ ALL = "all"
 """Word after `--help` that lists every setting."""
 COMMON = (
     "run", "seed", "limit", "model", "modes", "suite", "control", "runs", "items", "annotators",
-    "host", "port", "public", "folder", "format", "product", "verify", "frames",
+    "host", "port", "public", "folder", "format", "product", "verify", "frames", "pool",
     "examples", "gpus", "routes", "images", "benchmark.name", "benchmark.scenes", "benchmark.seed",
     "benchmark.folder", "benchmark.renderer", "teacher.url", "teacher.model", "teacher.attempts",
     "teacher.predicates", "teacher_model", "teacher_server.url", "sampling_server.url",
@@ -35,7 +35,7 @@ TRAINING = (
     "train.rewards.following", "train.rewards.no_numbers", "train.rewards.form", "train.lr",
     "train.epochs", "train.max_steps", "train.batch", "train.micro_batch", "train.mini_batch",
     "train.hard_negatives", "train.precision", "train.evaluations", "train.generated_items",
-    "train.best_metric", "train.report_to",
+    "train.best_metric", "train.report_to", "train.pools",
 )  # fmt: skip
 """Further such keys, which are listed for the commands that train. Other commands use few of
 them."""

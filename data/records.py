@@ -33,7 +33,6 @@ LETTERS = "ABCD"
 SHAPES = ("cube", "sphere", "cylinder")
 MATERIALS = ("metal", "rubber")
 COLORS = ("gray", "red", "blue", "green", "brown", "cyan", "purple", "yellow")
-POOLS = ("future", "counterfactual")
 SPLITS = ("train", "test")
 FAMILIES = ("event", "time", "window")
 MATCHED_ANCHOR = "matched_anchor"
@@ -286,6 +285,13 @@ class RetrievalQuery:
     def name(self) -> str:
         """The query's key in logs and caches."""
         return self.query_id
+
+    @property
+    def factual_twin(self) -> FrameRef | None:
+        """The frame of the factual scene at the target's moment, which is the first hard negative
+        of a counterfactual query; None in the future pool."""
+        is_counterfactual = self.pool == "counterfactual"
+        return FrameRef(self.scene_id, self.target.frame) if is_counterfactual else None
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,7 @@ from data.records import (
     Scene,
     SceneObject,
     SelectionItem,
+    original_scene_id,
 )
 from data.versions import component_versions
 
@@ -197,6 +198,22 @@ class Store:
         """Return the frames of one of `DATABASES`."""
         rows = load_rows(self.folder / "database.parquet")
         return [FrameRef(r["scene_id"], r["frame"]) for r in rows if r["database"] == name]
+
+    def ranked_frames(self, split: str, pool: str = "future") -> list[FrameRef]:
+        """Return the frames to rank for the queries of a split in one of the `POOLS`.
+
+        In the future pool, they are the database of the standard test, or, for the training split,
+        that of all future-state queries. In the counterfactual pool, they are the frames of its
+        database that are of the split's scenes, and the factual twins that this database lacks.
+        """
+        if pool == "future":
+            return self.database("test" if split == "test" else "future")
+        own = set(self.scene_ids(split))
+        frames = [f for f in self.database(pool) if original_scene_id(f.scene_id) in own]
+        # The database lacks a twin if it has a near-duplicate of it, or had no room for it.
+        return list(
+            dict.fromkeys([*frames, *(q.factual_twin for q in self.retrieval(split, pool))])
+        )
 
 
 cached_scene = lru_cache(maxsize=512)(load_scene)

@@ -15,7 +15,7 @@ import numpy as np
 
 from conf.errors import UserError
 from conf.files import expand_path
-from conf.schema.benchmark import store_name
+from conf.schema.benchmark import POOLS, store_name
 from data.frames.frame_cache import FrameReader
 from data.records import (
     FAMILIES,
@@ -41,6 +41,7 @@ def load(
     store: str | Path = "store",
     frames: int | None = None,
     image_size: int | None = None,
+    pool: str = "future",
 ) -> Benchmark:
     """Open a benchmark, and build it first if it is a preset that has not been built.
 
@@ -52,14 +53,17 @@ def load(
         frames: The number of frames of a prefix, evenly spaced. A shorter prefix has all its
             frames. None takes the benchmark's own number, `prefix_frames`.
         image_size: Frames are resized to `image_size` x `image_size` px; None keeps their size.
+        pool: The retrieval queries: `future`, or `counterfactual` (where an object would be if
+            another were absent).
 
     Raises:
         UserError: There is no such benchmark, the benchmark is damaged or of another version, or an
             argument is invalid. Building a benchmark requires the extra `simulate`, and
             `image_size` the extra `train`.
     """
-    if split not in SPLITS:
-        raise UserError(f"split={split!r}: choose {' or '.join(SPLITS)}", code="unknown-option")
+    for name, value, options in (("split", split, SPLITS), ("pool", pool, POOLS)):
+        if value not in options:
+            raise UserError(f"{name}={value!r}: choose {' or '.join(options)}", "unknown-option")
     for name, value in (("frames", frames), ("image_size", image_size)):
         if value is not None and value < 1:
             raise UserError(f"{name}={value}: give 1 or more", code="invalid-setting")
@@ -76,7 +80,7 @@ def load(
     is_built = (folder / MANIFEST).exists()
     opened = open_store(folder) if is_built else _open_preset(name, root)
     count = frames or opened.manifest["config"]["prefix_frames"]
-    return Benchmark(opened, split, count, image_size)
+    return Benchmark(opened, split, count, image_size, pool)
 
 
 def preset_names(group: str = "benchmark") -> list[str]:
@@ -305,12 +309,14 @@ class Benchmark:
         split: train or test.
         frames: As in `load`.
         image_size: As in `load`.
+        pool: As in `load`.
     """
 
     store: Store
     split: str
     frames: int
     image_size: int | None
+    pool: str = "future"
 
     @property
     def name(self) -> str:
@@ -328,18 +334,16 @@ class Benchmark:
 
     @cached_property
     def retrieval(self) -> Lazy[Query]:
-        """The retrieval queries of the split; of the test split, those of the standard test, whose
-        targets are in `database`."""
-        test = self.split == "test"
-        records = self.store.standard_test() if test else self.store.retrieval(self.split)
-        return Lazy(Query, records, self)
+        """The retrieval queries of the split and the pool, whose targets are in `database`. Those
+        of the split `test` and the pool `future` are the standard test."""
+        return Lazy(Query, self.store.retrieval(self.split, self.pool), self)
 
     @cached_property
     def database(self) -> Lazy[Frame]:
         """The frames to rank for `retrieval`: the standard test's database, or, of the train split,
-        the database of all future-state queries."""
-        name = "test" if self.split == "test" else "future"
-        return Lazy(Frame, self.store.database(name), self)
+        the database of all future-state queries; in the counterfactual pool, frames of the split's
+        scenes and of their counterfactuals."""
+        return Lazy(Frame, self.store.ranked_frames(self.split, self.pool), self)
 
     @cached_property
     def rationales(self) -> dict[str, str]:
@@ -354,7 +358,8 @@ class Benchmark:
     def __reduce__(self) -> tuple[Any, ...]:
         # A worker process opens the benchmark once, instead of receiving it with each item.
         folder = self.store.folder.absolute()
-        return _reopen, (folder, self.store.identity, self.split, self.frames, self.image_size)
+        settings = (self.split, self.frames, self.image_size, self.pool)
+        return _reopen, (folder, self.store.identity, *settings)
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{self._count(family)} {family}" for family in FAMILIES)
@@ -369,7 +374,7 @@ class Benchmark:
 
 @lru_cache(maxsize=8)
 def _reopen(
-    folder: Path, identity: str, split: str, frames: int, image_size: int | None
+    folder: Path, identity: str, split: str, frames: int, image_size: int | None, pool: str
 ) -> Benchmark:
     """Return the benchmark of a pickled item. Raises UserError if it is another one now."""
     store = open_store(folder)
@@ -378,7 +383,7 @@ def _reopen(
             f"{folder} was built again since its items were pickled: load them again",
             code="different-builds",
         )
-    return Benchmark(store, split, frames, image_size)
+    return Benchmark(store, split, frames, image_size, pool)
 
 
 def refuse_repeated(names: Sequence[str], kind: str) -> None:

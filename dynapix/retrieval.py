@@ -41,7 +41,9 @@ class RetrievalScores:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """`recall@k`, `mrr`, `median_rank` and `tie_rate` over all queries, at the widest width."""
+        """`recall@k`, `mrr`, `median_rank` and `tie_rate` over all queries, at the widest width. In
+        the counterfactual pool also `twin_above`, the share of queries for which the factual
+        scene's frame at the target's moment ranks above the target."""
         return {name: measure.value for name, measure in self.rows[0].measures.items()}
 
     def __str__(self) -> str:
@@ -123,8 +125,10 @@ def evaluate_retrieval(
             code="missing-targets",
         )
     targets = frame_rows[[index[q.target.name] for q in queries]]
-    ranks = exact_ranks(query_rows, targets, [frame_rows], ranked_widths)
     records = [q.record for q in queries]
+    twins = [index[r.factual_twin.name] for r in records if r.factual_twin]
+    twin_rows = frame_rows[twins] if twins else None
+    ranks = exact_ranks(query_rows, targets, [frame_rows], ranked_widths, twin_rows)
     rows = retrieval_results(benchmark.name, name, ranks, records, seed)
     return RetrievalScores(rows, ranks, name, benchmark, queries, seed)
 

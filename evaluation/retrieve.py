@@ -1,5 +1,5 @@
-"""Measure a retriever and its untrained base: for each query of the standard test and each width,
-rank all frames of the test database. A baseline knows the scene and nothing else."""
+"""Measure a retriever and its untrained base: for each test query of a pool and each width, rank
+all frames of its test database. A baseline knows the scene and nothing else."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from evaluation.retrieval import exact_search, standard_test
 
     preset, store, embedders = open_retriever(cfg, run)
-    queries, database = standard_test.load_standard_test(store)
+    queries, database = standard_test.load_test(store, cfg.pool)
     frame_names = [f.name for f in database]
+    twins = [q.factual_twin.name for q in queries if q.factual_twin]
     rows, ranks = [], {}
     for embedder in embedders:
         query_embeddings = embedder.embed_queries(queries)
@@ -32,6 +33,7 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
             query_embeddings.rows([q.query_id for q in queries]),
             frame_embeddings.rows([q.target.name for q in queries]),
             frame_embeddings.parts(frame_names),
+            frame_embeddings.rows(twins) if twins else None,
         )
         rows += results.retrieval_results(store.name, name, ranks[name], queries, cfg.seed)
 

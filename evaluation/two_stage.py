@@ -41,7 +41,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from evaluation.retrieval import standard_test, text_matching
     from models.student.prompts import text_sample
 
-    queries, database = standard_test.load_standard_test(store)
+    queries, database = standard_test.load_test(store)
     matcher = next(
         open_embedders(matcher_folder, matcher_settings, store, run.folder, cfg.matcher.batch)
     )

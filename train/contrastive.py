@@ -36,7 +36,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from train.common.checkpoints import newest_checkpoint
     from train.common.journal import run_metrics
     from train.common.training_loop import explain_load_errors, run_training
-    from train.retriever.batches import split_queries
+    from train.retriever.batches import read_pools, split_queries
     from train.retriever.trainer_setup import build_trainer
 
     keep_freed_memory()
@@ -55,14 +55,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     with main_first():
         checkpoint = newest_checkpoint(run.folder)
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-    training, validation = split_queries(
-        store,
-        cfg.train.batch,
-        cfg.train.hard_negatives,
-        cfg.train.validation_queries,
-        cfg.seed,
-        cfg.train.hold_out,
-    )
+    training, validation = split_queries(store, cfg.train, cfg.seed)
 
     data = data_digest(store.identity, (q.query_id for q in (*training, *validation)))
     with main_first():
@@ -72,7 +65,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     log.info("loading retriever %s, computing in %s", retriever.name, precision)
     # Seed the initialisation of the adapters; the trainer sets its seed later.
     set_seed(cfg.seed)
-    texts = tokenizer_texts(store.retrieval("train"), retriever)
+    texts = tokenizer_texts(read_pools(store, cfg.train.pools), retriever)
     with explain_load_errors("retriever"):
         model = load_retriever(retriever, precision, texts, run.folder / "untrained")
     use_fast_layers(model)

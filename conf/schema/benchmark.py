@@ -25,6 +25,8 @@ WINDOW_HORIZONS = (8, 16, 24)
 WINDOW_DIFFICULTIES = ("easy", "hard")
 STANDIN = "standin_"
 """Start of the names of the suites whose scenes are simulated instead of read from a release."""
+POOLS = ("future", "counterfactual")
+"""Kinds of retrieval queries."""
 QUERIES_PER_SCENE = {"1": 3, "2": 3, "3": 3, "4": 1, "5": 1, "6": 1}
 """Maximum number of queries of each builder about a scene (paper, retrieval construction)."""
 COUNTERFACTUAL_SECONDS = (0.5, 1, 2, 3, 4)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 from urllib.parse import urlsplit
 
-from conf.schema.benchmark import BenchmarkConfig
+from conf.schema.benchmark import POOLS, BenchmarkConfig
 from conf.schema.commands import CommandConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import ServerConfig
@@ -103,7 +103,9 @@ class EmbeddingCommand(EmbedderConfig, CommandConfig):
 
 @dataclass
 class RetrieveCommand(EmbeddingCommand):
-    """Settings of evaluation.retrieve."""
+    pool: str = setting("future", POOLS)
+    """Test queries to measure: future (the standard test) or counterfactual (where an object would
+    be if another were absent)."""
 
 
 @dataclass

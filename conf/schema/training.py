@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import ClassVar
 
-from conf.schema.settings import Settings, setting
+from conf.schema.benchmark import POOLS
+from conf.schema.settings import Settings, check_choices, setting
 
 REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout", "answer_only")
 
@@ -210,6 +211,9 @@ class ReinforceTrainConfig(TrainConfig):
 
 @dataclass
 class ContrastiveTrainConfig(TrainConfig):
+    pools: list[str] = field(default_factory=lambda: ["future"])
+    """Pools whose queries are trained on: future, counterfactual, or both. The first hard negative
+    of a counterfactual query shows the factual scene at the target's moment."""
     batch: int = setting(512, least=1)
     """Number of queries per optimizer step, over all ranks. The negatives of a query are all
     targets and hard negatives of the batch, except the query's own target frame."""
@@ -233,6 +237,7 @@ class ContrastiveTrainConfig(TrainConfig):
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
+        yield from check_choices(f"{group}pools", self.pools, POOLS)
         if self.batch < 2 and not self.hard_negatives:
             yield (
                 f"{group}batch={self.batch} with {group}hard_negatives=0 leaves no negatives: set "

@@ -13,7 +13,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from data.oracle.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
-from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
+from data.records import (
+    Candidate,
+    FrameRef,
+    RetrievalQuery,
+    SelectionItem,
+    original_scene_id,
+)
 from data.sim.camera import Camera
 from data.store import Store
 
@@ -79,9 +85,10 @@ def share_of_lowest(costs: np.ndarray, answer: int) -> float:
 def count_frames_of_scene(
     queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
 ) -> np.ndarray:
-    """Return for each query the number of frames of its target's scene in the database, (Q,)."""
-    frames = Counter(frame.scene_id for frame in database)
-    return np.array([frames[query.target.scene_id] for query in queries])
+    """Return for each query the number of frames of its scene in the database, (Q,). Frames of the
+    scene's counterfactual count."""
+    frames = Counter(original_scene_id(frame.scene_id) for frame in database)
+    return np.array([frames[query.scene_id] for query in queries])
 
 
 def score_scene_alone(

@@ -6,8 +6,23 @@ from collections import Counter
 from collections.abc import Sequence
 
 from conf.errors import UserError
-from data.records import FrameRef, RetrievalQuery
+from data.records import FrameRef, RetrievalQuery, original_scene_id
 from data.store import Store
+
+QUOTAS = {"future": "builders", "counterfactual": "counterfactual"}
+"""The setting below benchmark.retrieval with the quotas of each pool."""
+
+
+def read_queries(store: Store, split: str, pool: str) -> list[RetrievalQuery]:
+    """Return the queries of a split in a pool. Raises UserError if there are none."""
+    if queries := store.retrieval(split, pool):
+        return queries
+    raise UserError(
+        f"{store.folder} has no {pool} queries in the {split} split: choose a benchmark whose "
+        f"benchmark.retrieval.{QUOTAS[pool]} has a quota of {split} queries, such as "
+        "benchmark=tiny",
+        code="missing-queries",
+    )
 
 
 def check_training(store: Store, queries: Sequence[RetrievalQuery], negatives: int) -> None:
@@ -27,19 +42,13 @@ def check_training(store: Store, queries: Sequence[RetrievalQuery], negatives: i
 def check_test(
     store: Store, queries: Sequence[RetrievalQuery], database: Sequence[FrameRef]
 ) -> None:
-    """Raises UserError if there is no query, a query or frame occurs twice, a query refers to a
-    training scene, or the database lacks a target."""
-    if not queries:
-        raise UserError(
-            f"{store.folder} has no queries of the standard test: choose a benchmark whose "
-            "benchmark.retrieval.builders have test queries, such as benchmark=tiny",
-            code="missing-queries",
-        )
+    """Raises UserError if a query or frame occurs twice, a query refers to a training scene, or
+    the database lacks a target."""
     repeated = _find_repeated("retrieval", queries) + _find_repeated("database", database)
     _refuse(store, "duplicate-record", repeated)
     frames = set(database)
     lacking = [
-        f"database test lacks frame {q.target.name}, the target of query {q.query_id}"
+        f"the database lacks frame {q.target.name}, the target of query {q.query_id}"
         for q in queries
         if q.target not in frames
     ]
@@ -55,7 +64,7 @@ def _find_leaks(store: Store, queries: Sequence[RetrievalQuery], other: str) -> 
         "split, which would invalidate the evaluation"
         for q in queries
         for f in (FrameRef(q.scene_id, q.prefix_stop), q.target, *q.hard_negatives)
-        if f.scene_id in scenes
+        if original_scene_id(f.scene_id) in scenes
     ]
 
 

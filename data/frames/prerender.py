@@ -10,9 +10,10 @@ from typing import Any
 
 from conf.files import read_json, write_json
 from conf.runs import LOCK, lock_file
+from conf.schema.benchmark import POOLS
 from data.frames.frame_cache import frames_path, load_frames, render_frames, save_frames
 from data.parallel import Workers
-from data.records import MATCHED_ANCHOR, POOLS, original_scene_id, sample_prefix_frames
+from data.records import MATCHED_ANCHOR, original_scene_id, sample_prefix_frames
 from data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path
 
 FRAMES_RECORD = "frames.json"

@@ -17,9 +17,10 @@ from itertools import chain, islice
 import numpy as np
 
 from conf.schema import BenchmarkConfig
+from conf.schema.benchmark import POOLS
 from data.items.cells import builder_name, cell_quotas
 from data.oracle.displacement import visible_positions
-from data.records import POOLS, FrameRef, RetrievalQuery, Scene
+from data.records import FrameRef, RetrievalQuery, Scene
 from data.seeded_order import named_rng, round_robin
 
 DUPLICATE_DISTANCE = 1.0

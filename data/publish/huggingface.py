@@ -26,6 +26,7 @@ from tqdm import tqdm
 from conf.errors import UserError
 from conf.files import read_json_if_valid, write_bytes
 from conf.runs import lock_file
+from conf.schema.benchmark import POOLS
 from data.publish.columns import (
     DESCRIPTIONS,
     ExportedRecord,
@@ -33,7 +34,7 @@ from data.publish.columns import (
     dataset_features,
     list_columns,
 )
-from data.records import MATCHED_ANCHOR, POOLS, SPLITS, RetrievalQuery, SelectionItem
+from data.records import MATCHED_ANCHOR, SPLITS, RetrievalQuery, SelectionItem
 from data.store import DATABASES, Store, hash_file
 from data.versions import component_versions
 

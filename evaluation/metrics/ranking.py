@@ -45,6 +45,12 @@ def count_above_and_equal(scores: np.ndarray, targets: np.ndarray) -> tuple[np.n
     return (scores > targets).sum(1), (scores == targets).sum(1)
 
 
+def share_above(scores: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return the probability that each frame ranks above its query's target, if ties are broken at
+    random: 1, 1/2 for an equal score, or 0."""
+    return (scores > targets) + (scores == targets) / 2
+
+
 def expected_hits(above: np.ndarray, tied: np.ndarray, valid: np.ndarray, k: int) -> np.ndarray:
     """Return the probability (queries,) that a query's target ranks among the first `k` frames if
     ties are broken at random.

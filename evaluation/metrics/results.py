@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,9 @@ RECALLS = (1, 10, 50)
 COMPARED = (*(f"recall@{k}" for k in RECALLS), "mrr")
 """Measures by which retrievers are compared."""
 MEASURES = (*COMPARED, "median_rank", "tie_rate")
+TWIN_ABOVE = "twin_above"
+"""The measure of the counterfactual pool alone: the share of queries whose factual twin ranks above
+the target."""
 UNTRAINED = "untrained"
 """First word of the names of Qwen3-VL retrievers that this project has not trained."""
 BASELINE = "baseline"
@@ -166,6 +169,8 @@ class RetrievalResult:
     bytes: int | None = None
     seconds: float | None = field(default=None, compare=False)
 
+    pool: ClassVar[str] = "future"
+
     @property
     def untrained(self) -> bool:
         return self.name.startswith(UNTRAINED)
@@ -174,6 +179,19 @@ class RetrievalResult:
     def measures(self) -> dict[str, Interval]:
         """The measures by name, as `query_metrics` names them, such as "recall@1"."""
         return {name: getattr(self, name.replace("@", "_")) for name in MEASURES}
+
+
+@dataclass(frozen=True)
+class CounterfactualResult(RetrievalResult):
+    """Measures over counterfactual queries, with `TWIN_ABOVE`."""
+
+    twin_above: Interval = field(kw_only=True)
+
+    pool: ClassVar[str] = "counterfactual"
+
+    @property
+    def measures(self) -> dict[str, Interval]:
+        return {**super().measures, TWIN_ABOVE: self.twin_above}
 
 
 @dataclass(frozen=True)
@@ -236,7 +254,7 @@ class RetrievalReport:
     """report.json of evaluation.retrieve and evaluation.two_stage."""
 
     build: str
-    rows: list[RetrievalResult]
+    rows: list[CounterfactualResult | RetrievalResult]
     differences: list[RetrieverDifference] = field(default_factory=list)
 
 
@@ -267,9 +285,12 @@ def retrieval_results(
             cost = (None, None)
             if width is not None:
                 cost = (ranks.vectors * width * np.dtype(np.float32).itemsize, ranks.seconds)
-            results.append(
-                RetrievalResult(benchmark, name, width, builder, *measures, *sizes, *cost)
-            )
+            values = (benchmark, name, width, builder, *measures, *sizes, *cost)
+            if TWIN_ABOVE in per_query:
+                twin_above = scenes.mean(per_query[TWIN_ABOVE])
+                results.append(CounterfactualResult(*values, twin_above=twin_above))
+            else:
+                results.append(RetrievalResult(*values))
     return results
 
 
@@ -284,7 +305,8 @@ def compare_retrievers(
     for right, other in others:
         for k, width in enumerate(first.widths):
             one, two = (_query_metrics(r, k, slice(None)) for r in (first, other))
-            measures = {name: _summarize(name, one[name] - two[name], scenes) for name in COMPARED}
+            names = [name for name in (*COMPARED, TWIN_ABOVE) if name in one]
+            measures = {name: _summarize(name, one[name] - two[name], scenes) for name in names}
             compared.append(RetrieverDifference(left, right, width, measures))
     return compared
 
@@ -292,7 +314,10 @@ def compare_retrievers(
 def _query_metrics(ranks: Ranks, k: int, indices: list[int] | slice) -> dict[str, np.ndarray]:
     """Return the measures of the queries at `indices`, at the k-th width."""
     counts = (ranks.above[k, indices], ranks.tied[k, indices], ranks.found[indices])
-    return query_metrics(*counts, ranks.frames, RECALLS)
+    measures = query_metrics(*counts, ranks.frames, RECALLS)
+    if ranks.twin_above is not None:
+        measures[TWIN_ABOVE] = ranks.twin_above[k, indices]
+    return measures
 
 
 def _summarize(name: str, values: np.ndarray, scenes: SceneBootstrap) -> Interval:

@@ -58,9 +58,11 @@ class Measurement:
 
     @property
     def variants(self) -> list[str]:
-        """The suite and the control, if any; empty for the standard items without a control."""
+        """The suite and the control, if any, or the pool of counterfactual queries; empty for the
+        standard items without a control and for the standard test."""
         if isinstance(self.result, RetrievalResult):
-            return []
+            pool = self.result.pool
+            return [] if pool == "future" else [f"{pool} queries"]
         return [x for x in (self.result.suite, self.result.control) if x is not None]
 
     @property

@@ -8,7 +8,7 @@ from textwrap import indent
 
 from evaluation.metrics.baselines import TITLES
 from evaluation.metrics.intervals import Interval
-from evaluation.metrics.results import RetrievalResult
+from evaluation.metrics.results import TWIN_ABOVE, RetrievalResult
 from evaluation.reporting.item_browser import ItemBrowser
 from evaluation.reporting.measurements import Measurement, widest_results
 
@@ -75,11 +75,13 @@ def _describe_student(
 def _describe_retriever(retrievals: Sequence[Measurement]) -> Iterator[str]:
     widest = [m for m in widest_results(retrievals) if isinstance(m.result, RetrievalResult)]
     for m in (m for m in widest if m.trained):
-        same = [w for w in widest if w.group == m.group and not w.trained]
+        same = [w for w in widest if w.item_set == m.item_set and not w.trained]
         beside = "".join(f"; {w.name} {100 * w.result.recall_10.value:.1f}%" for w in same)
+        twin = m.result.measures.get(TWIN_ABOVE)
+        above = f" It ranks the factual scene's frame higher in {percent(twin)}." if twin else ""
         yield (
-            f"{m.name} finds the future frame among the first 10 of {m.result.frames:,} in "
-            f"{percent(m.result.recall_10)} of {m.result.queries:,} queries{beside}."
+            f"{m.name} finds the {m.result.pool} frame among the first 10 of {m.result.frames:,} "
+            f"in {percent(m.result.recall_10)} of {m.result.queries:,} queries{beside}.{above}"
         )
 
 

@@ -15,9 +15,9 @@ from evaluation.reporting.tables import (
     FAMILY_COLUMNS,
     INTERVAL_NOTE,
     RECALL_COLUMNS,
-    RETRIEVAL_COLUMNS,
     SELECTION_COLUMNS,
     SELECTION_NOTE,
+    retrieval_columns,
     retrieval_notes,
     retrieval_row,
     selection_rows,
@@ -33,7 +33,7 @@ GROUPS = (
 """Labels of the groups of measured models, in their order. Baselines and people follow."""
 BEST = {
     **dict.fromkeys((*FAMILY_COLUMNS, "Macro", "Micro", *RECALL_COLUMNS, "MRR"), max),
-    "Median": min,
+    **dict.fromkeys(("Median", "Twin"), min),
 }
 """The columns whose best value is marked, with the function that chooses it."""
 BEST_NOTE = "Bold: the best value of a column among these runs, and among the paper's rows."
@@ -58,7 +58,8 @@ def summary_table(
         for m in rows:
             groups[_group(m)] += selection_rows(m.label, m.result)
     else:
-        columns, notes = RETRIEVAL_COLUMNS, (*retrieval_notes(rows[0].result), BEST_NOTE)
+        first = rows[0].result
+        columns, notes = retrieval_columns(first), (*retrieval_notes(first), BEST_NOTE)
         for m in rows:
             groups[_group(m)].append(retrieval_row(m.name, m.result))
     baseline_rows = [selection_rows(r.name, r)[0] for r in baselines]
@@ -66,7 +67,9 @@ def summary_table(
     groups["people, on the items of their study"] = [*people]
     item_set = rows[0].item_set
     table = table_with_paper(name, file_stem(f"{name}-{item_set}"), columns, groups, notes)
-    return replace(table, caption=f"{table.caption}, on {item_set}", best=BEST)
+    # The paper's rows are of standard items and of the standard test.
+    paper = {} if rows[0].variants else table.paper
+    return replace(table, caption=f"{table.caption}, on {item_set}", best=BEST, paper=paper)
 
 
 def _group(m: Measurement) -> str:

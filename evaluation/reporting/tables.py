@@ -11,8 +11,10 @@ from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval
 from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.results import (
+    MEASURES,
     RECALLS,
     SIMILARITY,
+    TWIN_ABOVE,
     Accuracy,
     RetrievalResult,
     RetrieverDifference,
@@ -27,8 +29,10 @@ from evaluation.reporting.table import DETAIL, Row, Table
 FAMILY_COLUMNS = [family.capitalize() for family in FAMILIES]
 SELECTION_COLUMNS = [*FAMILY_COLUMNS, "Macro", "Micro", "Parsed", "Items"]
 RECALL_COLUMNS = [f"R@{k}" for k in RECALLS]
-MEASURE_COLUMNS = [*RECALL_COLUMNS, "MRR", "Median", "Tied"]
-RETRIEVAL_COLUMNS = ["Width", *MEASURE_COLUMNS, "MiB", "s"]
+MEASURE_COLUMNS = dict(
+    zip((*MEASURES, TWIN_ABOVE), (*RECALL_COLUMNS, "MRR", "Median", "Tied", "Twin"), strict=True)
+)
+"""The column of each measure of retrieval."""
 
 INTERVAL_NOTE = "95% intervals are bootstrapped over scenes."
 SELECTION_NOTE = f"{INTERVAL_NOTE} Answers that cannot be parsed count as wrong."
@@ -36,6 +40,10 @@ RETRIEVAL_NOTE = (
     f"{INTERVAL_NOTE} A target that is not ranked counts as last. MiB: "
     "size of the database's embeddings. s: time to rank the database for all queries, at all "
     "widths together."
+)
+TWIN_NOTE = (
+    "Twin: queries for which the frame of the factual scene at the target's moment ranks above the "
+    "target (%)."
 )
 
 
@@ -198,7 +206,7 @@ def paired_table(comparisons: Iterable[PairedComparison]) -> Table:
 
 
 def retrieval_table(results: Sequence[RetrievalResult], command: str = "retrieve") -> Table:
-    """Return the results over all queries, above the paper's rows.
+    """Return the results over all queries, above the paper's rows if these are of the same pool.
 
     Results are sorted by width, widest first, and by training, untrained first.
 
@@ -208,12 +216,20 @@ def retrieval_table(results: Sequence[RetrievalResult], command: str = "retrieve
     overall = [r for r in results if r.builder is None]
     overall.sort(key=lambda r: (-(r.width or 0), not r.untrained))
     rows, notes = [retrieval_row(r.name, r) for r in overall], retrieval_notes(overall[0])
-    return table_with_paper(command, "retrieval", RETRIEVAL_COLUMNS, {"": rows}, notes)
+    columns = retrieval_columns(overall[0])
+    table = table_with_paper(command, "retrieval", columns, {"": rows}, notes)
+    if (pool := overall[0].pool) == "future":
+        return table
+    return replace(table, caption=f"{table.caption}, {pool} queries", paper={})
+
+
+def retrieval_columns(result: RetrievalResult) -> list[str]:
+    return ["Width", *(MEASURE_COLUMNS[name] for name in result.measures), "MiB", "s"]
 
 
 def retrieval_row(name: str, result: RetrievalResult) -> Row:
-    """Return a row of `RETRIEVAL_COLUMNS`."""
-    measures = dict(zip(MEASURE_COLUMNS, result.measures.values(), strict=True))
+    """Return a row of `retrieval_columns`."""
+    measures = {MEASURE_COLUMNS[key]: measure for key, measure in result.measures.items()}
     return {
         "name": name, "Width": _width(result.width), **measures,
         "MiB": None if result.bytes is None else f"{result.bytes / 2**20:,.2f}",
@@ -223,12 +239,16 @@ def retrieval_row(name: str, result: RetrievalResult) -> Row:
 
 def retrieval_notes(result: RetrievalResult) -> tuple[str, ...]:
     """Return the notes of a table whose results have the same queries and database as `result`."""
-    return f"{result.queries:,} queries, {result.frames:,} frames.", RETRIEVAL_NOTE
+    notes = f"{result.queries:,} queries, {result.frames:,} frames.", RETRIEVAL_NOTE
+    return (*notes, TWIN_NOTE) if TWIN_ABOVE in result.measures else notes
 
 
 def builder_tables(results: Sequence[RetrievalResult]) -> list[Table]:
-    """Return a table for each retriever, with a row for each builder and width."""
+    """Return a table for each retriever, with a row for each builder and width; none for queries
+    without builders."""
     tables = []
+    if all(r.builder is None for r in results):
+        return tables
     for name in dict.fromkeys(r.name for r in results):
         rows = [
             retrieval_row(f"builder {r.builder or 'any'} ({r.queries:,} queries)", r)
@@ -236,21 +256,22 @@ def builder_tables(results: Sequence[RetrievalResult]) -> list[Table]:
             if r.name == name
         ]
         caption = f"Retrieval by builder: {name}"
-        tables.append(Table("builders", caption, RETRIEVAL_COLUMNS, {"": rows}))
+        tables.append(Table("builders", caption, retrieval_columns(results[0]), {"": rows}))
     return tables
 
 
 def rank_differences_table(differences: Iterable[RetrieverDifference]) -> Table:
     """Return a table of differences: a group for each pair of retrievers, a row for each width."""
-    columns = [*RECALL_COLUMNS, "MRR"]
+    columns: dict[str, None] = {}
     groups: dict[str, list[Row]] = {}
     for d in differences:
-        measures = dict(zip(columns, d.measures.values(), strict=True))
+        measures = {MEASURE_COLUMNS[name]: interval for name, interval in d.measures.items()}
+        columns |= dict.fromkeys(measures)
         rows = groups.setdefault(f"{d.left} minus {d.right}", [])
         rows.append({"name": f"at width {_width(d.width)}", **measures})
     caption = "Differences between retrievers, query by query (recall in %)"
     note = "Intervals are bootstrapped over scenes."
-    return Table("rank-differences", caption, columns, groups, (note,), signed=True)
+    return Table("rank-differences", caption, [*columns], groups, (note,), signed=True)
 
 
 def human_table(study: StudyReport) -> Table:

@@ -19,7 +19,7 @@ import numpy as np
 from conf.files import write_json_lines
 from data.parallel import batched
 from data.records import RetrievalQuery
-from evaluation.metrics.ranking import count_above_and_equal
+from evaluation.metrics.ranking import count_above_and_equal, share_above
 
 GRID = 2.0**26
 """Entries of unit vectors are rounded to multiples of 1 / GRID."""
@@ -39,6 +39,8 @@ class Ranks:
         frames: Number of frames in the database.
         vectors: Number of vectors in the database; a multi-vector retriever has several per frame.
         seconds: Time to rank the database for all queries at all widths.
+        twin_above: (widths, queries) 1 if the factual twin of a counterfactual query scores above
+            the target, 1/2 if they tie; None in the future pool.
     """
 
     widths: tuple[int | None, ...]
@@ -48,28 +50,38 @@ class Ranks:
     frames: int
     vectors: int
     seconds: float
+    twin_above: np.ndarray | None = None
 
     @classmethod
     def from_counts(
-        cls, widths: Sequence[int], counts: np.ndarray, frames: int, vectors: int, seconds: float
+        cls,
+        widths: Sequence[int],
+        counts: np.ndarray,
+        frames: int,
+        vectors: int,
+        seconds: float,
+        twin_above: np.ndarray | None = None,
     ) -> Ranks:
         """Build ranks without misses from the counts (2, widths, queries) of the frames that score
         above the target and of the frames that score as it does, including the target itself."""
         (above, equal), found = counts, np.ones(counts.shape[2], bool)
-        return cls(tuple(widths), above, equal - 1, found, frames, vectors, seconds)
+        return cls(tuple(widths), above, equal - 1, found, frames, vectors, seconds, twin_above)
 
 
 def write_ranks(
     folder: Path, ranks: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
 ) -> None:
     """Write ranks.jsonl. For a retriever and a query, a row has at each width the number of frames
-    `above` the target and the number of other frames `tied` with it."""
+    `above` the target and the number of other frames `tied` with it; if it is counterfactual, also
+    `twin_above`."""
     rows = []
     for name, result in ranks.items():
         for k, query in enumerate(queries):
             row = {"by": name, "query_id": query.query_id, "widths": result.widths}
             row["above"] = result.above[:, k].tolist()
             row["tied"] = result.tied[:, k].tolist()
+            if result.twin_above is not None:
+                row["twin_above"] = result.twin_above[:, k].tolist()
             rows.append(row)
     write_json_lines(folder / "ranks.jsonl", rows)
 
@@ -150,7 +162,11 @@ def _cosines(
 
 
 def exact_ranks(
-    queries: np.ndarray, targets: np.ndarray, database: Iterable[np.ndarray], widths: Sequence[int]
+    queries: np.ndarray,
+    targets: np.ndarray,
+    database: Iterable[np.ndarray],
+    widths: Sequence[int],
+    twins: np.ndarray | None = None,
 ) -> Ranks:
     """Count, for every query and width, the frames that score above its target or tie with it.
 
@@ -159,6 +175,7 @@ def exact_ranks(
         targets: (queries, entries) embeddings of each query's target, which is in the database.
         database: Parts (frames, entries) in any order; only one of them is in memory at a time.
         widths: Embedding widths, widest first; None for a baseline without embeddings.
+        twins: (queries, entries) embeddings of the factual twins of counterfactual queries.
     """
     began = time.perf_counter()
     grid = GridEmbeddings(queries, widths)
@@ -172,6 +189,10 @@ def exact_ranks(
             rows = slice(start, start + BLOCK_QUERIES)
             for k, scores in enumerate(block_scores(grid[rows], block)):
                 counts[:, k, rows] += count_above_and_equal(scores, target_scores[k][rows])
+    twin_above = None
+    if twins is not None:
+        pairs = zip(pair_scores(grid, GridEmbeddings(twins, widths)), target_scores, strict=True)
+        twin_above = np.array([share_above(*pair) for pair in pairs])[::-1]
     # The scores begin with the narrowest width, the ranks with the widest.
     seconds = time.perf_counter() - began
-    return Ranks.from_counts(widths, counts[:, ::-1], frames, frames, seconds)
+    return Ranks.from_counts(widths, counts[:, ::-1], frames, frames, seconds, twin_above)

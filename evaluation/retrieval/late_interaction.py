@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from data.parallel import batched
-from evaluation.metrics.ranking import count_above_and_equal
+from evaluation.metrics.ranking import count_above_and_equal, share_above
 from evaluation.retrieval.exact_search import Ranks
 
 GRID = 2.0**20
@@ -27,7 +27,11 @@ BLOCK_VECTORS, BLOCK_PRODUCTS = 4096, 2**23
 
 
 def late_ranks(
-    queries: np.ndarray, targets: np.ndarray, database: Iterable[np.ndarray], width: int
+    queries: np.ndarray,
+    targets: np.ndarray,
+    database: Iterable[np.ndarray],
+    width: int,
+    twins: np.ndarray | None = None,
 ) -> Ranks:
     """Count, for every query, the frames that score above its target or tie with it.
 
@@ -39,6 +43,7 @@ def late_ranks(
         targets: (queries, entries) rows of each query's target, which is in the database.
         database: Parts (frames, entries) in any order; only one of them is in memory at a time.
         width: Number of entries of a vector.
+        twins: (queries, entries) rows of the factual twins of counterfactual queries.
     """
     began = time.perf_counter()
     target_scores = pair_scores(queries, targets, width)
@@ -60,8 +65,11 @@ def late_ranks(
             part = slice(start, start + step)
             scores = block_scores(to_grid(queries[part], width), frame_vectors)
             counts[:, 0, part] += count_above_and_equal(scores, target_scores[part])
+    twin_above = None
+    if twins is not None:
+        twin_above = share_above(pair_scores(queries, twins, width), target_scores)[None]
     seconds = time.perf_counter() - began
-    return Ranks.from_counts([width], counts, frames, vectors, seconds)
+    return Ranks.from_counts([width], counts, frames, vectors, seconds, twin_above)
 
 
 def pair_scores(queries: np.ndarray, frames: np.ndarray, width: int) -> np.ndarray:

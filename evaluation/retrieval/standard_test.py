@@ -1,7 +1,8 @@
-"""The standard test of retrieval: its queries and database, and the report.
+"""The test of retrieval: its queries and database, and the report.
 
-The queries are the future-state queries of the test split. The database holds frames of test
-scenes, with every target among them.
+The queries of the standard test are the future-state queries of the test split; the counterfactual
+queries of this split have a test of their own. The database holds frames of test scenes, with every
+target and every factual twin among them.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from conf.files import write_text
 from conf.schema import RetrieverConfig
 from data.checks.baselines import count_frames_of_scene
-from data.checks.queries import check_test
+from data.checks.queries import check_test, read_queries
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from evaluation.metrics.results import SCENE_ALONE, RetrievalResult, retrieval_results
@@ -29,9 +30,10 @@ from evaluation.retrieval.exact_search import Ranks, exact_ranks
 log = logging.getLogger(__name__)
 
 
-def load_standard_test(store: Store) -> tuple[list[RetrievalQuery], list[FrameRef]]:
-    """Return the queries and the database. Raise UserError as `check_test` does."""
-    queries, database = store.standard_test(), store.database("test")
+def load_test(store: Store, pool: str = "future") -> tuple[list[RetrievalQuery], list[FrameRef]]:
+    """Return the queries and the database, by default of the standard test. Raise UserError if
+    there are no queries, and as `check_test` does."""
+    queries, database = read_queries(store, "test", pool), store.ranked_frames("test", pool)
     check_test(store, queries, database)
     return queries, database
 
@@ -41,23 +43,25 @@ def rank_targets(
     queries: np.ndarray,
     targets: np.ndarray,
     database: Iterable[np.ndarray],
+    twins: np.ndarray | None = None,
 ) -> Ranks:
     """Rank with `late_ranks` if the preset is a multi-vector retriever, else with `exact_ranks`."""
     if preset.late is not None:
         from evaluation.retrieval.late_interaction import late_ranks
 
-        return late_ranks(queries, targets, database, preset.late.width)
-    return exact_ranks(queries, targets, database, preset.widths)
+        return late_ranks(queries, targets, database, preset.late.width, twins)
+    return exact_ranks(queries, targets, database, preset.widths, twins)
 
 
 def score_scene_alone(
     benchmark: str, queries: Sequence[RetrievalQuery], database: Sequence[FrameRef], seed: int
 ) -> list[RetrievalResult]:
-    """Return the results of a ranker that only recognises the scene: its frames tie above all
-    others."""
+    """Return the results of a ranker that only recognises the scene: its frames, and those of its
+    counterfactual, tie above all others."""
     tied = count_frames_of_scene(queries, database)[None] - 1
     found = np.ones(len(queries), bool)
-    ranks = Ranks((None,), np.zeros_like(tied), tied, found, len(database), 0, 0.0)
+    twin_above = np.full(tied.shape, 0.5) if queries[0].factual_twin else None
+    ranks = Ranks((None,), np.zeros_like(tied), tied, found, len(database), 0, 0.0, twin_above)
     return retrieval_results(benchmark, SCENE_ALONE, ranks, queries, seed)
 
 

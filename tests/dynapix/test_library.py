@@ -23,7 +23,7 @@ import dynapix
 from conf.compose import compose
 from conf.schema import BuildCommand
 from data.frames.frame_cache import FrameReader
-from data.records import Rationale
+from data.records import SPLITS, Rationale
 from data.store import MANIFEST, Store
 from dynapix.__main__ import COMMANDS, overview
 from dynapix.benchmark import _preset_world, _reopen, preset_names
@@ -150,6 +150,13 @@ def test_queries_and_frames_are_those_of_the_store(bench, micro_store) -> None:
     assert [query.record for query in train.retrieval] == micro_store.retrieval("train")
     names = {frame.name for frame in train.database}
     assert all(query.target.name in names for query in train.retrieval)
+    for split in SPLITS:
+        absent = dynapix.load(micro_store.folder, split=split, pool="counterfactual")
+        records = [query.record for query in absent.retrieval]
+        assert records == micro_store.retrieval(split, "counterfactual")
+        names = {frame.name for frame in absent.database}
+        assert {f.name for q in records for f in (q.target, q.factual_twin)} <= names
+        assert pickle.loads(pickle.dumps(absent.retrieval[0])).record == records[0]
 
 
 def test_a_result_is_the_report_of_the_command(bench, micro_store) -> None:

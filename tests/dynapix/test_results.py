@@ -84,6 +84,25 @@ def test_embeddings_that_find_every_target_have_full_recall(bench, as_mapping) -
     assert constant.metrics["recall@1"] == pytest.approx(1 / len(names))
 
 
+def test_a_retriever_of_counterfactual_frames_ranks_no_factual_twin_above(bench, tmp_path) -> None:
+    bench = dynapix.load(bench.store.folder, pool="counterfactual")
+    frames = np.eye(len(bench.database), dtype=np.float32)
+    rows = dict(zip((frame.name for frame in bench.database), frames, strict=True))
+    by_oracle = {q.query_id: rows[q.target.name] for q in bench.retrieval}
+    by_factual_scene = {q.query_id: rows[q.hard_negatives[0].name] for q in bench.retrieval}
+    constant = dict.fromkeys(by_oracle, np.ones_like(frames[0]))
+    for queries, share in ((by_oracle, 0), (by_factual_scene, 1), (constant, 0.5)):
+        scores = dynapix.evaluate_retrieval(bench.retrieval, queries, rows)
+        assert scores.metrics["twin_above"] == share
+        assert (scores.metrics["recall@1"] == 1) == (share == 0)
+    folder = scores.save(tmp_path / "runs" / "mine")
+    assert json.loads((folder / "metrics.json").read_text()) == scores.metrics
+    folder = run_report(tmp_path, bench.store.folder.parent, items=0, saved=str(tmp_path / "runs"))
+    table = (folder / "tables" / "retrieval-micro-counterfactual-queries.md").read_text()
+    assert "Twin" in table
+    assert "50.0" in table
+
+
 def test_saved_retrieval_results_are_in_the_report(bench, tmp_path) -> None:
     rng = np.random.default_rng(0)
     queries, frames = (rng.normal(size=(len(r), 8)) for r in (bench.retrieval, bench.database))

@@ -11,6 +11,7 @@ from sentence_transformers import SentenceTransformer
 
 from conf.errors import UserError
 from conf.schema import LateConfig, LoraConfig
+from conf.schema.benchmark import POOLS
 from data.items.database import UniqueFrames
 from data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
 from models.compat import keep_differentiable
@@ -146,7 +147,7 @@ def test_a_missing_base_is_not_called_a_damaged_run(retriever_cfg, tmp_path) -> 
 
 def test_frames_of_the_database_look_different(micro_store) -> None:
     """The exception are targets, which are always in the database."""
-    queries = micro_store.retrieval("train")
+    queries = [q for pool in POOLS for q in micro_store.retrieval("train", pool)]
     targets = {q.target for q in queries}
     database = build_database(queries, micro_store)
     assert targets < set(database)
@@ -154,8 +155,9 @@ def test_frames_of_the_database_look_different(micro_store) -> None:
     for target in targets:
         album.add(target)
     assert all(album.add(frame) for frame in database if frame not in targets)
+    assert not any(album.add(q.factual_twin) for q in queries if q.factual_twin)
     kept = {(f.scene_id, f.frame) for f in database}
-    for scene_id in {f.scene_id for f in database}:
+    for scene_id in {scene_id for q in queries for scene_id in (q.scene_id, q.target.scene_id)}:
         left_out = {f for f in range(0, FRAMES, FRAME_STEP) if (scene_id, f) not in kept}
         assert not any(album.add(FrameRef(scene_id, frame)) for frame in left_out)
 

@@ -8,39 +8,41 @@ import numpy as np
 from sentence_transformers.base.sampler import DefaultBatchSampler
 
 from conf.errors import UserError
-from data.checks.queries import check_training
+from conf.schema import ContrastiveTrainConfig
+from data.checks.queries import check_training, read_queries
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
 from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 
 
+def read_pools(store: Store, pools: Sequence[str]) -> list[RetrievalQuery]:
+    """Return the queries of the training split in some pools. Raises UserError if a pool has
+    none."""
+    return [query for pool in pools for query in read_queries(store, "train", pool)]
+
+
 def split_queries(
-    store: Store,
-    batch: int,
-    negatives: int,
-    max_validation: int,
-    seed: int,
-    hold_out: bool = True,
+    store: Store, train: ContrastiveTrainConfig, seed: int
 ) -> tuple[list[RetrievalQuery], list[RetrievalQuery]]:
-    """Return the training queries, and up to `max_validation` queries of held-out training scenes.
-    Without `hold_out`, all queries of the training split are trained on, and some of them returned
-    a second time.
+    """Return the training queries of `train.pools`, and up to `train.validation_queries` queries of
+    held-out training scenes. Without `train.hold_out`, all queries of the training split are
+    trained on, and some of them returned a second time.
 
     Raises:
-        UserError: One list is empty, a batch cannot be filled, or `check_training` raises.
+        UserError: A pool or a list is empty, a batch cannot be filled, or `check_training` raises.
     """
-    queries = store.retrieval("train")
-    check_training(store, queries, negatives)
-    held_out = held_out_scenes(store) if hold_out else set()
+    queries = read_pools(store, train.pools)
+    check_training(store, queries, train.hard_negatives)
+    held_out = held_out_scenes(store) if train.hold_out else set()
     training = [q for q in queries if q.scene_id not in held_out]
-    kept = [q for q in queries if q.scene_id in held_out] if hold_out else queries
+    kept = [q for q in queries if q.scene_id in held_out] if train.hold_out else queries
     # The benchmark lists the queries by type of question; a shuffled part has all types.
-    validation = shuffled(kept, seed)[:max_validation]
+    validation = shuffled(kept, seed)[: train.validation_queries]
     check_not_empty(len(training), "training queries")
     check_not_empty(len(validation), "queries of held-out training scenes")
-    if len(training) < batch:
+    if len(training) < train.batch:
         raise UserError(
-            f"train.batch={batch} is more than the {len(training)} training queries of "
+            f"train.batch={train.batch} is more than the {len(training)} training queries of "
             f"{store.folder}: lower it",
             code="batch-too-large",
         )

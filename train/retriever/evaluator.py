@@ -22,13 +22,16 @@ RECALLS = (1, 10, 50)
 
 
 def build_database(queries: Sequence[RetrievalQuery], store: Store) -> list[FrameRef]:
-    """Return a small database, sorted by scene and frame: the queries' targets, and those of every
-    `FRAME_STEP`th frame of their scenes that look different from all frames in the database."""
+    """Return a small database, sorted by scene and frame: the queries' targets, and those of their
+    factual twins and of every `FRAME_STEP`th frame of their scenes and counterfactual scenes that
+    look different from all frames in the database."""
     targets = {q.target: None for q in queries}
     unique = UniqueFrames(store.scene)
-    for target in targets:
-        unique.add(target)
-    for scene_id in sorted({q.scene_id for q in queries}):
+    for frame in (*targets, *(q.factual_twin for q in queries if q.factual_twin)):
+        unique.add(frame)
+    for scene_id in sorted(
+        {scene_id for q in queries for scene_id in (q.scene_id, q.target.scene_id)}
+    ):
         for frame in range(0, store.scene(scene_id).frames, FRAME_STEP):
             unique.add(FrameRef(scene_id, frame))
     return sorted(unique.frames | targets, key=attrgetter("scene_id", "frame"))

@@ -50,16 +50,9 @@ class RetrieverMerge:
 
     def held_out(self, root: Path, workers: int) -> HeldOut:
         """Return some validation queries of the run, and a reader of the benchmark's frames."""
-        settings, train = self.settings, self.settings.train
+        settings = self.settings
         store = require_benchmark(settings.benchmark, root, workers)
-        _, queries = split_queries(
-            store,
-            train.batch,
-            train.hard_negatives,
-            train.validation_queries,
-            settings.seed,
-            train.hold_out,
-        )
+        _, queries = split_queries(store, settings.train, settings.seed)
         return queries[:MAX_QUERIES], FrameReader(store, settings.retriever.image_size)
 
     def trained_outputs(self, items: HeldOut) -> ModelOutputs:

@@ -1,12 +1,16 @@
-"""`check_test` refuses missing and repeated test queries, queries without their target, and queries
-of training scenes, and names one of them."""
+"""`check_test` refuses repeated test queries, queries without their target, and queries of training
+scenes, and names one of them; `read_queries` refuses a pool without queries."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from data.checks.queries import check_test
-from data.records import FrameRef
+import pytest
+
+from conf.schema.benchmark import POOLS
+from data.checks.queries import check_test, check_training, read_queries
+from data.records import SPLITS, FrameRef
+from data.store import Store
 from tests.user_errors import raises_user_error
 
 
@@ -17,7 +21,6 @@ def test_invalid_test_queries_are_refused(micro_store) -> None:
     leaked = replace(queries[2], query_id="new", scene_id=trained)
     moved = replace(queries[0], target=FrameRef(trained, 5))
     for code, contains, test_queries, frames in (
-        ("missing-queries", (), [], database),
         ("duplicate-record", queries[1].query_id, [*queries, queries[1]], database),
         ("duplicate-record", database[5].scene_id, queries, [*database, database[5], database[5]]),
         ("missing-target", target.scene_id, queries, [f for f in database if f != target]),
@@ -26,3 +29,23 @@ def test_invalid_test_queries_are_refused(micro_store) -> None:
     ):
         with raises_user_error(code, contains):
             check_test(micro_store, test_queries, frames)
+
+
+def test_a_counterfactual_of_a_scene_of_the_other_split_is_refused(micro_store) -> None:
+    trained, tested = (micro_store.retrieval(split, "counterfactual")[0] for split in SPLITS)
+    moved = replace(tested, target=trained.target)
+    with raises_user_error("split-leak", trained.target.scene_id):
+        check_test(micro_store, [moved], [trained.target])
+    with raises_user_error("split-leak", tested.target.scene_id):
+        check_training(micro_store, [replace(trained, target=tested.target)], 1)
+
+
+@pytest.mark.parametrize("pool", POOLS)
+def test_a_pool_without_queries_names_its_setting(micro_store, monkeypatch, pool) -> None:
+    setting = {"future": "builders", "counterfactual": "counterfactual"}[pool]
+    for split in SPLITS:
+        assert read_queries(micro_store, split, pool) == micro_store.retrieval(split, pool)
+    monkeypatch.setattr(Store, "retrieval", lambda *_: [])
+    for split in SPLITS:
+        with raises_user_error("missing-queries", (f"benchmark.retrieval.{setting}", split)):
+            read_queries(micro_store, split, pool)

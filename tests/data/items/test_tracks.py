@@ -22,7 +22,7 @@ from data.oracle.displacement import (
 )
 from data.oracle.events import window_group
 from data.oracle.interventions import removal_displacements
-from data.records import FPS, FrameRef, SelectionItem
+from data.records import FPS, SPLITS, FrameRef, SelectionItem, original_scene_id
 from data.store import Store
 
 
@@ -284,7 +284,7 @@ def test_counterfactual_targets_differ_from_the_factual_scene(
         assert shifts[: q.prefix_stop].max() == 0
         assert q.target.frame - q.prefix_stop in (12, 25, 50, 75, 100)
         factual, *wrong_time = q.hard_negatives
-        assert factual == FrameRef(q.scene_id, q.target.frame)
+        assert factual == q.factual_twin == FrameRef(q.scene_id, q.target.frame)
         assert {n.scene_id for n in wrong_time} == {other.scene_id}
         for pair in combinations([q.target, *q.hard_negatives], 2):
             a, b = ((benchmark_store.scene(f.scene_id), f.frame) for f in pair)
@@ -310,6 +310,22 @@ def test_standard_test_uses_only_test_scenes(benchmark_store) -> None:
     assert queries == benchmark_store.retrieval("test")
     assert {f.scene_id for f in database} <= set(benchmark_store.scene_ids("test"))
     assert set(database) <= set(benchmark_store.database("future"))
+
+
+@pytest.mark.parametrize("only_targets", [False, True])
+def test_ranked_frames_are_of_the_split_and_include_targets_and_twins(
+    benchmark_store, monkeypatch, only_targets
+) -> None:
+    queries = {split: benchmark_store.retrieval(split, "counterfactual") for split in SPLITS}
+    if only_targets:
+        targets = [q.target for own in queries.values() for q in own]
+        monkeypatch.setattr(Store, "database", lambda store, name: targets)
+    for split, own in queries.items():
+        frames = benchmark_store.ranked_frames(split, "counterfactual")
+        assert len(frames) == len(set(frames))
+        assert {frame for q in own for frame in (q.target, q.factual_twin)} <= set(frames)
+        scenes = {original_scene_id(frame.scene_id) for frame in frames}
+        assert scenes <= set(benchmark_store.scene_ids(split))
 
 
 def test_counterfactual_database_contains_factual_frames(benchmark_store) -> None:

@@ -13,13 +13,13 @@ import pytest
 from datasets import load_dataset
 from huggingface_hub import DatasetCard
 
+from conf.schema.benchmark import POOLS
 from data.frames.frame_cache import FrameReader
 from data.publish import huggingface
 from data.publish.columns import COLUMNS, DESCRIPTIONS, dataset_features
 from data.publish.huggingface import ensure_export, render_card
 from data.records import (
     MATCHED_ANCHOR,
-    POOLS,
     SPLITS,
     RetrievalQuery,
     SelectionItem,

@@ -67,6 +67,16 @@ def test_ranks_agree_with_the_librarys_scores(queries, frames) -> None:
     assert not found.tied[0][~copies].any()
 
 
+def test_twins_are_compared_with_targets(queries, frames) -> None:
+    """A frame is its own best match, and equal frames tie."""
+    rows = rows_of(frames)
+    # Every third frame equals the first.
+    cases = [(1, 1, 2, 0), (1, 2, 1, 1), (1, 2, 2, 0.5), (1, 0, 3, 0.5)]
+    for query, target, twin, expected in cases:
+        found = late_ranks(rows[[query]], rows[[target]], [rows], WIDTH, rows[[twin]])
+        assert found.twin_above.tolist() == [[expected]]
+
+
 @pytest.mark.parametrize(("size", "block", "cells"), [(1, 9, 1), (7, 64, 2**10), (50, 1, 2**23)])
 def test_blocks_do_not_change_ranks(monkeypatch, queries, frames, size, block, cells) -> None:
     expected = ranks(queries, frames)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,10 @@ import torch
 from omegaconf import OmegaConf
 from sentence_transformers import SentenceTransformer
 
+import dynapix
 from conf.files import read_json_lines
 from conf.schema import ContrastiveTrainConfig, LateConfig, RetrieveCommand, RetrieverConfig
+from conf.schema.benchmark import POOLS
 from data.checks.baselines import score_scene_alone
 from data.frames.frame_cache import FrameReader
 from data.store import open_store
@@ -37,15 +39,16 @@ def measure(tmp_path, trained_retriever, micro, micro_store) -> Callable[..., di
     shutil.copytree(micro_store.folder, tmp_path / "store" / "micro")
     shutil.rmtree(tmp_path / "store" / "micro" / EMBEDDINGS, ignore_errors=True)
 
-    def run_command(name: str = "one", batch: int = 16) -> dict:
+    def run_command(name: str = "one", batch: int = 16, pool: str = "future") -> dict:
         run = new_run(tmp_path / name)
         cfg = RetrieveCommand(
             benchmark=micro, retriever=RetrieverConfig(name="unused", model="unused"),
-            store=str(tmp_path / "store"), batch=batch, model=str(tmp_path / "run"),
+            store=str(tmp_path / "store"), batch=batch, model=str(tmp_path / "run"), pool=pool,
         )  # fmt: skip
         metrics = retrieve.main.__wrapped__(cfg, run)
         report = json.loads((run.folder / "report.json").read_text())
-        assert set(metrics) == {"recall@1", "recall@10", "recall@50", "mrr", "median_rank"}
+        expected = {"recall@1", "recall@10", "recall@50", "mrr", "median_rank"}
+        assert set(metrics) == expected | ({"twin_above"} if pool == "counterfactual" else set())
         assert metrics["recall@10"] == report["rows"][0]["recall_10"]["value"]
         assert all((row.pop("seconds") is None) == (row["width"] is None) for row in report["rows"])
         return report
@@ -151,6 +154,26 @@ def test_a_multi_vector_retriever_is_measured_by_late_interaction(
     (tmp_path / "run" / "retriever" / "config.json").unlink()
     (tmp_path / "run" / "untrained" / "config.json").unlink()
     assert measure("two") == first
+
+
+@pytest.mark.parametrize("pool", POOLS)
+def test_the_library_measures_what_the_command_measures(measure, tmp_path, pool) -> None:
+    report = measure(pool=pool)
+    bench = dynapix.load(tmp_path / "store" / "micro", pool=pool)
+    trained, _ = embedders(tmp_path / "run", bench.store, tmp_path)
+    queries, database = [q.record for q in bench.retrieval], [f.ref for f in bench.database]
+    query_rows = trained.embed_queries(queries).rows([q.name for q in queries])
+    frame_rows = trained.embed_frames(database).rows([f.name for f in database])
+    scores = dynapix.evaluate_retrieval(
+        bench.retrieval, query_rows, frame_rows, widths=RETRIEVER.widths, name="run"
+    )
+    library = json.loads(json.dumps([asdict(row) for row in scores.rows]))
+    assert [row.pop("seconds") is None for row in library] == [False] * len(library)
+    assert library == [row for row in report["rows"] if row["name"] == "run"]
+    assert (pool == "counterfactual") == ("twin_above" in scores.metrics)
+    baseline = report["rows"][-1]
+    assert baseline["name"] == SCENE_ALONE
+    assert baseline.get("twin_above", {"value": 0.5})["value"] == 0.5
 
 
 def test_running_out_of_memory_names_the_batch(measure, monkeypatch) -> None:

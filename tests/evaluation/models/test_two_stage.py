@@ -29,7 +29,7 @@ from evaluation.embedders.joint_encoder import load_encoder
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.results import SCENE_ALONE, retrieval_results
 from evaluation.retrieval.exact_search import Ranks
-from evaluation.retrieval.standard_test import load_standard_test
+from evaluation.retrieval.standard_test import load_test
 from evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
 from tests.evaluation.metrics.reference import matrix_metrics
 from tests.evaluation.models import released
@@ -72,7 +72,7 @@ def matcher(clip, store, tmp_path) -> Embedder:
 def rank(store, matcher) -> Callable[..., Ranks]:
     """A function that ranks the standard test by texts for its queries and captions of its
     frames."""
-    queries, database = load_standard_test(store)
+    queries, database = load_test(store)
 
     def rank(route: str, query_texts: list[str], captions: list[str] = ()) -> Ranks:
         texts = {ROUTES[route].mode: dict(zip((q.name for q in queries), query_texts, strict=True))}
@@ -101,7 +101,7 @@ def test_the_part_of_a_response_about_the_target_is_matched(text, state) -> None
 
 
 def test_ranks_follow_from_the_scores_and_an_empty_text_is_a_miss(rank, store, matcher) -> None:
-    queries, database = load_standard_test(store)
+    queries, database = load_test(store)
     texts = [f"The scene after {q.question} {k}" for k, q in enumerate(queries)]
     found = rank("predict_image", texts)
     encoder = matcher.encoder
@@ -124,7 +124,7 @@ def test_ranks_follow_from_the_scores_and_an_empty_text_is_a_miss(rank, store, m
 
 
 def test_a_text_is_matched_to_the_caption_with_the_same_words(rank, store) -> None:
-    queries, database = load_standard_test(store)
+    queries, database = load_test(store)
     captions = [f"Frame {f.name}." for f in database]
     texts = [f"Frame {q.target.name}." for q in queries]
     found = rank("predict_caption", texts, captions)
@@ -185,7 +185,7 @@ def test_a_students_texts_serve_every_matcher(
         "student": replace(STUDENT, temperature=1.0, top_k=50),
     }  # fmt: skip
     metrics, report = measure("one", *overrides, **settings)
-    queries, database = load_standard_test(store)
+    queries, database = load_test(store)
     measures = ("recall@1", "recall@10", "recall@50", "mrr", "median_rank")
     assert set(metrics) == {f"{route}_{measure}" for route in routes for measure in measures}
     names = dict.fromkeys(row["name"] for row in report["rows"])
@@ -223,7 +223,7 @@ def test_texts_of_a_server_are_requested_once(
         url=server.url, model="served", concurrency=1, unreachable_timeout=0.2, timeout=10.0
     )
     settings = {"server": served, "routes": ["cot_text", "predict_image"]}
-    queries, _ = load_standard_test(store)
+    queries, _ = load_test(store)
     _, report = measure(**settings)
     assert report["texts"]["rationale"]["  prediction and outcome alone"] == len(queries)
     # A text is requested once, except for the request that failed.

@@ -151,7 +151,13 @@ def similarity_run(
 
 
 def retrieve_run(
-    root: Path, store: Store, benchmark, name: str, frames: int = 60, kind: str = "retrieve"
+    root: Path,
+    store: Store,
+    benchmark,
+    name: str,
+    frames: int = 60,
+    kind: str = "retrieve",
+    pool: str = "future",
 ) -> Path:
     """Write a run of evaluation.retrieve, or of another `kind`, and return its folder.
 
@@ -159,13 +165,14 @@ def retrieve_run(
     """
     trained = ContrastiveCommand(benchmark=benchmark, retriever=RetrieverConfig(name="small"))
     finish(root / "contrastive" / name, trained)
-    queries = store.standard_test()
+    queries = store.retrieval("test", pool)
     rng = np.random.default_rng(0)
     rows, ranked = [], {}
     for title in (name, "untrained small"):
         above = rng.integers(frames, size=(2, len(queries)))
         found = np.ones(len(queries), bool)
-        ranks = Ranks((64, 32), above, np.zeros_like(above), found, frames, frames, 0.5)
+        twins = None if pool == "future" else rng.integers(2, size=above.shape)
+        ranks = Ranks((64, 32), above, np.zeros_like(above), found, frames, frames, 0.5, twins)
         ranked[title] = ranks
         rows += retrieval_results(store.name, title, ranks, queries, 0)
     report = {"rows": rows, "build": store.identity}
@@ -173,10 +180,11 @@ def retrieve_run(
         report["differences"] = compare_retrievers(ranked, queries, 0)
     settings = RetrieveCommand(
         benchmark=benchmark, retriever=RetrieverConfig(name="small"),
-        model=f"{root}/contrastive/{name}",
+        model=f"{root}/contrastive/{name}", pool=pool,
     )  # fmt: skip
-    finish(root / kind / name, settings, report)
-    return root / kind / name
+    folder = root / kind / (name if pool == "future" else f"{name}-{pool}")
+    finish(folder, settings, report)
+    return folder
 
 
 def run_report(root: Path, store: Path, **settings) -> Path:

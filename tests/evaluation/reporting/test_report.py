@@ -16,6 +16,7 @@ from data.records import MATCHED_ANCHOR
 from tests.evaluation.reporting.measured import (
     finish,
     read_table,
+    retrieve_run,
     right,
     select_run,
     similarity_run,
@@ -225,6 +226,28 @@ def test_runs_over_different_items_have_separate_tables(runs, micro, micro_store
     counts = Counter(entry["benchmark"] for entry in page_data(folder)["items"])
     assert sorted(counts.values()) == [len(items) - 3, len(items)]
     assert len(read_table(report(runs=["select/few"], items=1), "distillation-selection-micro"))
+
+
+def test_pools_of_queries_have_separate_tables(runs, micro, micro_store, report, caplog):
+    folder = report(items=1)
+    before = {path.name: path.read_text() for path in (folder / "tables").glob("*.md")}
+    retrieve_run(runs, micro_store, micro, "emb", pool="counterfactual")
+    caplog.set_level("INFO")
+    folder = report(items=1)
+    after = {path.name: path.read_text() for path in (folder / "tables").glob("*.md")}
+    assert {name: after[name] for name in before} == before
+    own = {name: text for name, text in after.items() if name not in before}
+    assert {
+        f"{key}-micro-counterfactual-queries.md"
+        for key in ("retrieval", "distillation-retrieval", "widths")
+    } < set(own)
+    for text in own.values():
+        assert "Twin" in text
+        assert "paper, " not in text
+    assert "Twin" not in "".join(before.values())
+    overview = next(m for m in caplog.messages if "is right in" in m)
+    [line] = [each for each in overview.splitlines() if "finds the counterfactual frame" in each]
+    assert "the factual scene's frame higher in" in line
 
 
 def test_a_retriever_is_compared_with_its_untrained_base(runs, micro, micro_store, report):

@@ -14,8 +14,11 @@ from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
 from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.results import (
+    MEASURES,
     RECALLS,
     UNTRAINED,
+    CounterfactualResult,
+    RetrievalReport,
     RetrievalResult,
     SelectionResult,
     accuracy_by_family,
@@ -160,6 +163,37 @@ def test_differences_between_retrievers_are_paired_by_query():
     text = str(rank_differences_table([same, different]))
     assert "one minus again" in text
     assert "+0.0 to +0.0" in text
+
+
+def test_counterfactual_results_have_the_share_of_twins_and_tables_of_their_own(ranks, queries):
+    rng = np.random.default_rng(1)
+    twins = rng.integers(3, size=ranks.above.shape) / 2
+    cf = [replace(q, pool="counterfactual", builder=None) for q in queries]
+    results = retrieval_results("tiny", "one", replace(ranks, twin_above=twins), cf, seed=3)
+    plain = retrieval_results("tiny", "one", ranks, cf, seed=3)
+    assert [r.width for r in results] == list(ranks.widths)
+    for k, (result, other) in enumerate(zip(results, plain, strict=True)):
+        assert [*result.measures] == [*MEASURES, "twin_above"]
+        assert {name: result.measures[name] for name in MEASURES} == other.measures
+        share = result.twin_above
+        assert share.value == pytest.approx(twins[k].mean())
+        interval = scene_interval(twins[k], [q.scene_id for q in cf], np.mean, seed=3)
+        assert (share.low, share.high) == pytest.approx(interval)
+    report = RetrievalReport("build", [results[0], plain[0]])
+    again = from_json(RetrievalReport, json.loads(json.dumps(asdict(report))))
+    assert again == report
+    assert [type(row) for row in again.rows] == [CounterfactualResult, RetrievalResult]
+    own, standard = (str(retrieval_table(rows)) for rows in (results, plain))
+    assert "Twin" in own.splitlines()[2]
+    assert "Twin" not in standard
+    assert "paper" in standard
+    assert "paper" not in own
+
+    fewer = replace(ranks, twin_above=twins / 2)
+    ranked = {"one": replace(ranks, twin_above=twins), "other": fewer}
+    for k, difference in enumerate(compare_retrievers(ranked, cf, 0)):
+        assert difference.measures["twin_above"].value == pytest.approx(twins[k].mean() / 2)
+        assert "Twin" in str(rank_differences_table([difference]))
 
 
 def test_figures_are_written(selection, retrievals, tmp_path):

@@ -113,6 +113,26 @@ def test_equal_frames_tie_at_any_position(size) -> None:
     assert np.array_equal(found.above, 3 * distinct.above)
 
 
+def test_twins_are_compared_with_targets_at_each_width() -> None:
+    queries, database = embeddings(400), embeddings(800, 1)
+    targets, twins = database[:400], database[400:]
+
+    def share(rows: np.ndarray) -> np.ndarray:
+        found = exact_ranks(rows, targets, [database], WIDTHS, twins)
+        assert same(found, exact_ranks(rows, targets, [database], WIDTHS))
+        return found.twin_above
+
+    assert (share(targets) == 0).all(), "embeddings of the counterfactual frames"
+    assert (share(twins) == 1).all(), "embeddings of the factual frames"
+    assert (share(np.zeros_like(queries)) == 0.5).all()
+    assert share(queries).mean(axis=1) == pytest.approx([0.5] * len(WIDTHS), abs=0.1)
+    for k, width in enumerate(WIDTHS):
+        scores = cosines(queries, database, width)
+        clear = np.abs(gap := np.diagonal(scores[:, 400:]) - np.diagonal(scores)) > 1e-6
+        assert np.array_equal(share(queries)[k][clear], (gap > 0)[clear])
+    assert exact_ranks(queries, targets, [database], WIDTHS).twin_above is None
+
+
 def test_scores_of_pairs_and_of_blocks_are_bit_identical() -> None:
     rng = np.random.default_rng(0)
     queries = rng.standard_normal((70, 1024), np.float32)
