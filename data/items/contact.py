@@ -51,7 +51,7 @@ OBSERVED = 21
 """Number of frames of a prefix, as in the other event items."""
 LEAD = 3
 """Number of frames from the end of the prefix to the collision."""
-MASSES, BOUNCES, AIMS = 5, 2, 4
+MASSES, BOUNCES, AIMS = 8, 2, 6
 """Numbers of outcomes with another mass, restitution and direction from which the distractors of an
 item are chosen."""
 LOG_MASSES = np.log(16.0)

@@ -1,0 +1,171 @@
+"""The observer's curve: how exact eyes must be to answer the items of a simulated benchmark.
+
+An observer sees the objects in the frames of the prefix with an error of s px, fits a position and
+a velocity to each, and chooses the candidate nearest to what it predicts for the target's moment.
+One observer simulates the scene from there, the other one extrapolates at constant velocity. Both
+know the moment; the one that simulates also knows masses, friction and orientations.
+
+The observer's motion model is exact, so that its fit is that of the errors alone: a line through
+the errors of the frames in which an object is visible, since its last contact in the prefix. An
+object with fewer than two such frames is known exactly.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from conf.errors import UserError
+from conf.files import write_bytes
+from conf.schema import WorldConfig
+from conf.schema.settings import from_dict
+from data.items.futures import scene_states, simulate_futures
+from data.oracle.displacement import DIAGONAL, MODEL_SIZE, visible_positions
+from data.parallel import Workers, batched
+from data.records import Scene, SelectionItem, sample_prefix_frames
+from data.seeded_order import named_rng
+from data.sim.camera import Camera
+from data.sim.physics import Branch
+from data.store import Store
+
+ERRORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+"""Standard deviations of an observer's errors in each direction of the image, px at 336 x 336."""
+DRAWS = 8
+"""Number of draws of the errors for each item."""
+OBSERVER_FOLDER = "observer-1"
+"""Folder of a store with the results. Its number rises when the results would change."""
+CHUNK = 25
+"""Number of items in one file of results."""
+
+
+def observe_benchmark(store: Store, workers: Workers) -> pd.DataFrame:
+    """Return the results of the observers on the items of a benchmark. They are computed once and
+    kept in the store, in small files, so that a killed run goes on where it was.
+
+    Returns:
+        One row for each item, observer and error: `item_id`, `observer` (simulates or
+        extrapolates), `error` in px at 336 x 336, and `right`, the share of the draws in which the
+        observer chooses the target. With the error 0, there is one draw.
+
+    Raises:
+        UserError: The scenes of the benchmark were not simulated by Bullet.
+    """
+    if store.manifest["config"]["simulator"] != "bullet":
+        raise UserError(
+            f"{store.folder}: its scenes are those of a release, which cannot be simulated again, "
+            "so there is no observer: choose a benchmark with benchmark.simulator=bullet",
+            code="no-simulation",
+        )
+    items, folder = store.selection(), store.folder / OBSERVER_FOLDER
+    chunks = {folder / f"{k}.json": own for k, own in enumerate(batched(items, CHUNK))}
+    jobs = {path: partial(_observe_items, store, own, path) for path, own in chunks.items()}
+    sizes = {path: len(own) for path, own in chunks.items()}
+    workers.write_files(jobs, "simulating observers", "item", sizes)
+    rows = [row for path in chunks for row in json.loads(path.read_bytes())]
+    return pd.DataFrame(rows)
+
+
+def _observe_items(store: Store, items: Sequence[SelectionItem], path: Path) -> None:
+    rows = []
+    for item in items:
+        rng = named_rng(store.manifest["seed"], "observer", item.item_id)
+        for observer, right in observe_item(item, store, ERRORS, DRAWS, rng).items():
+            shares = dict(zip((0.0, *ERRORS), right.tolist(), strict=True))
+            rows += [
+                {"item_id": item.item_id, "observer": observer, "error": error, "right": share}
+                for error, share in shares.items()
+            ]
+    path.parent.mkdir(exist_ok=True)
+    write_bytes(path, json.dumps(rows).encode())
+
+
+def observe_item(
+    item: SelectionItem,
+    store: Store,
+    errors: Sequence[float],
+    draws: int,
+    rng: np.random.Generator,
+) -> dict[str, np.ndarray]:
+    """Return for each observer the share of draws in which it is right, (1 + E,): without an error,
+    and with each of the errors. All errors share the same draws, scaled."""
+    scene, stop = store.scene(item.scene_id), item.prefix_stop
+    config = store.manifest["config"]
+    world: WorldConfig = from_dict(WorldConfig, config["world"])
+    camera = Camera.from_settings(world.camera)
+    shown = sample_prefix_frames(item.prefix_start, stop, config["prefix_frames"])
+    unit = np.array([sample_fit_errors(scene, shown, rng) for _ in range(draws)])
+    scaled = np.concatenate([np.zeros((1, *unit.shape[1:])), *(e * unit for e in errors)])
+    states = scene_states(scene)[stop] + ground_errors(scene, stop, scaled, camera)
+    branches = [Branch(own) for own in states.astype(float)]
+    motions = simulate_futures(scene, stop, item.target_frame, branches, world)
+    seconds = (item.target_frame - stop) / scene.fps
+    predictions = {
+        "simulates": np.stack([motion.positions[-1] for motion in motions]),
+        "extrapolates": states[..., :3] + seconds * states[..., 7:10],
+    }
+    known = visible_positions(scene)[1][item.prefix_start : stop + 1].any(axis=0)
+    right = {}
+    for observer, positions in predictions.items():
+        image = camera.project(positions)[0] * (MODEL_SIZE / np.array(scene.image_size))
+        distances = candidate_distances(item, store, image, known)
+        nearest = distances == distances.min(axis=1, keepdims=True)
+        credit = nearest[:, item.answer] / nearest.sum(axis=1)
+        right[observer] = np.append(credit[0], credit[1:].reshape(-1, draws).mean(axis=1))
+    return right
+
+
+def sample_fit_errors(scene: Scene, shown: Sequence[int], rng: np.random.Generator) -> np.ndarray:
+    """Sample the errors of the fitted positions and velocities of the objects at the last of the
+    frames shown, (N, 2, 2): px, and px per second, if every observed position has an error of 1 px
+    in each direction."""
+    visible, last = visible_positions(scene)[1], shown[-1]
+    fitted = np.zeros((len(scene.objects), 2, 2))
+    for k in range(len(scene.objects)):
+        contacts = [
+            min(c.end, last) for c in scene.collisions if k in c.objects and c.frame <= last
+        ]
+        seen = [frame for frame in shown if visible[frame, k]]
+        since = [frame for frame in seen if frame >= max(contacts, default=0)]
+        frames = since if len(since) >= 2 else seen
+        if len(frames) >= 2:
+            times = (np.array(frames) - last) / scene.fps
+            line = np.stack([np.ones_like(times), times], axis=-1)
+            fitted[k] = np.linalg.lstsq(line, rng.normal(size=(len(frames), 2)), rcond=None)[0]
+    return fitted
+
+
+def ground_errors(scene: Scene, frame: int, errors: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the errors of states (K, N, 13) that correspond to errors (K, N, 2, 2) of positions
+    and velocities in the image, px at 336 x 336, for objects whose heights are known."""
+    positions, step = scene.positions[frame].astype(float), 1e-3
+    scale = MODEL_SIZE / np.array(scene.image_size)
+    moved = [camera.project(positions + step * np.eye(3)[axis])[0] for axis in (0, 1)]
+    base = camera.project(positions)[0]
+    jacobian = np.stack([(each - base) * scale / step for each in moved], axis=-1)
+    ground = np.einsum("nij,kntj->knti", np.linalg.inv(jacobian), errors)
+    states = np.zeros((len(errors), len(positions), 13))
+    states[..., 0:2], states[..., 7:9] = ground[:, :, 0], ground[:, :, 1]
+    return states
+
+
+def candidate_distances(
+    item: SelectionItem, store: Store, predicted: np.ndarray, known: np.ndarray
+) -> np.ndarray:
+    """Return the mean distance of the known objects between K predictions (K, N, 2) and each of the
+    four candidates, (K, 4) px at 336 x 336; the image's diagonal for a missing object."""
+    scene, distances = store.scene(item.scene_id), []
+    for candidate in item.candidates:
+        other = store.scene(candidate.scene_id)
+        places = other.image_positions[candidate.frame] * (MODEL_SIZE / np.array(other.image_size))
+        actual = dict(zip(other.object_keys, places, strict=True))
+        away = np.full(predicted.shape[:2], DIAGONAL)
+        for k, key in enumerate(scene.object_keys):
+            if key in actual:
+                away[:, k] = np.linalg.norm(predicted[:, k] - actual[key], axis=-1)
+        distances.append(np.minimum(away, DIAGONAL)[:, known].mean(axis=-1))
+    return np.stack(distances, axis=-1)
