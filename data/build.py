@@ -21,6 +21,7 @@ from data.checks.counts import count_records, summarize_store
 from data.frames.prerender import FRAMES_RECORD, prerender_frames
 from data.items.cells import family_quotas, list_subtypes, load_cached, make_items_and_queries
 from data.items.database import make_databases
+from data.items.intervention_pairs import CHANGES
 from data.items.queries import BUILDERS
 from data.oracle.displacement import visible_positions
 from data.parallel import Workers
@@ -201,6 +202,7 @@ def check_quota_names(cfg: BenchmarkConfig) -> None:
 
     subtypes = list_subtypes(cfg)
     named = {f"selection.{name}": (own, subtypes[name]) for name, own in family_quotas(cfg).items()}
+    named["selection.interventions"] = cfg.selection.interventions, (*CHANGES,)
     named["retrieval.builders"] = cfg.retrieval.builders, [str(b) for b in BUILDERS]
     problems = []
     for key, (settings, options) in named.items():

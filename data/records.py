@@ -35,10 +35,11 @@ MATERIALS = ("metal", "rubber")
 COLORS = ("gray", "red", "blue", "green", "brown", "cyan", "purple", "yellow")
 SPLITS = ("train", "test")
 FAMILIES = ("event", "time", "window")
-MATCHED_ANCHOR = "matched_anchor"
-"""Name of the suite of the matched-anchor items."""
 COUNTERFACTUAL, ALTERNATIVE = "-without-", "-alt-"
 """What follows the id of a scene in the ids of its counterfactuals and alternative futures."""
+INTERVENTION = "intervention"
+"""The source of the candidate that shows what would have come, in the item about what comes; the
+framing of the other item of the pair."""
 CONTACT, GHOST = "contact", "ghost"
 """The distractors of items that only contact physics solves, and the one of them in which the two
 objects pass through each other."""
@@ -181,7 +182,8 @@ class FrameRef:
 @dataclass(frozen=True)
 class Candidate(FrameRef):
     """One of an item's four frames. `source` is `target` or the kind of distractor: same_offset,
-    same_obj_match, same_time, same_near, same_far, cross_scene or alternative."""
+    same_obj_match, same_time, same_near, same_far, cross_scene, alternative, ghost, mass, bounce,
+    aim, actual or intervention."""
 
     source: str = "target"
 
@@ -229,12 +231,18 @@ class SelectionItem:
                 f"item {self.item_id}: prefix {self.prefix_start} to {self.prefix_stop} "
                 f"does not end before target {self.target_frame}"
             )
-        target = self.scene_id, self.target_frame
-        is_target = [(c.scene_id, c.frame) == target for c in self.candidates]
-        if is_target != [k == self.answer for k in range(4)]:
+        is_target = [c.source == "target" for c in self.candidates]
+        frames = {(c.scene_id, c.frame) for c in self.candidates}
+        if len(frames) != 4 or is_target != [k == self.answer for k in range(4)]:
             raise ValueError(
                 f"item {self.item_id}: expected four candidates, the target only at index "
                 f"{self.answer}"
+            )
+        target = original_scene_id(self.target.scene_id), self.target.frame
+        if target != (original_scene_id(self.scene_id), self.target_frame):
+            raise ValueError(
+                f"item {self.item_id}: its target {self.target.name} is not frame "
+                f"{self.target_frame} of scene {self.scene_id} or of one of its futures"
             )
 
     @classmethod
@@ -244,6 +252,12 @@ class SelectionItem:
     @property
     def letter(self) -> str:
         return LETTERS[self.answer]
+
+    @property
+    def target(self) -> Candidate:
+        """The right candidate, from the item's scene or, about an intervention, from a future of
+        it."""
+        return self.candidates[self.answer]
 
     @property
     def name(self) -> str:

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+PAIR_SOURCES = {
+    "matched_anchor": ("matched.test", "small"),
+    "interventions": ("interventions.absent.test", "tiny_interventions"),
+}
+"""A quota of the pairs of each suite, and a preset that has them."""
+
 
 @command("evaluation.select", SelectCommand, ranks=True)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
@@ -105,16 +111,12 @@ def select_items(
     Raises:
         UserError: The benchmark has no such items.
     """
-    from data.records import MATCHED_ANCHOR
-
     items = store.selection("test", suite)
     if not items:
         problem = f"{store.folder} has no test items of the {suite or store.suite} suite"
-        if suite == MATCHED_ANCHOR:
-            problem += (
-                ": set benchmark.selection.matched.test, or choose a benchmark with matched-anchor "
-                "pairs, such as benchmark=small"
-            )
+        if suite is not None:
+            key, preset = PAIR_SOURCES[suite]
+            problem += f": set benchmark.selection.{key}, or choose a benchmark={preset}"
         raise UserError(problem, code="no-items")
     return limit_items(items, limit, seed)
 
@@ -122,18 +124,18 @@ def select_items(
 def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> list[SelectionItem]:
     """Return a random sample of `limit` items, or all items if `limit` is None.
 
-    The sample is spread evenly over the families, or consists of `limit // 2` matched-anchor pairs.
+    The sample is spread evenly over the families, or consists of `limit // 2` pairs.
     """
     import numpy as np
 
+    from conf.schema.benchmark import PAIRED
     from data.items.controls import pair_items
-    from data.records import MATCHED_ANCHOR
     from data.seeded_order import interleave
 
     if limit is None:
         return items
     rng = np.random.default_rng(seed)
-    if items[0].suite == MATCHED_ANCHOR:
+    if items[0].suite in PAIRED:
         pairs = pair_items(items)
         return [item for k in rng.permutation(len(pairs))[: limit // 2] for item in pairs[k]]
     order = rng.permutation(len(items))

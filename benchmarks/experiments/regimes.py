@@ -40,7 +40,8 @@ from benchmarks.experiments.records import (
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.schema import SftCommand
-from data.records import FAMILIES, MATCHED_ANCHOR
+from conf.schema.benchmark import MATCHED_ANCHOR
+from data.records import FAMILIES
 from data.store import Store
 from data.versions import BUILDERS
 from evaluation.metrics.baselines import baseline_results

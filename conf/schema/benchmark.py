@@ -23,6 +23,12 @@ WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
 WINDOW_HORIZONS = (8, 16, 24)
 """Number of frames from the last frame of a window item's prefix to its target."""
 WINDOW_DIFFICULTIES = ("easy", "hard")
+MATCHED_ANCHOR = "matched_anchor"
+"""Name of the suite of the matched-anchor items."""
+INTERVENTIONS = "interventions"
+"""Name of the suite of the pairs of items about what comes and what would have come."""
+PAIRED = (MATCHED_ANCHOR, INTERVENTIONS)
+"""The suites whose items form pairs, which a benchmark has besides its own suite."""
 STANDIN = "standin_"
 """Start of the names of the suites whose scenes are simulated instead of read from a release."""
 POOLS = ("future", "counterfactual")
@@ -63,6 +69,10 @@ class SelectionConfig(Settings):
     matched: Quota = field(default_factory=Quota)
     """Pairs of matched-anchor items. The two questions of a pair ask for the same target, one by an
     event and the other by a time."""
+
+    interventions: dict[str, Quota] = field(default_factory=dict)
+    """Pairs of items about interventions, by subtype: absent, heavier, lighter, faster, other_side.
+    One question of a pair asks for what comes, and the other for what would have come."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

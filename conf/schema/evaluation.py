@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 from urllib.parse import urlsplit
 
-from conf.schema.benchmark import POOLS, BenchmarkConfig
+from conf.schema.benchmark import PAIRED, POOLS, BenchmarkConfig
 from conf.schema.commands import CommandConfig
 from conf.schema.models import RetrieverConfig, StudentConfig
 from conf.schema.servers import ServerConfig
@@ -32,13 +32,14 @@ class ItemsCommand(CommandConfig):
 
     limit: int | None = setting(None, least=1)
     """Maximum number of test items, sampled evenly from the families; null uses all items."""
-    suite: str | None = setting(None, ("matched_anchor", None))
+    suite: str | None = setting(None, (*PAIRED, None))
     """matched_anchor uses pairs of items that differ only in how the question names the target's
-    moment: by an event or by a time. null uses the benchmark's standard items."""
+    moment: by an event or by a time. interventions uses pairs of items that ask for what comes and
+    for what would have come. null uses the benchmark's standard items."""
 
     def find_problems(self, group: str) -> Iterator[str]:
-        if self.suite == "matched_anchor" and self.limit == 1:
-            yield "limit=1 with suite=matched_anchor: a pair has two items; give limit=2 or more"
+        if self.suite and self.limit == 1:
+            yield f"limit=1 with suite={self.suite}: a pair has two items; give limit=2 or more"
 
 
 @dataclass

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import Counter
 
 from conf.schema import BenchmarkConfig
+from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR, PAIRED
 from data.items.cells import builder_name, cell_quotas
-from data.records import MATCHED_ANCHOR, SPLITS, FrameRef, RetrievalQuery, SelectionItem
+from data.records import SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import Store
 
 
@@ -26,9 +27,12 @@ def count_records(
     counts = Counter({f"scenes/{split}": len(names) for split, names in scene_ids.items()})
     cells: Counter[str] = Counter()
     for item in items:
-        is_own = item.suite != MATCHED_ANCHOR
-        track = "selection" if is_own else MATCHED_ANCHOR
+        is_own = item.suite not in PAIRED
+        track = "selection" if is_own else item.suite
         counts[f"{track}/{item.family}/{item.split}"] += 1
+        if item.suite == INTERVENTIONS:
+            # A quota counts pairs.
+            cells[f"{INTERVENTIONS}/{item.subtype}/{item.split}"] += item.framing == "future"
         cells[f"{item.family}/{item.subtype}/{item.split}"] += is_own
     for split in SPLITS:
         cells[f"{MATCHED_ANCHOR}/{split}"] = counts[f"{MATCHED_ANCHOR}/event/{split}"]

@@ -10,10 +10,10 @@ from typing import Any
 
 from conf.files import read_json, write_json
 from conf.runs import LOCK, lock_file
-from conf.schema.benchmark import POOLS
+from conf.schema.benchmark import PAIRED, POOLS
 from data.frames.frame_cache import frames_path, load_frames, render_frames, save_frames
 from data.parallel import Workers
-from data.records import MATCHED_ANCHOR, original_scene_id, sample_prefix_frames
+from data.records import original_scene_id, sample_prefix_frames
 from data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path
 
 FRAMES_RECORD = "frames.json"
@@ -53,7 +53,7 @@ def frames_to_render(store: Store, which: str) -> dict[str, list[int]]:
     """Return the frames to render by scene, with the scenes of the test split first."""
     frames: dict[str, set[int]] = defaultdict(set)
     count = store.manifest["config"]["prefix_frames"]
-    items = [*store.selection(), *store.selection(suite=MATCHED_ANCHOR)]
+    items = [i for suite in (None, *PAIRED) for i in store.selection(suite=suite)]
     queries = [q for pool in POOLS for q in store.retrieval(pool=pool)]
     for record in (*items, *queries):
         prefix = sample_prefix_frames(record.prefix_start, record.prefix_stop, count)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from data.items.futures import (
 from data.items.pickers import DistractorPicker, Recipe, Timing, new_item
 from data.items.scores import Balance, CandidateFrames, render_small
 from data.oracle.displacement import frame_displacements
-from data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
+from data.records import ALTERNATIVE, Candidate, Collision, Scene, SelectionItem
 from data.store import save_scene, scene_path
 
 FUTURES = {"event": 10, "time": 12, "window": 12}
@@ -104,9 +104,11 @@ class BalancedPicker(DistractorPicker):
         choices = _of_difficulty(choices, displacement, NEAREST.get(cell["distractors"]))
         if not len(choices):
             return None
-        chosen = self._choose(self.balance, frames, frame_moments, choices)
-        if chosen is None:
+        scores = self._compare(frames, frame_moments).scores(choices)
+        best = self.balance.choose(scores)
+        if best is None:
             return None
+        chosen = choices[best].tolist()
         candidates = []
         for frame in chosen:
             moment = frame_moments[frame]
@@ -121,32 +123,26 @@ class BalancedPicker(DistractorPicker):
         least = least_displacement(frames, chosen)
         return new_item(recipe, scene, timing, candidates, least, distractors="alternative")
 
-    def _choose(
-        self,
-        balance: Balance,
-        frames: Scene,
-        moments: Sequence[int],
-        choices: np.ndarray,
-        further: Sequence[np.ndarray] = (),
-        eligible: Sequence[int] = (0, 1, 2, 3),
-    ) -> list[int] | None:
-        """Return the choice of candidates (T, 4) that balances the ranks of the targets best, or
-        None (see `Balance.choose`).
-
-        Args:
-            frames: The frames from which candidates are chosen, the last observed one first.
-            moments: Their frame indices in time.
-            further: Further scores of these frames.
-        """
+    def _compare(
+        self, frames: Scene, moments: Sequence[int], further: Sequence[np.ndarray] = ()
+    ) -> CandidateFrames:
+        """Compare the frames from which candidates are chosen, the last observed one first, given
+        their frame indices in time and further scores."""
         states = [(frames, k) for k in range(frames.frames)]
         images = render_small(frames, range(frames.frames), {"world": asdict(self.world)})
-        compared = CandidateFrames.compare(states, moments, images, further)
-        best = balance.choose(compared.scores(choices), eligible)
-        return None if best is None else choices[best].tolist()
+        return CandidateFrames.compare(states, moments, images, further)
 
-    def _save(self, scene: Scene, name: str, stop: int, states: np.ndarray) -> None:
+    def _save(
+        self,
+        scene: Scene,
+        name: str,
+        stop: int,
+        states: np.ndarray,
+        collisions: tuple[Collision, ...] = (),
+    ) -> None:
         """Save an alternative future: a scene with the states (F, N, 13) from frame `stop` on."""
         future = alternative_scene(scene, name, stop, states, self.world)
+        future = replace(future, collisions=collisions)
         save_scene(future, scene_path(self.folder, name))
 
     def _candidate_frames(

@@ -23,23 +23,21 @@ import numpy as np
 
 from conf.files import write_bytes
 from conf.schema import BenchmarkConfig, Quota
+from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
 from data.items import contact, recipes, transfer
 from data.items.balanced import BalancedPicker
 from data.items.balanced_subset import RESERVE, choose_items
 from data.items.contact import ContactPicker
+from data.items.intervention_pairs import (
+    InterventionPicker,
+    make_intervention_pair,
+    make_intervention_recipe,
+)
 from data.items.pickers import CellInputs, DistractorPicker, Recipe, fill_quota, shuffle_candidates
 from data.items.queries import make_counterfactual_queries, make_future_queries
 from data.items.scores import compare_item
 from data.parallel import Workers
-from data.records import (
-    CONTACT,
-    FAMILIES,
-    GHOST,
-    MATCHED_ANCHOR,
-    RetrievalQuery,
-    Scene,
-    SelectionItem,
-)
+from data.records import CONTACT, FAMILIES, GHOST, RetrievalQuery, Scene, SelectionItem
 from data.seeded_order import named_rng
 from data.store import PARTS, SCENES_FOLDER, hash_files, load_scene, part_path, scene_path
 from data.versions import component_versions
@@ -78,9 +76,9 @@ def make_items_and_queries(
         paths[name] = path = part_path(folder, [*inputs, name, asdict(quota)])
         jobs[path] = partial(_make_cell, cfg, name, cell, path)
         sizes[path] = quota.train + quota.test
-    if is_balanced(cfg):
-        # The alternative futures of balanced items have the same names for other settings: a result
-        # from before a change of settings may refer to futures that were simulated since.
+    if is_balanced(cfg) or cfg.selection.interventions:
+        # Alternative futures have the same names for other settings: a result from before a change
+        # of settings may refer to futures that were simulated since.
         for path in {*(folder / PARTS).glob("*.json")} - jobs.keys():
             path.unlink()
     workers.write_files(jobs, "making items and queries", "item", sizes)
@@ -96,11 +94,9 @@ def make_items_and_queries(
             scores |= zip((i.item_id for i in made), part.get("scores", []), strict=False)
             reason = "no suitable distractors" if is_balanced(cfg) else "too alike"
             dropped[f"items dropped, {reason}/{name.partition('/')[0]}"] += part["dropped"]
-    return (
-        _choose_balanced(cfg, items, scores) if is_balanced(cfg) else items,
-        queries,
-        dict(dropped),
-    )
+    if is_balanced(cfg):
+        items = _choose_balanced(cfg, items, scores)
+    return items, queries, dict(dropped)
 
 
 def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> None:
@@ -111,6 +107,11 @@ def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) ->
         made, dropped = make_counterfactual_queries(cell)
     elif _is_query_cell(group):
         made, dropped = make_future_queries(int(group.split()[1]), cell)
+    elif group == INTERVENTIONS:
+        make_picker = partial(InterventionPicker, world=cfg.world, folder=path.parents[1])
+        actual, dropped = fill_quota(name, make_intervention_recipe(subtype), cell, make_picker)
+        pairs = (make_intervention_pair(item, cell.scene_of(item.scene_id)) for item in actual)
+        made = [item for pair in pairs for item in pair]
     elif group == MATCHED_ANCHOR:
         by_time, dropped = fill_quota(name, recipes.MATCHED, cell)
         made = [paired for item in by_time for paired in recipes.make_pair(item)]
@@ -191,6 +192,8 @@ def cell_quotas(cfg: BenchmarkConfig) -> dict[str, Quota]:
         for family, quotas in family_quotas(cfg).items()
         for subtype, quota in quotas.items()
     }
+    interventions = cfg.selection.interventions
+    quotas |= {f"{INTERVENTIONS}/{change}": quota for change, quota in interventions.items()}
     quotas[MATCHED_ANCHOR] = cfg.selection.matched
     quotas |= {f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()}
     quotas[COUNTERFACTUAL] = cfg.retrieval.counterfactual
@@ -207,7 +210,7 @@ def _with_reserve(cfg: BenchmarkConfig, name: str, quota: Quota) -> Quota:
     factor = 1.0
     if _is_query_cell(name):
         factor = QUERY_RESERVE
-    elif is_balanced(cfg) and name != MATCHED_ANCHOR:
+    elif is_balanced(cfg) and name.partition("/")[0] in FAMILIES:
         factor = RESERVE
     made = copy(quota)
     made.train, made.test = (math.ceil(factor * n) for n in (quota.train, quota.test))

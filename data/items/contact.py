@@ -38,7 +38,7 @@ from data.items.futures import (
 )
 from data.items.pickers import Recipe, Timing, new_item
 from data.items.recipes import EVENT_QUESTION
-from data.items.scores import COLLISION_SCORES, SCORES, Balance, collision_scores
+from data.items.scores import COLLISION_SCORES, SCORES, Balance, CandidateFrames, collision_scores
 from data.oracle.contacts import is_next, next_collision, touching_pairs
 from data.oracle.displacement import frame_displacements, visible_positions
 from data.records import ALTERNATIVE, CONTACT, GHOST, Candidate, Scene, SelectionItem
@@ -140,20 +140,26 @@ class ContactPicker(BalancedPicker):
         choices = distinct_choices(np.array(choices, int).reshape(-1, 4), displacement, least)
         if not len(choices):
             return None
-        moments = [stop, *[target] * (frames.frames - 1)]
-        shown = [(frames, k) for k in range(frames.frames)]
-        camera = Camera.from_settings(self.world.camera)
-        further = collision_scores(scene, stop, target, shown, camera)
-        balance, eligible = self.balances[with_ghost], eligible_candidates(with_ghost)
-        chosen = self._choose(balance, frames, moments, choices, further, eligible)
-        if chosen is None:
+        compared = self._compare_outcomes(scene, timing, frames)
+        eligible = eligible_candidates(with_ghost)
+        best = self.balances[with_ghost].choose(compared.scores(choices), eligible)
+        if best is None:
             return None
+        chosen = choices[best].tolist()
         candidates = [Candidate(scene.scene_id, target)]
         for k in (frame - TRUE for frame in chosen[1:]):
             name = f"{scene.scene_id}{ALTERNATIVE}{recipe.fields(timing)['subtype']}-{stop}-{k}"
             self._save(scene, name, stop, motions[k].states)
             candidates.append(Candidate(name, target, sources[k]))
         return new_item(recipe, scene, timing, candidates, least_displacement(frames, chosen))
+
+    def _compare_outcomes(self, scene: Scene, timing: Timing, frames: Scene) -> CandidateFrames:
+        """Compare frames of the target's moment, with the last observed one first."""
+        moments = [timing.stop, *[timing.target] * (frames.frames - 1)]
+        shown = [(frames, k) for k in range(frames.frames)]
+        camera = Camera.from_settings(self.world.camera)
+        further = collision_scores(scene, timing.stop, timing.target, shown, camera)
+        return self._compare(frames, moments, [*further])
 
     def _wants_ghost(self) -> bool:
         """Return whether the next item should have the ghost, to keep its share."""

@@ -13,13 +13,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from data.items.recipes import pair_key
-from data.records import SelectionItem, sample_prefix_frames
+from data.records import INTERVENTION, SelectionItem, sample_prefix_frames
 
 
 def pair_items(items: Sequence[SelectionItem]) -> list[tuple[SelectionItem, SelectionItem]]:
-    """Return the matched-anchor pairs among `items` as (event item, time item), in order."""
-    by_time = {pair_key(item): item for item in items if item.family == "time"}
-    return [(item, by_time[pair_key(item)]) for item in items if item.family == "event"]
+    """Return the pairs among `items` of a paired suite, in order: matched-anchor pairs as (event
+    item, time item), and pairs about interventions as (actual future, changed future)."""
+    second = {pair_key(item): item for item in items if _is_second(item)}
+    return [(item, second[pair_key(item)]) for item in items if not _is_second(item)]
+
+
+def _is_second(item: SelectionItem) -> bool:
+    return item.family == "time" or item.framing == INTERVENTION
 
 
 def prefix_under_control(item: SelectionItem, count: int, control: str | None) -> list[int]:

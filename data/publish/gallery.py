@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+from conf.schema.benchmark import MATCHED_ANCHOR
 from data.items.controls import pair_items
 from data.publish.contact_sheets import SheetRows, draw_sheet
-from data.records import MATCHED_ANCHOR, SPLITS
+from data.records import SPLITS
 from data.seeded_order import named_rng
 from data.store import Store
 

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from conf.errors import UserError
 from conf.files import read_json_if_valid, write_bytes
 from conf.runs import lock_file
-from conf.schema.benchmark import POOLS
+from conf.schema.benchmark import PAIRED, POOLS
 from data.publish.columns import (
     DESCRIPTIONS,
     ExportedRecord,
@@ -34,7 +34,7 @@ from data.publish.columns import (
     dataset_features,
     list_columns,
 )
-from data.records import MATCHED_ANCHOR, SPLITS, RetrievalQuery, SelectionItem
+from data.records import SPLITS, RetrievalQuery, SelectionItem
 from data.store import DATABASES, Store, hash_file
 from data.versions import component_versions
 
@@ -118,7 +118,9 @@ def list_tables(store: Store) -> dict[tuple[str, str], list[ExportedRecord]]:
     of the configuration `database` are the databases."""
     tables: dict[tuple[str, str], list[ExportedRecord]] = {}
     for split in SPLITS:
-        tables["selection", split] = store.selection(split) + store.selection(split, MATCHED_ANCHOR)
+        tables["selection", split] = [
+            item for suite in (None, *PAIRED) for item in store.selection(split, suite)
+        ]
     for split in SPLITS:
         tables["retrieval", split] = [q for pool in POOLS for q in store.retrieval(split, pool)]
     tables |= {("database", name): store.database(name) for name in DATABASES}
@@ -178,7 +180,7 @@ def render_card(store: Store, shards: Sequence[Shard], images: bool) -> str:
     rows: dict[str, Counter[str]] = {}
     for shard in shards:
         rows.setdefault(shard["configuration"], Counter())[shard["split"]] += shard["rows"]
-    items = [i for suite in (store.suite, MATCHED_ANCHOR) for i in store.selection(suite=suite)]
+    items = [i for suite in (None, *PAIRED) for i in store.selection(suite=suite)]
     queries = [q for pool in POOLS for q in store.retrieval(pool=pool)]
     text = (files("data.publish") / "templates/dataset_card.md").read_text()
     return Template(text).render(

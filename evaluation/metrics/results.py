@@ -11,6 +11,7 @@ import numpy as np
 from data.records import FAMILIES, RetrievalQuery
 from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval, SceneBootstrap
+from evaluation.metrics.pairs import PairScores
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.significance import PairedComparison
@@ -126,6 +127,7 @@ class SelectionReport:
             has the numbers of parsed responses, of valid records, and of responses that could not
             be parsed for each reason.
         reasons: What the rationales claim, by `SelectionResult.key`, for reasoning modes.
+        pairs: Scores of pairs about interventions, by `SelectionResult.key`.
         asked: The mode and the control of each variant, and the `key` of its lines in
             answers.jsonl; empty for retrievers.
     """
@@ -139,6 +141,7 @@ class SelectionReport:
     calibration: dict[str, Calibration]
     reasons: dict[str, ReasonSummary] = field(default_factory=dict)
     asked: list[tuple[str, str | None, str]] = field(default_factory=list)
+    pairs: dict[str, list[PairScores]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
 from data.items.recipes import TIME_CELLS
-from data.records import LETTERS, MATCHED_ANCHOR, SelectionItem
+from data.records import LETTERS, SelectionItem
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
 from evaluation.metrics.intervals import SceneBootstrap
+from evaluation.metrics.pairs import PairScores, score_pairs
 from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.results import (
     BASELINE,
@@ -103,7 +105,26 @@ def build_selection_report(
         calibration={key: of for key, of in calibrations.items() if of},
         reasons={**reasons},
         asked=[*asked],
+        pairs=_score_interventions(by_key, items, seed),
     )
+
+
+def _score_interventions(
+    choices: Mapping[str, Choices], items: Sequence[SelectionItem], seed: int
+) -> dict[str, list[PairScores]]:
+    """Return the scores of pairs about interventions; none for other items."""
+    if items[0].suite != INTERVENTIONS:
+        return {}
+    ids = [item.item_id for item in items]
+    return {
+        key: score_pairs(
+            items,
+            dict(zip(ids, c.credits, strict=True)),
+            dict(zip(ids, c.letters, strict=True)),
+            seed,
+        )
+        for key, c in choices.items()
+    }
 
 
 def _selection_result(

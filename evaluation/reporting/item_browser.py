@@ -13,16 +13,10 @@ import numpy as np
 from tqdm import tqdm
 
 from conf.errors import UserError
+from conf.schema.benchmark import PAIRED
 from data.frames.frame_cache import FrameReader
 from data.oracle.contacts import collisions_in
-from data.records import (
-    FAMILIES,
-    LETTERS,
-    MATCHED_ANCHOR,
-    FrameRef,
-    SelectionItem,
-    sample_prefix_frames,
-)
+from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_prefix_frames
 from data.seeded_order import interleave
 from data.store import Store, open_store
 from evaluation.metrics.baselines import baseline_results
@@ -75,7 +69,7 @@ class ItemBrowser:
             name: The group's name (`Measurement.group`).
             models: The models' results, by label.
         """
-        suites = (None, MATCHED_ANCHOR)
+        suites = (None, *PAIRED)
         items = {i.item_id: i for suite in suites for i in store.selection("test", suite)}
         by_label = {label: m.responses for label, m in models.items()}
         # The comparisons with controls are in the reports of the runs that measured them.

@@ -182,6 +182,11 @@ def build_controls(selections: Results, runs: Sequence[FinishedRun]) -> Section:
     """The accuracies on other suites and under controls, and the paired differences."""
     compared = [run for run in runs if run.kind in SELECTION_KINDS and run.report.controls]
     differences = [_name_table(tables.paired_table(r.report.controls), r.title) for r in compared]
+    differences += [
+        _name_table(tables.pair_table(run.report.pairs), run.title)
+        for run in runs
+        if run.kind in SELECTION_KINDS and run.report.pairs
+    ]
     groups = group_by_item_set(selections).values()
     accuracies = [summary_tables.summary_table("control", rows) for rows in groups]
     return Section("Controls", differences + accuracies)

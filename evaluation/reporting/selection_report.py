@@ -22,6 +22,7 @@ def write_report(report: SelectionReport, folder: Path, suite: str) -> None:
     results = report.rows
     parts = [tables.selection_table(results, suite)]
     parts += [tables.paired_table(report.controls)] if report.controls else []
+    parts += [tables.pair_table(report.pairs)] if report.pairs else []
     log.info("%s", "\n\n".join(map(str, parts)))
     parts += tables.detail_tables({r.key: (r.key, report) for r in results})
     write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")

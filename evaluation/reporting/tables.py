@@ -9,6 +9,7 @@ from typing import Any
 from data.records import FAMILIES, LETTERS
 from evaluation.metrics.calibration import Calibration, PositionBias
 from evaluation.metrics.intervals import Interval
+from evaluation.metrics.pairs import PairScores
 from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.results import (
     MEASURES,
@@ -203,6 +204,28 @@ def paired_table(comparisons: Iterable[PairedComparison]) -> Table:
         "counts, which treats the items of a scene as independent."
     )
     return Table("paired", "Paired differences of accuracy (%)", columns, groups, (note,))
+
+
+def pair_table(scores: Mapping[str, Sequence[PairScores]]) -> Table:
+    """Return a table of pairs about interventions, with a group for each model."""
+    columns = ["Actual", "Changed", "Both", "Ignored", "Pairs"]
+    groups = {
+        label: [
+            {
+                "name": each.of, "Actual": each.actual, "Changed": each.changed,
+                "Both": each.both, "Ignored": each.ignored, "Pairs": each.both.n,
+            }
+            for each in own
+        ]
+        for label, own in scores.items()
+    }  # fmt: skip
+    note = (
+        f"{INTERVAL_NOTE} Actual, changed: accuracy on the items about what comes, and about what "
+        "would have come. Both: pairs with both items right; 6.2 by independent guesses, 8.3 by "
+        "one who knows that the two answers differ. Ignored: pairs whose items are both answered "
+        "with what comes."
+    )
+    return Table("pairs", "Pairs about interventions (%)", columns, groups, (note,))
 
 
 def retrieval_table(results: Sequence[RetrievalResult], command: str = "retrieve") -> Table:

@@ -12,9 +12,10 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.schema import StudyCommand
+from conf.schema.benchmark import MATCHED_ANCHOR
 from data.build import ensure_benchmark
 from data.frames.frame_cache import FrameReader
-from data.records import FAMILIES, MATCHED_ANCHOR, SelectionItem
+from data.records import FAMILIES, SelectionItem
 from data.seeded_order import interleave, named_rng
 from data.store import Store
 from evaluation.study import auth, storage

@@ -13,18 +13,12 @@ import pytest
 from datasets import load_dataset
 from huggingface_hub import DatasetCard
 
-from conf.schema.benchmark import POOLS
+from conf.schema.benchmark import MATCHED_ANCHOR, POOLS
 from data.frames.frame_cache import FrameReader
 from data.publish import huggingface
 from data.publish.columns import COLUMNS, DESCRIPTIONS, dataset_features
 from data.publish.huggingface import ensure_export, render_card
-from data.records import (
-    MATCHED_ANCHOR,
-    SPLITS,
-    RetrievalQuery,
-    SelectionItem,
-    sample_prefix_frames,
-)
+from data.records import SPLITS, RetrievalQuery, SelectionItem, sample_prefix_frames
 from data.store import Store
 from tests.user_errors import raises_user_error
 

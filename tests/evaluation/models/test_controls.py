@@ -11,8 +11,8 @@ import pytest
 
 from conf.entry import Run
 from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentConfig
+from conf.schema.benchmark import MATCHED_ANCHOR
 from data.items.controls import pair_items
-from data.records import MATCHED_ANCHOR
 from evaluation import select
 from evaluation.generators.response_log import score_response
 from evaluation.metrics.results import SelectionResult, from_json

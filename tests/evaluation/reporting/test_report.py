@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from conf.schema import ExportStudyCommand, ReportCommand
-from data.records import MATCHED_ANCHOR
+from conf.schema.benchmark import MATCHED_ANCHOR
 from tests.evaluation.reporting.measured import (
     finish,
     read_table,
