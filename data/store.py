@@ -36,6 +36,7 @@ import numpy as np
 
 from conf.errors import UserError
 from conf.files import read_json_if_valid, write_bytes
+from conf.schema.benchmark import INTERVENTIONS
 from data.records import (
     Collision,
     FrameRef,
@@ -183,6 +184,11 @@ class Store:
         suite = suite or self.suite
         kept = (r for r in rows if split in (None, r["split"]) and r["suite"] == suite)
         return [SelectionItem.from_row(r) for r in kept]
+
+    def training_items(self) -> list[SelectionItem]:
+        """Selection items for training: those of the benchmark's own suite, and the pairs about
+        interventions."""
+        return self.selection("train") + self.selection("train", INTERVENTIONS)
 
     def retrieval(self, split: str | None = None, pool: str = "future") -> list[RetrievalQuery]:
         """Retrieval queries of one of the `POOLS`; by default of both splits."""

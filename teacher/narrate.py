@@ -107,7 +107,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
         UserError: rationales.jsonl is damaged or belongs to another benchmark, or the servers
             cannot be used.
     """
-    items = store.selection("train")
+    items = store.training_items()
     grader = RationaleGrader(cfg)
     with Journal(store.folder / JOURNAL_FILE) as journal:
         check_items(journal, items)

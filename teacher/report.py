@@ -232,7 +232,7 @@ def write_report(
     text = f"predicates: {name_vocabulary(cfg)}\n\n{format_figures(figures)}"
     write_json(folder / "report.json", figures)
     write_text(folder / "report.txt", text + "\n")
-    items = {item.item_id: item for item in store.selection("train")}
+    items = {item.item_id: item for item in store.training_items()}
     rows, examples = SheetRows(store), []
     for k in sorted(np.random.default_rng(cfg.seed).permutation(len(accepted))[:count].tolist()):
         item = items[accepted[k].item_id]

@@ -26,7 +26,8 @@ def describe_item(
     item: SelectionItem, store: Store, cfg: TeacherConfig
 ) -> RelationalPredicates | None:
     """Return all predicates of an item; None if its prefix is too short."""
-    scene = store.scene(item.scene_id)
+    # The scene of the target is the one whose future the item asks for.
+    scene = store.scene(item.target.scene_id)
     return extract_predicates(item, scene, store.scene, cfg.bounds)
 
 

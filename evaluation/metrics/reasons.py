@@ -86,7 +86,7 @@ def read_reasons(
 def item_predicates(item: SelectionItem, store: Store) -> RelationalPredicates | None:
     """Return all predicates of an item, with which claims are compared; None if the item has no
     predicates, because its prefix is too short."""
-    scene = store.scene(item.scene_id)
+    scene = store.scene(item.target.scene_id)
     return extract_predicates(item, scene, store.scene, RelationBounds())
 
 

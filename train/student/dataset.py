@@ -143,7 +143,7 @@ def split_items(
 
     Without `hold_out`, return all items of the training split, and a sample of them.
     """
-    items = store.selection("train")
+    items = store.training_items()
     if not hold_out:
         return items, shuffled(items, seed)[:validation_items]
     held_out = held_out_scenes(store)
@@ -199,7 +199,7 @@ def uses_only(item: SelectionItem, scenes: set[str]) -> bool:
 
 def tokenizer_corpus(store: Store, rationales: list[Rationale]) -> list[str]:
     """Return texts to train a tokenizer on: everything that a student reads and writes."""
-    return prompt_corpus(store.selection("train")) + [r.text for r in rationales]
+    return prompt_corpus(store.training_items()) + [r.text for r in rationales]
 
 
 def prompt_corpus(items: Sequence[SelectionItem], others: Sequence[str] = ()) -> list[str]:
