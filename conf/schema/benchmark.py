@@ -22,6 +22,8 @@ WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
 """Window families of each group (see `data.items.recipes`). B and G2 need a later collision."""
 WINDOW_HORIZONS = (8, 16, 24)
 """Number of frames from the last frame of a window item's prefix to its target."""
+MASS_CHANGES = ("heavier", "lighter")
+"""The interventions on the mass of an object (see `data.items.intervention_pairs`)."""
 WINDOW_DIFFICULTIES = ("easy", "hard")
 MATCHED_ANCHOR = "matched_anchor"
 """Name of the suite of the matched-anchor items."""
@@ -198,6 +200,7 @@ class BenchmarkConfig(Settings):
                 f"{recipe}: these distractors are frames of simulated futures; set "
                 f"{group}simulator=bullet and {group}recipe=dynapix, or {group}distractors=paper"
             )
+        yield from self._find_intervention_problems(group)
         if recipe == "tracks":
             yield from self._find_contact_quotas(group)
         elif recipe != "dynapix":
@@ -234,6 +237,27 @@ class BenchmarkConfig(Settings):
                 "candidates could be the same image"
             )
 
+    def _find_intervention_problems(self, group: str) -> Iterator[str]:
+        """Describe pairs about interventions that the world or the simulator cannot give."""
+        quotas = self.selection.interventions
+        asked = [name for name, quota in quotas.items() if quota.train + quota.test]
+        if asked and (self.simulator != "bullet" or self.item_recipe != "dynapix"):
+            yield (
+                f"{group}selection.interventions with {group}simulator={self.simulator} and "
+                f"{group}recipe={self.item_recipe}: their scenes are simulated again; set "
+                f"{group}simulator=bullet and {group}recipe=dynapix, or remove these quotas"
+            )
+        mass = self.world.objects.mass
+        if (
+            about := [name for name in asked if name in MASS_CHANGES]
+        ) and mass.metal <= mass.rubber:
+            yield (
+                f"{group}selection.interventions.{', '.join(about)} with world={self.world.name}: "
+                f"metal is not heavier than rubber there (objects.mass.metal={mass.metal:g}, "
+                f"rubber={mass.rubber:g}), so a question about the mass has no answer; set "
+                "world=masses or world=above_masses, or remove these quotas"
+            )
+
     def _find_contact_quotas(self, group: str) -> Iterator[str]:
         """Describe what the recipe tracks cannot make."""
         if self.simulator != "tracks":
@@ -268,6 +292,8 @@ class BenchmarkConfig(Settings):
             for family in ("event", "time", "window")
             for cell, quota in getattr(track, family).items()
         }
+        for change, quota in track.interventions.items():
+            quotas[f"selection.interventions.{change}"] = (quota.test, 1)
         quotas["selection.matched"] = (track.matched.test, 1)
         for name, most in QUERIES_PER_SCENE.items():
             quotas[f"retrieval.builders.{name}"] = (builders.get(name, Quota()).test, most)
