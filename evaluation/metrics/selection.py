@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from data.checks.intervals import SceneBootstrap
 from data.items.recipes import TIME_CELLS
 from data.records import LETTERS, MATCHED_ANCHOR, SelectionItem
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
-from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.results import (
     BASELINE,

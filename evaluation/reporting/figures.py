@@ -12,10 +12,10 @@ from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
-from evaluation.metrics.intervals import Interval
+from data.checks.figures import COLORS, create_figure
+from data.checks.intervals import Interval
 from evaluation.metrics.results import RECALLS, UNTRAINED, RetrievalResult
 from evaluation.reporting.reference import COT_STUDENT, cot_student
-from train.common.curves import COLORS, create_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

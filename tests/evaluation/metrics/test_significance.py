@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import binomtest, norm, permutation_test
 from statsmodels.stats.multitest import multipletests
 
+from data.checks.intervals import SceneBootstrap
 from data.records import FAMILIES, MATCHED_ANCHOR, Candidate, SelectionItem
-from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.results import accuracy_by_family, from_json
 from evaluation.metrics.significance import (
     EXACT_SCENES,
