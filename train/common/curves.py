@@ -1,7 +1,4 @@
-"""Plot the curves of a run from its journal.
-
-Figures are built without pyplot, so plotting leaves no global state and needs no display.
-"""
+"""Plot the curves of a run from its journal."""
 
 from __future__ import annotations
 
