@@ -115,7 +115,7 @@ def _observe_items(store: Store, items: Sequence[SelectionItem], path: Path) -> 
     for item in items:
         rng = named_rng(store.manifest["seed"], "observer", item.item_id)
         for observer, right in observe_item(item, store, ERRORS, DRAWS, rng).items():
-            rows[observer][item.item_id] = right.tolist()
+            rows[observer][item.item_id] = right.mean(axis=1).tolist()
     write_bytes(path, json.dumps(rows).encode())
 
 
@@ -126,8 +126,9 @@ def observe_item(
     draws: int,
     rng: np.random.Generator,
 ) -> dict[str, np.ndarray]:
-    """Return for each observer the share of draws in which it is right, (1 + E,): without an error,
-    and with each of the errors. All errors share the same draws, scaled."""
+    """Return for each observer its credit in each draw, (1 + E, draws): without an error, where all
+    draws are the same, and with each of the errors. All errors share the same draws, scaled. The
+    credit is 1 for the target, and 1/m if m candidates with the target among them tie."""
     scene, stop = store.scene(item.scene_id), item.prefix_stop
     config = store.manifest["config"]
     world: WorldConfig = from_dict(WorldConfig, config["world"])
@@ -150,7 +151,7 @@ def observe_item(
         distances = candidate_distances(item, store, image, known)
         nearest = distances == distances.min(axis=1, keepdims=True)
         credit = nearest[:, item.answer] / nearest.sum(axis=1)
-        right[observer] = np.append(credit[0], credit[1:].reshape(-1, draws).mean(axis=1))
+        right[observer] = np.append(credit[:1].repeat(draws), credit[1:]).reshape(-1, draws)
     return right
 
 
