@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import shutil
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -86,7 +87,7 @@ def test_the_curves_fall_within_their_intervals(items, results) -> None:
     curves = observer_curves(results, items, 0)
     for curve in curves.values():
         intervals = list(curve.accuracy.values())
-        for left, right in zip(intervals, intervals[1:], strict=False):
+        for left, right in pairwise(intervals):
             assert right.low <= left.high
         assert intervals[-1].high < intervals[0].low
     exact = curves[SIMULATES].accuracy[0.0].value
@@ -145,17 +146,13 @@ def test_an_item_whose_prefix_shows_no_object_is_a_guess(store, items) -> None:
 
 @pytest.mark.slow
 def test_benchmarks_without_simulation_or_items_are_refused(store) -> None:
-    manifest = store.manifest
-    release = replace(
-        store, manifest=manifest | {"config": manifest["config"] | {"simulator": "movi_a"}}
-    )
-    with raises_user_error("no-simulation"):
-        shutil.rmtree(store.folder / OBSERVER_FOLDER, ignore_errors=True)
-        observe_benchmark(release, "test", Workers(1))
-    with raises_user_error("empty-split"):
-        observe_benchmark(
-            replace(store, manifest=manifest | {"suite": "other"}), "test", Workers(1)
-        )
+    config = store.manifest["config"] | {"simulator": "movi_a"}
+    release = replace(store, manifest=store.manifest | {"config": config})
+    empty = replace(store, manifest=store.manifest | {"suite": "other"})
+    shutil.rmtree(store.folder / OBSERVER_FOLDER, ignore_errors=True)
+    for refused, code in ((release, "no-simulation"), (empty, "empty-split")):
+        with raises_user_error(code):
+            observe_benchmark(refused, "test", Workers(1))
 
 
 def test_an_accuracy_of_the_curve_has_the_error_of_the_curve() -> None:
