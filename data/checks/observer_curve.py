@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import exp, inf, log
 from pathlib import Path
+from textwrap import fill
 from types import MappingProxyType
 from typing import IO, Any, Self
 
@@ -143,11 +144,12 @@ def format_observers(summary: Mapping[str, Any]) -> str:
     ceilings = summary["ceilings"]
     low = [name for name, chance in ceilings.items() if chance <= GUESS]
     named = f" ({', '.join(low[:NAMED])}{', ...' * (len(low) > NAMED)})" if low else ""
-    sections.append(
-        f"{len(low)} of {len(ceilings)} items{named} are unsolvable for eyes with an error of "
-        f"{CEILING_ERROR:g} px:\nthe observer that simulates is right in at most a quarter of its "
-        f"{DRAWS} draws."
+    unsolvable = (
+        f"Unsolvable for eyes with an error of {CEILING_ERROR:g} px, with which the observer that "
+        f"simulates is right in at most a quarter of its {DRAWS} draws: {len(low)} of "
+        f"{len(ceilings)} items{named}"
     )
+    sections.append(fill(unsolvable, 100))
     return "\n\n".join(sections)
 
 
