@@ -41,7 +41,8 @@ class ObserverError:
     high: float
 
     def __str__(self) -> str:
-        return f"{_format(self.value)} [{_format(self.low)}, {_format(self.high)}]"
+        value, low, high = map(_format, (self.value, self.low, self.high))
+        return value if low == high else f"{value} [{low}, {high}]"
 
 
 def _format(error: float) -> str:
