@@ -9,9 +9,10 @@
         embeddings/          cache of embeddings of frames and queries
         rationales.jsonl     every response of a teacher
         rationales.parquet   accepted rationales of the last narration
+        observer-1/          results of simulated observers
         checked.json         sizes and times of the files at the last check
 
-The manifest does not cover the last five, which may change after the build.
+The manifest does not cover the last six, which may change after the build.
 
 A build writes to the folder `.<name>.partial` beside the store and renames it when the benchmark is
 complete. Every file is written atomically, so that a killed build resumes with the complete files.

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from conf.errors import UserError
     from dynapix.benchmark import Benchmark, Frame, Item, Query, load
+    from dynapix.observers import Observers, observer
     from dynapix.rationales import RationaleScore, score_rationale, sufficiency
     from dynapix.retrieval import RetrievalScores, evaluate_retrieval
     from dynapix.selection import Comparison, Failure, Outcome, Result, evaluate
@@ -31,6 +32,7 @@ _HOMES = {
     "Failure": "dynapix.selection",
     "Frame": "dynapix.benchmark",
     "Item": "dynapix.benchmark",
+    "Observers": "dynapix.observers",
     "Outcome": "dynapix.selection",
     "ParsedAnswer": "models.student.answer_parser",
     "Query": "dynapix.benchmark",
@@ -42,6 +44,7 @@ _HOMES = {
     "evaluate_retrieval": "dynapix.retrieval",
     "find_numbers": "teacher.numbers.detection",
     "load": "dynapix.benchmark",
+    "observer": "dynapix.observers",
     "parse_choice": "models.student.answer_parser",
     "rank_metrics": "evaluation.metrics.ranking",
     "score_rationale": "dynapix.rationales",
@@ -55,6 +58,7 @@ __all__ = [
     "Failure",
     "Frame",
     "Item",
+    "Observers",
     "Outcome",
     "ParsedAnswer",
     "Query",
@@ -66,6 +70,7 @@ __all__ = [
     "evaluate_retrieval",
     "find_numbers",
     "load",
+    "observer",
     "parse_choice",
     "rank_metrics",
     "score_rationale",

@@ -73,6 +73,9 @@ class StatisticsCommand(CommandConfig):
     blind: bool = False
     """Also train two small models that do not see the prefix, and report their accuracy. This takes
     minutes and needs the extra `train`."""
+    observer: bool = False
+    """Also simulate observers who see the objects with errors of 0.25 to 32 px, and report their
+    accuracy. This takes minutes, once per benchmark, which must be simulated."""
 
 
 @dataclass

@@ -7,7 +7,11 @@ know the moment; the one that simulates also knows masses, friction and orientat
 
 The observer's motion model is exact, so that its fit is that of the errors alone: a line through
 the errors of the frames in which an object is visible, since its last contact in the prefix. An
-object with fewer than two such frames is known exactly.
+object with fewer than two such frames is known exactly. Objects that no frame of the prefix shows
+take part in the simulation, but their places are not compared.
+
+From the exact state, the observer that simulates is right, except where objects touch at the end of
+the prefix: Bullet keeps contacts from step to step, and a simulation that starts there may stray.
 """
 
 from __future__ import annotations
@@ -21,7 +25,8 @@ import numpy as np
 import pandas as pd
 
 from conf.errors import UserError
-from conf.files import write_bytes
+from conf.files import is_writable, write_bytes
+from conf.runs import lock_file
 from conf.schema import WorldConfig
 from conf.schema.settings import from_dict
 from data.items.futures import scene_states, simulate_futures
@@ -37,50 +42,80 @@ ERRORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Standard deviations of an observer's errors in each direction of the image, px at 336 x 336."""
 DRAWS = 8
 """Number of draws of the errors for each item."""
+OBSERVERS = SIMULATES, EXTRAPOLATES = "simulates", "extrapolates"
 OBSERVER_FOLDER = "observer-1"
 """Folder of a store with the results. Its number rises when the results would change."""
 CHUNK = 25
 """Number of items in one file of results."""
 
 
-def observe_benchmark(store: Store, workers: Workers) -> pd.DataFrame:
-    """Return the results of the observers on the items of a benchmark. They are computed once and
-    kept in the store, in small files, so that a killed run goes on where it was.
+def observe_benchmark(store: Store, split: str, workers: Workers) -> dict[str, pd.DataFrame]:
+    """Return the results of the observers on the items of a split. They are computed once and kept
+    in the store, in small files, so that a killed run goes on where it was.
 
     Returns:
-        One row for each item, observer and error: `item_id`, `observer` (simulates or
-        extrapolates), `error` in px at 336 x 336, and `right`, the share of the draws in which the
-        observer chooses the target. With the error 0, there is one draw.
+        By observer (simulates, extrapolates): the share of the draws in which it chooses the
+        target, with a row for each item id and a column for each error, 0 and `ERRORS`. Without an
+        error, there is one draw.
 
     Raises:
-        UserError: The scenes of the benchmark were not simulated by Bullet.
+        UserError: The scenes of the benchmark were not simulated by Bullet, the split has no items,
+            or the store cannot be written and has no results.
     """
+    if (results := load_observers(store, split)) is not None:
+        return results
     if store.manifest["config"]["simulator"] != "bullet":
         raise UserError(
             f"{store.folder}: its scenes are those of a release, which cannot be simulated again, "
             "so there is no observer: choose a benchmark with benchmark.simulator=bullet",
             code="no-simulation",
         )
-    items, folder = store.selection(), store.folder / OBSERVER_FOLDER
-    chunks = {folder / f"{k}.json": own for k, own in enumerate(batched(items, CHUNK))}
-    jobs = {path: partial(_observe_items, store, own, path) for path, own in chunks.items()}
-    sizes = {path: len(own) for path, own in chunks.items()}
-    workers.write_files(jobs, "simulating observers", "item", sizes)
-    rows = [row for path in chunks for row in json.loads(path.read_bytes())]
-    return pd.DataFrame(rows)
+    chunks, folder = _list_chunks(store, split), store.folder / OBSERVER_FOLDER
+    if not chunks:
+        raise UserError(
+            f"{store.folder} has no selection items in the split {split}, so there is nothing to "
+            "observe: choose a benchmark with quotas in benchmark.selection",
+            code="empty-split",
+        )
+    if not is_writable(folder):
+        raise UserError(
+            f"{folder} cannot be written, so the results of observers cannot be kept: copy the "
+            "benchmark to a folder that you may write",
+            code="read-only",
+        )
+    with lock_file(folder / ".lock", f"observers of {store.folder} run in another process", True):
+        jobs = {path: partial(_observe_items, store, own, path) for path, own in chunks.items()}
+        sizes = {path: len(own) for path, own in chunks.items()}
+        workers.write_files(jobs, "simulating observers", "item", sizes)
+    return load_observers(store, split)
+
+
+def load_observers(store: Store, split: str) -> dict[str, pd.DataFrame] | None:
+    """Return the results that `observe_benchmark` has kept; None unless it has finished."""
+    paths = [*_list_chunks(store, split)]
+    if not paths or not all(path.exists() for path in paths):
+        return None
+    parts = [json.loads(path.read_bytes()) for path in paths]
+    columns = [0.0, *ERRORS]
+    return {
+        name: pd.concat(pd.DataFrame.from_dict(p[name], "index", columns=columns) for p in parts)
+        for name in OBSERVERS
+    }
+
+
+def _list_chunks(store: Store, split: str) -> dict[Path, list[SelectionItem]]:
+    """Return the items of each file of results."""
+    folder = store.folder / OBSERVER_FOLDER
+    parts = batched(store.selection(split), CHUNK)
+    return {folder / f"{split}-{k}.json": own for k, own in enumerate(parts)}
 
 
 def _observe_items(store: Store, items: Sequence[SelectionItem], path: Path) -> None:
-    rows = []
+    rows: dict[str, dict[str, list[float]]] = {name: {} for name in OBSERVERS}
     for item in items:
         rng = named_rng(store.manifest["seed"], "observer", item.item_id)
         for observer, right in observe_item(item, store, ERRORS, DRAWS, rng).items():
-            shares = dict(zip((0.0, *ERRORS), right.tolist(), strict=True))
-            rows += [
-                {"item_id": item.item_id, "observer": observer, "error": error, "right": share}
-                for error, share in shares.items()
-            ]
-    path.parent.mkdir(exist_ok=True)
+            rows[observer][item.item_id] = right.mean(axis=1).tolist()
     write_bytes(path, json.dumps(rows).encode())
 
 
@@ -91,8 +126,9 @@ def observe_item(
     draws: int,
     rng: np.random.Generator,
 ) -> dict[str, np.ndarray]:
-    """Return for each observer the share of draws in which it is right, (1 + E,): without an error,
-    and with each of the errors. All errors share the same draws, scaled."""
+    """Return for each observer its credit in each draw, (1 + E, draws): without an error, where all
+    draws are the same, and with each of the errors. All errors share the same draws, scaled. The
+    credit is 1 for the target, and 1/m if m candidates with the target among them tie."""
     scene, stop = store.scene(item.scene_id), item.prefix_stop
     config = store.manifest["config"]
     world: WorldConfig = from_dict(WorldConfig, config["world"])
@@ -105,8 +141,8 @@ def observe_item(
     motions = simulate_futures(scene, stop, item.target_frame, branches, world)
     seconds = (item.target_frame - stop) / scene.fps
     predictions = {
-        "simulates": np.stack([motion.positions[-1] for motion in motions]),
-        "extrapolates": states[..., :3] + seconds * states[..., 7:10],
+        SIMULATES: np.stack([motion.positions[-1] for motion in motions]),
+        EXTRAPOLATES: states[..., :3] + seconds * states[..., 7:10],
     }
     known = visible_positions(scene)[1][item.prefix_start : stop + 1].any(axis=0)
     right = {}
@@ -115,7 +151,7 @@ def observe_item(
         distances = candidate_distances(item, store, image, known)
         nearest = distances == distances.min(axis=1, keepdims=True)
         credit = nearest[:, item.answer] / nearest.sum(axis=1)
-        right[observer] = np.append(credit[0], credit[1:].reshape(-1, draws).mean(axis=1))
+        right[observer] = np.append(credit[:1].repeat(draws), credit[1:]).reshape(-1, draws)
     return right
 
 
@@ -147,7 +183,7 @@ def ground_errors(scene: Scene, frame: int, errors: np.ndarray, camera: Camera) 
     moved = [camera.project(positions + step * np.eye(3)[axis])[0] for axis in (0, 1)]
     base = camera.project(positions)[0]
     jacobian = np.stack([(each - base) * scale / step for each in moved], axis=-1)
-    ground = np.einsum("nij,kntj->knti", np.linalg.inv(jacobian), errors)
+    ground = np.einsum("nij,kntj->knti", np.linalg.pinv(jacobian), errors)
     states = np.zeros((len(errors), len(positions), 13))
     states[..., 0:2], states[..., 7:9] = ground[:, :, 0], ground[:, :, 1]
     return states
@@ -156,8 +192,9 @@ def ground_errors(scene: Scene, frame: int, errors: np.ndarray, camera: Camera) 
 def candidate_distances(
     item: SelectionItem, store: Store, predicted: np.ndarray, known: np.ndarray
 ) -> np.ndarray:
-    """Return the mean distance of the known objects between K predictions (K, N, 2) and each of the
-    four candidates, (K, 4) px at 336 x 336; the image's diagonal for a missing object."""
+    """Return the sum of the distances of the known objects between K predictions (K, N, 2) and each
+    of the four candidates, (K, 4) px at 336 x 336; the image's diagonal for a missing object. The
+    candidates tie where no object is known."""
     scene, distances = store.scene(item.scene_id), []
     for candidate in item.candidates:
         other = store.scene(candidate.scene_id)
@@ -167,5 +204,5 @@ def candidate_distances(
         for k, key in enumerate(scene.object_keys):
             if key in actual:
                 away[:, k] = np.linalg.norm(predicted[:, k] - actual[key], axis=-1)
-        distances.append(np.minimum(away, DIAGONAL)[:, known].mean(axis=-1))
+        distances.append(np.minimum(away, DIAGONAL)[:, known].sum(axis=-1))
     return np.stack(distances, axis=-1)

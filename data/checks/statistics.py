@@ -82,7 +82,7 @@ def measure_shortcuts(
 
         right = right.assign(**score_blind_models(items, store, store.manifest["seed"]))
     names = list(right)
-    right["category"] = [list(_categories(item)) for item in items]
+    right["category"] = [list(list_categories(item)) for item in items]
     test = right[[item.split == "test" for item in items]]
     categories = test.explode("category").groupby("category")
     return categories[names].mean().assign(items=categories.size())
@@ -109,7 +109,7 @@ def _describe_item(item: SelectionItem, compared: CandidateFrames) -> dict[str, 
     scenes = {candidate.scene_id for candidate in item.candidates}
     earlier = sum(candidate.frame < item.target_frame for candidate in item.candidates)
     return {
-        "category": list(_categories(item)),
+        "category": list(list_categories(item)),
         "letter": item.letter,
         "least": item.min_displacement,
         "nearest distractor": compared.displacement[target, wrong].min(),
@@ -117,7 +117,8 @@ def _describe_item(item: SelectionItem, compared: CandidateFrames) -> dict[str, 
     }
 
 
-def _categories(item: SelectionItem) -> Iterator[str]:
+def list_categories(item: SelectionItem) -> Iterator[str]:
+    """Yield the categories of an item; see `compute_statistics`."""
     yield item.family
     if item.family == "event":
         yield f"event, {item.distractors}"

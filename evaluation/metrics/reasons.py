@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from conf.schema import RelationBounds
+from data.checks.intervals import Interval, SceneBootstrap
 from data.records import SelectionItem
-from evaluation.metrics.intervals import Interval, SceneBootstrap
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates
 from teacher.reading.claims import Claim

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
+from data.checks.intervals import Interval, SceneBootstrap
 from data.records import FAMILIES, RetrievalQuery
 from evaluation.metrics.calibration import Calibration, PositionBias
-from evaluation.metrics.intervals import Interval, SceneBootstrap
 from evaluation.metrics.pairs import PairScores
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.reasons import ReasonSummary

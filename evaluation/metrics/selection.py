@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
+from data.checks.intervals import SceneBootstrap
 from data.items.recipes import TIME_CELLS
 from data.records import LETTERS, SelectionItem
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
-from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.pairs import PairScores, score_pairs
 from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.results import (

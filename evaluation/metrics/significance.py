@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from conf.errors import UserError
+from data.checks.intervals import SceneBootstrap
 from data.items.controls import pair_items
 from data.records import FAMILIES, SelectionItem
-from evaluation.metrics.intervals import SceneBootstrap
 
 MAX_NAMED_ITEMS = 3
 """Most items of each run that the error about different items names."""

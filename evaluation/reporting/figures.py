@@ -1,33 +1,20 @@
-"""The figures of evaluations and of the report. A file's suffix determines its format.
-
-Figures are built without pyplot, so that they leave no global state and need no display.
-"""
+"""The figures of evaluations and of the report. A file's suffix determines its format."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from textwrap import fill
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
 import numpy as np
 
-from evaluation.metrics.intervals import Interval
+from data.checks.figures import COLORS, GRID, INK, create_figure, legend_above
+from data.checks.intervals import Interval
 from evaluation.metrics.results import RECALLS, UNTRAINED, RetrievalResult
 from evaluation.reporting.reference import COT_STUDENT, cot_student
-from train.common.curves import COLORS, create_figure
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-INK, GRID = "#333333", "#eeeeee"
 GRAY = "#999999"
 """Color of untrained retrievers."""
-LEGEND_WIDTH = 100
-"""Maximum characters of a line of a legend."""
-LEGEND_ROWS, LEGEND_LINE = 4, 0.18
-"""Number of rows of a legend for which a figure has room, and the height of another row, inches."""
 
 
 def plot_accuracies(
@@ -67,7 +54,7 @@ def plot_accuracies(
     axes.set(xlim=(-0.5, len(groups) - 0.5), ylim=(0, 108), ylabel="Accuracy (%)")
     axes.set_yticks(range(0, 101, 25))
     axes.spines[["top", "right"]].set_visible(False)
-    _legend_above(figure, axes)
+    legend_above(figure, axes)
     figure.savefig(file)
 
 
@@ -102,17 +89,5 @@ def plot_recalls(rows: Iterable[tuple[str, RetrievalResult]], file: Path | IO[by
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color=GRID)
     panels[0].set_ylabel("Queries (%)")
-    _legend_above(figure, panels[0])
+    legend_above(figure, panels[0])
     figure.savefig(file)
-
-
-def _legend_above(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    # Matplotlib would read the text between two dollar signs as a formula.
-    labels = [fill(label.replace("$", r"\$"), LEGEND_WIDTH) for label in labels]
-    columns = 2 if max(map(len, labels)) <= LEGEND_WIDTH / 2 else 1
-    rows = sum(label.count("\n") + 1 for label in labels) / columns
-    figure.set_figheight(figure.get_figheight() + LEGEND_LINE * max(0, rows - LEGEND_ROWS))
-    figure.legend(
-        handles, labels, loc="outside upper left", ncols=columns, fontsize=9, frameon=False
-    )  # fmt: skip

@@ -14,6 +14,8 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.schema.benchmark import PAIRED
+from data.checks.observer import SIMULATES, load_observers
+from data.checks.observer_curve import CEILING_ERROR, ObserverCurve, observer_curves
 from data.frames.frame_cache import FrameReader
 from data.oracle.contacts import collisions_in
 from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_prefix_frames
@@ -46,6 +48,8 @@ class ItemBrowser:
         notes: Sentences that say which items and frames are shown and which are missing.
         comparisons: Paired comparisons of models, by `Measurement.group`.
         baselines: Results of the baselines on the same items, by `Measurement.group`.
+        observers: Curves of the observers on the same items, by `Measurement.item_set`; empty for
+            items that no observer has seen.
     """
 
     entries: list[dict[str, Any]] = field(default_factory=list)
@@ -53,6 +57,7 @@ class ItemBrowser:
     notes: list[str] = field(default_factory=list)
     comparisons: dict[str, list[PairedComparison]] = field(default_factory=dict)
     baselines: dict[str, list[SelectionResult]] = field(default_factory=dict)
+    observers: dict[str, dict[str, ObserverCurve]] = field(default_factory=dict)
 
     def add_group(
         self,
@@ -79,8 +84,9 @@ class ItemBrowser:
         standard = [item for item in answered if item.suite == store.suite]
         if standard:
             self.baselines[name] = baseline_results(standard, store, seed)
+        ceilings = self._add_observers(store, models, items, seed)
         shown = choose_items(answered, by_label, limit, seed)
-        entries = page_entries(shown, by_label, store, name)
+        entries = page_entries(shown, by_label, store, name, ceilings)
         frames, errors = encode_frames(shown, store)
         self.entries += entries
         self.frames |= frames
@@ -91,6 +97,31 @@ class ItemBrowser:
         if errors:
             more = f" ({len(errors) - 1:,} more scenes)" if errors[1:] else ""
             self.notes.append(f"Frames are missing: {errors[0]}{more}.")
+
+    def _add_observers(
+        self,
+        store: Store,
+        models: Mapping[str, Measurement],
+        items: Mapping[str, SelectionItem],
+        seed: int,
+    ) -> Mapping[str, float]:
+        """Add the curves of the observers on the items of the models, if the store has their
+        results. Return the ceiling of each item: the chance of the observer that simulates."""
+        config = store.manifest["config"]
+        if (results := load_observers(store, "test")) is None:
+            if config["simulator"] == "bullet":
+                self.notes.append(
+                    f"No observers have seen {store.name}: run python -m data.statistics "
+                    f"benchmark={config['name']} world={config['world']['name']} observer=true "
+                    "to report accuracies as errors in px."
+                )
+            return {}
+        seen = results[SIMULATES][CEILING_ERROR].to_dict()
+        for m in models.values():
+            own = [items[name] for name in m.responses if name in seen]
+            if len(own) == m.result.n and m.item_set not in self.observers:
+                self.observers[m.item_set] = observer_curves(results, own, seed)
+        return seen
 
 
 def browse_items(
@@ -137,9 +168,14 @@ def choose_items(
 
 
 def page_entries(
-    items: Sequence[SelectionItem], responses: Mapping[str, Responses], store: Store, group: str
+    items: Sequence[SelectionItem],
+    responses: Mapping[str, Responses],
+    store: Store,
+    group: str,
+    ceilings: Mapping[str, float],
 ) -> Iterator[dict[str, Any]]:
-    """Yield the data of each item for the page, with frames by the names in `encode_frames`."""
+    """Yield the data of each item for the page, with frames by the names in `encode_frames`.
+    `ceilings` has the chance of an observer by item id, for the items that it has seen."""
     for item in items:
         yield {
             "id": item.item_id,
@@ -159,7 +195,10 @@ def page_entries(
                 for letter, c in zip(LETTERS, item.candidates, strict=True)
             ],
             "answer": item.letter,
-            "truth": describe_truth(item, store),
+            "truth": [
+                *describe_truth(item, store),
+                *_describe_ceiling(ceilings.get(item.item_id)),
+            ],
             "facts": list_oracle_facts(item, store),
             "responses": [
                 _response_entry(label, r[item.item_id], item, store)
@@ -181,6 +220,14 @@ def describe_truth(item: SelectionItem, store: Store) -> list[str]:
         first, second = (scene.objects[k].noun_phrase for k in collision.objects)
         sentences.append(f"The {first} and the {second} collide at frame {collision.frame}.")
     return sentences
+
+
+def _describe_ceiling(chance: float | None) -> Iterator[str]:
+    if chance is not None:
+        yield (
+            f"An observer who sees the objects with an error of {CEILING_ERROR:g} px and simulates "
+            f"the scene is right in {100 * chance:.0f}% of its draws."
+        )
 
 
 def list_oracle_facts(item: SelectionItem, store: Store) -> list[str]:

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from textwrap import indent
 
+from data.checks.intervals import Interval
 from evaluation.metrics.baselines import TITLES
-from evaluation.metrics.intervals import Interval
 from evaluation.metrics.results import TWIN_ABOVE, RetrievalResult
 from evaluation.reporting.item_browser import ItemBrowser
 from evaluation.reporting.measurements import Measurement, widest_results

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
+from data.checks.observer_curve import plot_observers
 from evaluation.reporting import figures, summary_tables, tables
 from evaluation.reporting.item_browser import ItemBrowser
 from evaluation.reporting.measurements import (
@@ -79,7 +80,7 @@ def build_sections(
         build_transfer(unchanged, transfers, browser),
         build_controls([m for m in selections if m.variants], runs),
         Section("Human study", [_study_table(study) for study in studies]),
-        build_selection_details(unchanged, transfers),
+        build_selection_details(unchanged, transfers, browser),
         build_retrieval_details([m for m in retrievals if m.result.builder is None]),
         build_training([run for run in runs if run.kind in TRAINING_KINDS]),
     ]
@@ -97,7 +98,9 @@ def build_zero_shot(
     for rows in group_by_item_set(selections).values():
         people = [row for study in studies for row in _majority_rows(study, rows[0])]
         baselines = browser.baselines.get(rows[0].group, [])
-        section.tables.append(summary_tables.summary_table("selection", rows, people, baselines))
+        observers = browser.observers.get(rows[0].item_set, {})
+        table = summary_tables.summary_table("selection", rows, people, baselines, observers)
+        section.tables.append(table)
         section.figures.append(_family_figure("zero-shot", rows))
     for rows in group_by_item_set(m for m in retrievals if not m.trained).values():
         section.tables.append(summary_tables.summary_table("retrieval", rows))
@@ -119,9 +122,11 @@ def build_distillation(selections: Results, retrievals: Results, browser: ItemBr
     for rows in group_by_item_set(selections).values():
         if any(m.trained for m in rows):
             baselines = browser.baselines.get(rows[0].group, [])
-            section.tables.append(
-                summary_tables.summary_table("distillation-selection", rows, baselines=baselines)
+            observers = browser.observers.get(rows[0].item_set, {})
+            table = summary_tables.summary_table(
+                "distillation-selection", rows, baselines=baselines, observers=observers
             )
+            section.tables.append(table)
             section.figures.append(_family_figure("families", rows))
             section.tables += _model_differences(rows[0].group, browser)
     for rows in group_by_item_set(retrievals).values():
@@ -157,7 +162,9 @@ def build_transfer(selections: Results, transfers: Container[str], browser: Item
         section.tables.append(table)
     for rows in group_by_item_set(selections).values():
         if rows[0].benchmark in transfers:
-            section.tables.append(summary_tables.summary_table("transfer-selection", rows))
+            observers = browser.observers.get(rows[0].item_set, {})
+            table = summary_tables.summary_table("transfer-selection", rows, observers=observers)
+            section.tables.append(table)
             # The paper's accuracies by family are on CLEVRER.
             section.figures.append(_family_figure("families", rows, with_paper=False))
             section.tables += _model_differences(rows[0].group, browser)
@@ -197,7 +204,9 @@ def _study_table(run: FinishedRun) -> Table:
     return _name_table(tables.human_table(run.report), run.name, title)
 
 
-def build_selection_details(selections: Results, transfers: Container[str]) -> Section:
+def build_selection_details(
+    selections: Results, transfers: Container[str], browser: ItemBrowser
+) -> Section:
     section = Section("Selection in detail")
     for benchmark, rows in group_by_item_set(selections).items():
         if horizons := {m.label: m.result.horizons for m in rows if m.result.horizons}:
@@ -206,6 +215,11 @@ def build_selection_details(selections: Results, transfers: Container[str]) -> S
             section.figures.append(
                 Figure(file_stem(f"horizons-{benchmark}"), caption, plot, horizons)
             )
+        if curves := browser.observers.get(benchmark):
+            plot = partial(plot_observers, models={m.label: m.result.micro for m in rows})
+            caption = f"Accuracy of models and of observers, by their error, on {benchmark}."
+            name = file_stem(f"observer-{benchmark}")
+            section.figures.append(Figure(name, caption, plot, curves))
         details = tables.detail_tables({m.label: (m.result.key, m.run.report) for m in rows})
         section.tables += [_name_table(replace(t, folded=True), benchmark) for t in details]
     return section

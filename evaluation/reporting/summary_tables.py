@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
+from data.checks.observer import SIMULATES
+from data.checks.observer_curve import ObserverCurve
 from evaluation.metrics.results import SIMILARITY, RetrievalResult, SelectionResult
 from evaluation.reporting.measurements import TRANSFER_SUITES, Measurement, shared_names
 from evaluation.reporting.reference import table_with_paper
@@ -38,12 +41,19 @@ BEST = {
 """The columns whose best value is marked, with the function that chooses it."""
 BEST_NOTE = "Bold: the best value of a column among these runs, and among the paper's rows."
 
+OBSERVER = "Observer (px)"
+OBSERVER_NOTE = (
+    f"{OBSERVER}: the error of the observer that simulates the scene and has the same micro "
+    "accuracy on the same items, px at 336 x 336, with the interval of the accuracy."
+)
+
 
 def summary_table(
     name: str,
     rows: Sequence[Measurement],
     people: Sequence[Row] = (),
     baselines: Sequence[SelectionResult] = (),
+    observers: Mapping[str, ObserverCurve] = MappingProxyType({}),
 ) -> Table:
     """Return the results of many runs on the same items, in the groups of the paper's tables.
 
@@ -51,6 +61,7 @@ def summary_table(
         name: Key below `tables` in `reference.yaml`.
         people: Rows of human studies.
         baselines: Results of the baselines on the same items.
+        observers: The curves of the observers on the same items, if they have seen them.
     """
     groups: dict[str, list[Row]] = {label: [] for label in GROUPS}
     if isinstance(rows[0].result, SelectionResult):
@@ -63,6 +74,13 @@ def summary_table(
         for m in rows:
             groups[_group(m)].append(retrieval_row(m.name, m.result))
     baseline_rows = [selection_rows(r.name, r)[0] for r in baselines]
+    if observers:
+        place = columns.index("Micro") + 1
+        columns, notes = [*columns[:place], OBSERVER, *columns[place:]], (*notes, OBSERVER_NOTE)
+        curve = observers[SIMULATES]
+        for row in [*(row for own in groups.values() for row in own), *baseline_rows]:
+            if "Micro" in row:
+                row[OBSERVER] = str(curve.error_of(row["Micro"]))
     groups["baselines, from the oracle"] = [{**row, "ranked": False} for row in baseline_rows]
     groups["people, on the items of their study"] = [*people]
     item_set = rows[0].item_set

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from evaluation.metrics.intervals import Interval
+from data.checks.intervals import Interval
 
 NOTE_WIDTH = 100
 DETAIL = "  "

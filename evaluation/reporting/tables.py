@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from data.checks.intervals import Interval
 from data.records import FAMILIES, LETTERS
 from evaluation.metrics.calibration import Calibration, PositionBias
-from evaluation.metrics.intervals import Interval
 from evaluation.metrics.pairs import PairScores
 from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.results import (

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from data.checks.intervals import SceneBootstrap
 from data.records import LETTERS
-from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.results import (
     Accuracy,
     Agreement,

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import dynapix
+from data.checks import observer
+from data.checks.observer import ERRORS, EXTRAPOLATES, SIMULATES
 from tests.dynapix.models import always_a, nearest
 from tests.evaluation.reporting.measured import run_report
 from tests.user_errors import raises_user_error
@@ -101,6 +104,31 @@ def test_a_retriever_of_counterfactual_frames_ranks_no_factual_twin_above(bench,
     table = (folder / "tables" / "retrieval-micro-counterfactual-queries.md").read_text()
     assert "Twin" in table
     assert "50.0" in table
+
+
+def test_observers_state_accuracies_as_errors(bench, monkeypatch) -> None:
+    """The observers here are right in 3/4 of the draws with an error of 4 px, and less beyond."""
+    names = [item.item_id for item in bench.selection]
+    shares = [1.0, 1.0, 1.0, 1.0, 0.9, 0.75, 0.5, 0.25, 0.25]
+    seen = pd.DataFrame([shares] * len(names), index=names, columns=[0.0, *ERRORS])
+    results = {SIMULATES: seen, EXTRAPOLATES: seen}
+    monkeypatch.setattr(observer, "load_observers", lambda store, split: results)
+    observers = dynapix.observer(bench, error=4)
+    assert observers.ceilings == dict.fromkeys(names, 0.75)
+    assert observers.error_of(0.75).value == pytest.approx(4)
+    perfect = dynapix.evaluate(bench.selection[:9], lambda item: item.answer, progress=False)
+    assert observers.error_of(perfect).value == pytest.approx(1)
+    assert observers.curve.loc[("simulates", 8.0), "accuracy"] == pytest.approx(0.5)
+    assert "75.0% right" in repr(observers)
+    assert "extrapolates" in str(observers)
+    with raises_user_error("unknown-option", contains="16"):
+        dynapix.observer(bench, error=3)
+    with raises_user_error("invalid-setting"):
+        observers.error_of(75)
+    train = dynapix.load(bench.store.folder, split="train")
+    other = dynapix.evaluate(train.selection[:9], lambda item: "A", progress=False)
+    with raises_user_error("different-builds", contains="train"):
+        observers.error_of(other)
 
 
 def test_saved_retrieval_results_are_in_the_report(bench, tmp_path) -> None:

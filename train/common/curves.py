@@ -1,33 +1,15 @@
-"""Plot the curves of a run from its journal.
-
-Figures are built without pyplot, so plotting leaves no global state and needs no display.
-"""
+"""Plot the curves of a run from its journal."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from data.checks.figures import COLORS, DPI, create_figure
 
-DPI = 150
 MANY_PANELS, LOW_DPI = 8, 60
 """A figure with more panels than this has fewer dots per inch."""
-COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
-"""Colors that people with any colour vision can distinguish (Paul Tol's bright set)."""
-
-
-def create_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of width x height inches with the Agg backend."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def plot_curves(records: Sequence[dict[str, float]], path: Path | str) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from conf.schema import RelationBounds
+from data.checks.intervals import SceneBootstrap
 from data.records import LETTERS, SelectionItem
 from data.store import Store
-from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.reasons import ReasonSummary, measure_reasons, read_reasons
 from evaluation.reporting.item_browser import mark_claims
 from evaluation.reporting.run_responses import parse_response

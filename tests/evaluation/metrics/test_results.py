@@ -1,6 +1,6 @@
 import pytest
 
-from evaluation.metrics.intervals import SceneBootstrap
+from data.checks.intervals import SceneBootstrap
 from evaluation.metrics.results import accuracy_by_family
 
 

@@ -10,8 +10,8 @@ from scipy.stats import binomtest, norm, permutation_test
 from statsmodels.stats.multitest import multipletests
 
 from conf.schema.benchmark import MATCHED_ANCHOR
+from data.checks.intervals import SceneBootstrap
 from data.records import FAMILIES, Candidate, SelectionItem
-from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.results import accuracy_by_family, from_json
 from evaluation.metrics.significance import (
     EXACT_SCENES,

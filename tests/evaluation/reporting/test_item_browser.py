@@ -65,7 +65,7 @@ def test_every_shown_frame_is_encoded_as_a_small_image(micro_store, items):
     few = [*items[:6], items[0]]
     frames, errors = item_browser.encode_frames(few, micro_store)
     assert errors == []
-    entries = list(item_browser.page_entries(few, {}, micro_store, "micro"))
+    entries = list(item_browser.page_entries(few, {}, micro_store, "micro", {}))
     names = {n for e in entries for n in (*e["prefix"], *(c["frame"] for c in e["candidates"]))}
     assert names == frames.keys()
     for url in frames.values():
@@ -109,7 +109,7 @@ def test_the_verdict_on_a_response_is_that_of_its_parsed_answer(micro_store, ite
     wrong = next(letter for letter in LETTERS if letter != item.letter)
     response = parse_response(text.format(right=item.letter, wrong=wrong), False)
     [entry] = item_browser.page_entries(
-        [item], {"one": {item.item_id: response}}, micro_store, "micro"
+        [item], {"one": {item.item_id: response}}, micro_store, "micro", {}
     )
     [shown] = entry["responses"]
     assert (shown["model"], shown["verdict"]) == ("one", verdict)

@@ -9,10 +9,13 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from conf.schema import ExportStudyCommand, ReportCommand
 from conf.schema.benchmark import MATCHED_ANCHOR
+from data.checks.observer import ERRORS, EXTRAPOLATES, SIMULATES
+from evaluation.reporting import item_browser
 from tests.evaluation.reporting.measured import (
     finish,
     read_table,
@@ -366,3 +369,22 @@ def test_the_overview_names_the_student_and_shows_responses(report, caplog):
     assert "trained on answers alone" in first
     assert any(line.startswith("emb finds the future frame among the first 10") for line in rest)
     assert sum(line.startswith("Item ") for line in rest) >= 2
+
+
+def test_accuracies_are_reported_as_errors_of_observers(report, micro_store, monkeypatch):
+    """The observers are right in 3/4 of the draws with an error of 4 px, and less beyond it."""
+    without = report(items=3)
+    assert "python -m data.statistics" in (without / "report.html").read_text()
+    assert "Observer" not in read_table(without, "distillation-selection-micro")
+    names = [item.item_id for item in micro_store.selection("test")]
+    shares = [1.0, 1.0, 1.0, 1.0, 0.9, 0.75, 0.5, 0.25, 0.25]
+    seen = pd.DataFrame([shares] * len(names), index=names, columns=[0.0, *ERRORS])
+    results = {SIMULATES: seen, EXTRAPOLATES: seen}
+    monkeypatch.setattr(item_browser, "load_observers", lambda store, split: results)
+    folder = report(items=3)
+    table = read_table(folder, "distillation-selection-micro")
+    [right] = [line for line in table.splitlines() if line.startswith("| cot (reasoning)")]
+    assert "| 1 | 100.0 |" in right
+    assert "observer-micro" in {path.stem for path in (folder / "figures").glob("*.svg")}
+    for item in page_data(folder)["items"]:
+        assert "is right in 100% of its draws" in item["truth"][-1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import re
 
-from evaluation.metrics.intervals import Interval
+from data.checks.intervals import Interval
 from evaluation.reporting.item_browser import ItemBrowser
 from evaluation.reporting.page import render_page
 from evaluation.reporting.sections import Section

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from data.checks.intervals import SceneBootstrap
 from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
-from evaluation.metrics.intervals import SceneBootstrap
 from evaluation.metrics.ranking import query_metrics
 from evaluation.metrics.results import (
     MEASURES,

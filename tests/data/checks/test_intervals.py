@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from evaluation.metrics.intervals import SceneBootstrap
+from data.checks.intervals import SceneBootstrap
 from tests.evaluation.metrics.reference import scene_interval
 
 
