@@ -26,6 +26,7 @@ from data.records import (
 from data.seeded_order import interleave
 from data.store import Store, open_store
 from evaluation.metrics.baselines import baseline_results
+from evaluation.metrics.future_moment import FutureMoment, measure_future_moment
 from evaluation.metrics.reasons import item_predicates, read_reasons
 from evaluation.metrics.results import SelectionResult
 from evaluation.metrics.significance import PairedComparison
@@ -52,6 +53,8 @@ class ItemBrowser:
         notes: Sentences that say which items and frames are shown and which are missing.
         comparisons: Paired comparisons of models, by `Measurement.group`.
         baselines: Results of the baselines on the same items, by `Measurement.group`.
+        future_moment: By `Measurement.group` and label of a model: the shares of its answers that
+            show the true future and the true moment of balanced time items.
     """
 
     entries: list[dict[str, Any]] = field(default_factory=list)
@@ -59,6 +62,7 @@ class ItemBrowser:
     notes: list[str] = field(default_factory=list)
     comparisons: dict[str, list[PairedComparison]] = field(default_factory=dict)
     baselines: dict[str, list[SelectionResult]] = field(default_factory=dict)
+    future_moment: dict[str, dict[str, FutureMoment]] = field(default_factory=dict)
 
     def add_group(
         self,
@@ -85,6 +89,8 @@ class ItemBrowser:
         standard = [item for item in answered if item.suite == store.suite]
         if standard:
             self.baselines[name] = baseline_results(standard, store, seed)
+            letters = {label: {k: a.letters for k, a in r.items()} for label, r in by_label.items()}
+            self.future_moment[name] = measure_future_moment(standard, letters, store.scene, seed)
         shown = choose_items(answered, by_label, limit, seed)
         entries = page_entries(shown, by_label, store, name)
         frames, errors = encode_frames(shown, store)

@@ -79,7 +79,7 @@ def build_sections(
         build_transfer(unchanged, transfers, browser),
         build_controls([m for m in selections if m.variants], runs),
         Section("Human study", [_study_table(study) for study in studies]),
-        build_selection_details(unchanged, transfers),
+        build_selection_details(unchanged, transfers, browser),
         build_retrieval_details([m for m in retrievals if m.result.builder is None]),
         build_training([run for run in runs if run.kind in TRAINING_KINDS]),
     ]
@@ -192,7 +192,9 @@ def _study_table(run: FinishedRun) -> Table:
     return _name_table(tables.human_table(run.report), run.name, title)
 
 
-def build_selection_details(selections: Results, transfers: Container[str]) -> Section:
+def build_selection_details(
+    selections: Results, transfers: Container[str], browser: ItemBrowser
+) -> Section:
     section = Section("Selection in detail")
     for benchmark, rows in group_by_item_set(selections).items():
         if horizons := {m.label: m.result.horizons for m in rows if m.result.horizons}:
@@ -200,6 +202,14 @@ def build_selection_details(selections: Results, transfers: Container[str]) -> S
             caption = f"Accuracy by horizon on {benchmark}."
             section.figures.append(
                 Figure(file_stem(f"horizons-{benchmark}"), caption, plot, horizons)
+            )
+        if split := browser.future_moment.get(benchmark):
+            section.tables += [
+                _name_table(table, benchmark) for table in tables.future_moment_tables(split)
+            ]
+            name, caption = f"future-moment-{benchmark}", f"Future and moment on {benchmark}."
+            section.figures.append(
+                Figure(file_stem(name), caption, figures.plot_future_moment, split)
             )
         details = tables.detail_tables({m.label: (m.result.key, m.run.report) for m in rows})
         section.tables += [_name_table(replace(t, folded=True), benchmark) for t in details]
