@@ -20,6 +20,7 @@ from data.records import LETTERS
 from dynapix.benchmark import Benchmark, Item, refuse_repeated
 from dynapix.saved_runs import saved_run
 from evaluation.metrics.arrays import to_array
+from evaluation.metrics.future_moment import FutureMoment, measure_future_moment
 from evaluation.metrics.results import SIMILARITY, SelectionReport, SelectionResult
 from evaluation.metrics.selection import (
     Choices,
@@ -28,6 +29,7 @@ from evaluation.metrics.selection import (
     credit_choices,
 )
 from evaluation.metrics.significance import PairedComparison, compare_runs
+from evaluation.reporting.run_responses import nearest_candidates
 from models.student.answer_parser import parse_choice
 
 TEXT = "text"
@@ -235,6 +237,18 @@ class Result:
     def accuracy(self) -> SelectionResult:
         """Accuracy by family, macro and micro, with 95% intervals over scenes."""
         return self.report.rows[0]
+
+    @cached_property
+    def future_moment(self) -> FutureMoment | None:
+        """How often the answers to balanced time items show the true future, and the true moment;
+        None without such items."""
+        letters = {
+            o.item_id: nearest_candidates(o.scores).letters if o.scores else o.letter or ""
+            for o in self.outcomes
+        }
+        records, scene_of = [item.record for item in self.items], self.benchmark.store.scene
+        measured = measure_future_moment(records, {self.name: letters}, scene_of, self.seed)
+        return measured.get(self.name)
 
     def compare(self, other: Result) -> Comparison:
         """Compare with another result on the same items, by family, macro, and over all items.

@@ -185,7 +185,8 @@ class BalancedPicker(DistractorPicker):
         moment is right.
         """
         horizon = timing.target - timing.stop
-        least = horizon / (scene.frames - 1 - timing.stop)
+        # The later moment is then in the scene, and the earlier one after the prefix.
+        least = max(horizon / (scene.frames - 1 - timing.stop), 1 / horizon)
         share = self.rng.uniform(least, LARGEST_SHARE)
         excess = self.balance.excess_of("moment")
         lead = horizon * share if excess[0] >= excess[3] else horizon / share

@@ -6,7 +6,8 @@ The suite `tracks` has those that need no contacts; its seconds are as long as t
 ends `gap` frames before the next collision, whose frame is the target. Framing *contact*: the
 prefix ends at the collision, and the target is `gap` frames later.
 
-*time*: the prefix is the first second, and the target is one or two seconds after it.
+*time*: the prefix is the first second, and the target is a quarter of a second to three seconds
+after it.
 
 *window*: the target is a few frames (the horizon) after the prefix. The group is that of the
 events (`window_group`). The window family selects the objects that the item is about, among those
@@ -71,8 +72,13 @@ EVENT_CELLS = {
     "contact_match": ("contact", "same_obj_match", 10),
 }
 """Framing, distractors and gap by subtype (paper, Table "The seven event-anchored subtypes")."""
-TIME_CELLS = {"in_1s": 1, "in_2s": 2}
-"""Seconds between the prefix and the target, by subtype."""
+TIME_CELLS = {
+    "in_250ms": 0.25, "in_500ms": 0.5, "in_1s": 1, "in_1500ms": 1.5, "in_2s": 2, "in_3s": 3,
+}  # fmt: skip
+"""Seconds between the prefix and the target, by subtype. A point in a name would divide the key of
+a setting."""
+MATCHED_SECONDS = (1, 2)
+"""Seconds between the prefix and the target of matched-anchor items."""
 WINDOW_CELLS = {
     f"{group}_{family}_h{horizon}_{difficulty}": (group, family, horizon, difficulty)
     for group, families in WINDOW_FAMILIES.items()
@@ -129,20 +135,23 @@ def event_recipe(subtype: str) -> Recipe:
     return Recipe("event", timings, lambda timing: fields, pools)
 
 
-def time_timings(seconds: int, suite: str, scene: Scene) -> list[Timing]:
+def time_timings(seconds: float, suite: str, scene: Scene) -> list[Timing]:
     """Return the single timing of a scene, whose prefix is the first second. The target is the
-    first frame after the stated seconds. In the suite `tracks`, seconds are the scene's own."""
+    first frame after the stated seconds, rounded down to whole frames: a quarter of a second of 26
+    frames is 6 frames. In the suite `tracks`, seconds are the scene's own."""
     second = round(scene.fps) if suite == "tracks" else SELECTION_SECOND
-    target = second * (1 + seconds)
+    target = second + int(second * seconds)
     return [Timing(0, second - 1, target)] if target < scene.frames else []
 
 
 def time_fields(timing: Timing) -> dict[str, Any]:
     horizon = timing.target - timing.stop
     # The prefix is a second.
-    seconds = horizon // timing.observed
+    subtype, seconds = next(
+        cell for cell in TIME_CELLS.items() if int(timing.observed * cell[1]) == horizon - 1
+    )
     return {
-        "subtype": f"in_{seconds}s",
+        "subtype": subtype,
         "question": TIME_QUESTION.format(spell_seconds(seconds)),
         "distractors": "same_time",
         "horizon": horizon,
@@ -150,7 +159,8 @@ def time_fields(timing: Timing) -> dict[str, Any]:
 
 
 def spell_seconds(count: float) -> str:
-    return {0.5: "half a second", 1: "1 second"}.get(count) or f"{count} seconds"
+    words = {0.25: "a quarter of a second", 0.5: "half a second", 1: "1 second"}
+    return words.get(count) or f"{count} seconds"
 
 
 def frames_after_prefix(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
@@ -212,7 +222,7 @@ def matched_timings(scene: Scene) -> list[Timing]:
     every = [
         Timing(stop - SELECTION_SECOND + 1, stop, target, event=target)
         for target in collision_frames(scene)
-        for seconds in TIME_CELLS.values()
+        for seconds in MATCHED_SECONDS
         if (stop := target - seconds * SELECTION_SECOND - 1) >= SELECTION_SECOND - 1
         and target <= scene.frames - 1 - TAIL
     ]

@@ -49,7 +49,7 @@ EVENTS: dict[str, dict[str, Callable[[Scene], list[int]]]] = {
 is the next collision after the prefix, and A1 is the first contact of a trial."""
 CELLS = {
     "movi_a": {"event": tuple(EVENTS["movi_a"]), "time": ("in_1s",), "window": ()},
-    "physion": {"event": tuple(EVENTS["physion"]), "time": tuple(TIME_CELLS), "window": ()},
+    "physion": {"event": tuple(EVENTS["physion"]), "time": ("in_1s", "in_2s"), "window": ()},
 }
 """The subtypes of each family, by suite."""
 

@@ -136,8 +136,7 @@ def _selection_result(
 ) -> SelectionResult:
     accuracy = accuracy_by_family([i.family for i in items], choices.credits, scenes)
     by_horizon = scenes.group_means(choices.credits, [horizon_of(i) or "" for i in items])
-    # Horizons in frames come first: they are all shorter than one second.
-    ordered = sorted(filter(None, by_horizon), key=lambda h: (h.endswith(" s"), int(h.split()[0])))
+    ordered = sorted(filter(None, by_horizon), key=horizon_order)
     letters, parse_rate = choices.letters, None
     if choices.mode not in (BASELINE, SIMILARITY):
         parse_rate = sum(x is not None for x in letters) / len(letters)
@@ -152,6 +151,11 @@ def horizon_of(item: SelectionItem) -> str | None:
     if item.family == "time":
         return f"{TIME_CELLS[item.subtype]} s"
     return f"{item.horizon} frames" if item.family == "window" else None
+
+
+def horizon_order(horizon: str) -> tuple[bool, float]:
+    """Return the key by which horizons are sorted: those in frames come first."""
+    return horizon.endswith(" s"), float(horizon.split()[0])
 
 
 def count_readings(answers: Sequence[Answer]) -> dict[str, int]:

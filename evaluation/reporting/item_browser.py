@@ -22,6 +22,7 @@ from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_pref
 from data.seeded_order import interleave
 from data.store import Store, open_store
 from evaluation.metrics.baselines import baseline_results
+from evaluation.metrics.future_moment import FutureMoment, measure_future_moment
 from evaluation.metrics.reasons import item_predicates, read_reasons
 from evaluation.metrics.results import SelectionResult
 from evaluation.metrics.significance import PairedComparison
@@ -50,6 +51,8 @@ class ItemBrowser:
         baselines: Results of the baselines on the same items, by `Measurement.group`.
         observers: Curves of the observers on the same items, by `Measurement.item_set`; empty for
             items that no observer has seen.
+        future_moment: By `Measurement.group` and label of a model: the shares of its answers that
+            show the true future and the true moment of balanced time items.
     """
 
     entries: list[dict[str, Any]] = field(default_factory=list)
@@ -58,6 +61,7 @@ class ItemBrowser:
     comparisons: dict[str, list[PairedComparison]] = field(default_factory=dict)
     baselines: dict[str, list[SelectionResult]] = field(default_factory=dict)
     observers: dict[str, dict[str, ObserverCurve]] = field(default_factory=dict)
+    future_moment: dict[str, dict[str, FutureMoment]] = field(default_factory=dict)
 
     def add_group(
         self,
@@ -84,6 +88,8 @@ class ItemBrowser:
         standard = [item for item in answered if item.suite == store.suite]
         if standard:
             self.baselines[name] = baseline_results(standard, store, seed)
+            letters = {label: {k: a.letters for k, a in r.items()} for label, r in by_label.items()}
+            self.future_moment[name] = measure_future_moment(standard, letters, store.scene, seed)
         ceilings = self._add_observers(store, models, items, seed)
         shown = choose_items(answered, by_label, limit, seed)
         entries = page_entries(shown, by_label, store, name, ceilings)

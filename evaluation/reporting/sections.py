@@ -220,6 +220,14 @@ def build_selection_details(
             caption = f"Accuracy of models and of observers, by their error, on {benchmark}."
             name = file_stem(f"observer-{benchmark}")
             section.figures.append(Figure(name, caption, plot, curves))
+        if split := browser.future_moment.get(benchmark):
+            section.tables += [
+                _name_table(table, benchmark) for table in tables.future_moment_tables(split)
+            ]
+            name, caption = f"future-moment-{benchmark}", f"Future and moment on {benchmark}."
+            section.figures.append(
+                Figure(file_stem(name), caption, figures.plot_future_moment, split)
+            )
         details = tables.detail_tables({m.label: (m.result.key, m.run.report) for m in rows})
         section.tables += [_name_table(replace(t, folded=True), benchmark) for t in details]
     return section

@@ -9,6 +9,7 @@ from typing import Any
 from data.checks.intervals import Interval
 from data.records import FAMILIES, LETTERS
 from evaluation.metrics.calibration import Calibration, PositionBias
+from evaluation.metrics.future_moment import BANDS, FutureMoment
 from evaluation.metrics.pairs import PairScores
 from evaluation.metrics.reasons import ReasonSummary
 from evaluation.metrics.results import (
@@ -96,6 +97,49 @@ def detail_tables(reports: Mapping[str, tuple[str, SelectionReport]]) -> list[Ta
         "calibration": calibration_table,
     }  # fmt: skip
     return [*tables, *(make(found) for name, make in makers.items() if (found := details(name)))]
+
+
+def future_moment_tables(models: Mapping[str, FutureMoment]) -> list[Table]:
+    """Return the tables of the accuracy on balanced time items, split into future and moment: over
+    the time from the prefix to the target, and within bands of displacement."""
+    rows, bands = [], []
+    for label, of_model in models.items():
+        every = {label: of_model.total, **{f"{DETAIL}{h}": s for h, s in of_model.horizons.items()}}
+        rows += [
+            {
+                "name": name, "Accuracy": shares.accuracy, "Future": shares.future,
+                "Moment": shares.moment, "Items": shares.accuracy.n,
+            }
+            for name, shares in every.items()
+        ]  # fmt: skip
+        bands.append({"name": label})
+        for band in BANDS:
+            future, moment = of_model.future_bands.get(band), of_model.moment_bands.get(band)
+            counts = {
+                "Items by future": future and future.n,
+                "Items by moment": moment and moment.n,
+            }
+            bands.append({"name": f"{DETAIL}{band}", "Future": future, "Moment": moment, **counts})
+    note = (
+        f"{SELECTION_NOTE} Future: answers that show the true future, at the right moment or a "
+        "wrong one; moment: answers that show the right moment, of the true future or another one. "
+        "Chance is 50% for each, and 25% for the accuracy."
+    )
+    by_band = (
+        f"{note} The displacement, px at 336 x 336, is for the future that between both futures at "
+        "the right moment, and for the moment that between both moments of the true future."
+    )
+    columns = ["Future", "Items by future", "Moment", "Items by moment"]
+    return [
+        Table(
+            "future-moment", "Balanced time items: future and moment (%)",
+            ["Accuracy", "Future", "Moment", "Items"], {"": rows}, (note,),
+        ),
+        Table(
+            "future-moment-bands", "Balanced time items: future and moment by displacement (%)",
+            columns, {"": bands}, (by_band,), folded=True,
+        ),
+    ]  # fmt: skip
 
 
 def rows_by_label(values: Mapping[str, Mapping[str, Any]]) -> list[Row]:

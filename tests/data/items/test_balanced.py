@@ -11,12 +11,20 @@ import numpy as np
 import pytest
 
 from conf.compose import compose
-from conf.schema import BenchmarkConfig, BuildCommand, Quota, RetrievalTrackConfig, SelectionConfig
+from conf.schema import (
+    BenchmarkConfig,
+    BuildCommand,
+    Quota,
+    RetrievalTrackConfig,
+    SelectionConfig,
+    WorldConfig,
+)
 from data.build import ensure_items
 from data.checks.counts import summarize_store
 from data.items import balanced as balanced_items
 from data.items.balanced_subset import choose_items
-from data.items.pickers import shuffle_candidates
+from data.items.pickers import CellInputs, shuffle_candidates
+from data.items.recipes import TIME_CELLS, time_timings
 from data.items.scores import compare_item, order_target_first
 from data.oracle.displacement import cross_scene_displacement
 from data.parallel import Workers
@@ -25,6 +33,7 @@ from data.sim.parts import world_boxes
 from data.sim.shapes import RADIUS, rotation_matrix
 from data.store import Store
 from teacher.predicates.extraction import extract_predicates
+from tests.teacher import synthetic
 from train.student.dataset import uses_only
 
 QUOTAS = {"future_match_gap10": 2, "future_cross_gap10": 2, "contact_offset": 2}
@@ -137,6 +146,22 @@ def test_only_the_target_shows_the_scene_at_its_moment(
             assert len({c.scene_id for c in item.candidates}) == 2
         else:
             assert set(frames) == {item.target_frame}
+
+
+@pytest.mark.parametrize(("subtype", "seconds"), TIME_CELLS.items())
+def test_wrong_moments_follow_the_prefix(subtype: str, seconds: float) -> None:
+    scene = synthetic.scene([(0.0, -2.0)], [(0.0, 0.8)])
+    [timing] = time_timings(seconds, "dynapix", scene)
+    rng = np.random.default_rng(0)
+    cell = CellInputs({}, lambda _: scene, Quota(), 0, 0.1)
+    picker = balanced_items.BalancedPicker(cell, "test", rng, world=WorldConfig(), folder=Path())
+    found = set()
+    for _ in range(200):
+        # Each item counts for one of the sides.
+        picker.balance.counts_of("moment")[:] = rng.uniform(-1, 1, 4)
+        found.update(picker._wrong_moment(scene, timing, (0,)))
+    assert timing.stop < min(found) < timing.target < max(found) < scene.frames
+    assert timing.target not in found
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pytest
 from data.frames.frame_cache import FrameReader
 from data.items.database import UniqueFrames, counterfactual_database
 from data.items.pickers import Timing, visible_objects
-from data.items.recipes import window_subjects
+from data.items.recipes import TIME_QUESTION, window_subjects
 from data.oracle.contacts import collisions_in, next_collision
 from data.oracle.displacement import (
     cross_scene_displacement,
@@ -119,11 +119,16 @@ def test_event_distractors_match_their_source(benchmark_store, items, min_displa
 
 
 def test_time_items_count_26_frames_per_second(items) -> None:
+    cells = {
+        "in_250ms": (32, "a quarter of a second"), "in_500ms": (39, "half a second"),
+        "in_1s": (52, "1 second"), "in_1500ms": (65, "1.5 seconds"), "in_2s": (78, "2 seconds"),
+        "in_3s": (104, "3 seconds"),
+    }  # fmt: skip
     for item in (i for i in items if i.family == "time"):
-        seconds = {"in_1s": 1, "in_2s": 2}[item.subtype]
+        target, words = cells[item.subtype]
         assert (item.prefix_start, item.prefix_stop) == (0, 25)
-        assert item.target_frame == 26 + 26 * seconds
-        assert f"{seconds} second" in item.question
+        assert (item.target_frame, item.horizon) == (target, target - 25)
+        assert item.question == TIME_QUESTION.format(words)
 
 
 def test_window_items_match_their_group_and_horizon(benchmark_store, items) -> None:

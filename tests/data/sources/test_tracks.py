@@ -17,7 +17,12 @@ from data.build import build, ensure_benchmark
 from data.checks.baselines import constant_velocity_error
 from data.frames.frame_cache import FrameReader
 from data.items.queries import BUILDERS
-from data.items.recipes import CELLS_WITHOUT_CONTACTS
+from data.items.recipes import (
+    CELLS_WITHOUT_CONTACTS,
+    TIME_CELLS,
+    TIME_QUESTION,
+    spell_seconds,
+)
 from data.parallel import Workers
 from data.sources import tracks
 from data.sources.scenes import make_scenes
@@ -295,13 +300,13 @@ def interrupt(*_: object) -> None:
 def test_time_items_count_the_seconds_of_their_video(store: Store) -> None:
     items = [i for i in store.selection() if i.family == "time"]
     assert {(store.scene(i.scene_id).fps, i.subtype) for i in items} == {
-        (fps, subtype) for fps in (10, 30) for subtype in ("in_1s", "in_2s")
+        (fps, subtype) for fps in (10, 30) for subtype in TIME_CELLS
     }
     for item in items:
-        second, ahead = int(store.scene(item.scene_id).fps), int(item.subtype[3])
+        second, ahead = int(store.scene(item.scene_id).fps), TIME_CELLS[item.subtype]
         assert (item.prefix_start, item.prefix_stop) == (0, second - 1)
-        assert item.target_frame == second * (1 + ahead)
-        assert f"{ahead} second" in item.question
+        assert item.target_frame == second + int(second * ahead)
+        assert item.question == TIME_QUESTION.format(spell_seconds(ahead))
         assert item.suite == "tracks"
         assert all(c.frame > item.prefix_stop for c in item.candidates)
 
