@@ -6,7 +6,7 @@ from collections import Counter
 
 from conf.schema import BenchmarkConfig
 from data.items.cells import builder_name, cell_quotas
-from data.records import MATCHED_ANCHOR, SPLITS, FrameRef, RetrievalQuery, SelectionItem
+from data.records import CONTACT, MATCHED_ANCHOR, SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import Store
 
 
@@ -66,4 +66,8 @@ def summarize_store(store: Store) -> str:
             "  to fill them, raise benchmark.scenes, or lower their quotas or "
             "benchmark.selection.min_displacement"
         )
+        if store.manifest["config"]["distractors"] == CONTACT:
+            lines[-1] += (
+                "; in scenes without a collision after a prefix, raise benchmark.world.start.speed"
+            )
     return "\n".join(lines)

@@ -11,7 +11,7 @@ import numpy as np
 from conf.schema import RelationBounds
 from data.oracle.contacts import collisions_in
 from data.oracle.displacement import MODEL_SIZE
-from data.records import LETTERS, Candidate, Scene, SelectionItem
+from data.records import CONTACT, LETTERS, Candidate, Scene, SelectionItem
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
@@ -122,6 +122,8 @@ def extract_predicates(
 
 def name_moment(item: SelectionItem) -> str:
     """Return an item's target in words. The events of some subtypes are no collisions."""
+    if item.distractors == CONTACT:
+        return "after the collision"
     if item.framing == "future" and item.subtype in EVENT_MOMENTS:
         return EVENT_MOMENTS[item.subtype]
     return {"future": "at the collision", "contact": "just after the collision"}.get(
