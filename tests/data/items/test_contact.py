@@ -37,7 +37,6 @@ from data.parallel import Workers
 from data.records import CONTACT, GHOST, Scene, SelectionItem
 from data.sim.physics import Branch, Motion, shared_simulator
 from data.store import Store
-from teacher.predicates.extraction import extract_predicates
 from tests.data.simulated import preset_world, simulate_scene
 
 WORLD = preset_world("above_masses")
@@ -281,20 +280,6 @@ def test_statistics_report_horizons_on_both_splits(
     text = format_statistics(found)
     assert max(map(len, text.splitlines())) <= 100
     assert "both splits" in text
-
-
-@pytest.mark.slow
-def test_rationales_are_about_the_collision(store: Store, items: list[SelectionItem]) -> None:
-    for item in items:
-        own = store.scene(item.scene_id)
-        facts = extract_predicates(item, own, store.scene)
-        assert facts.moment == "after the collision"
-        pair = tuple(
-            own.objects[k].noun_phrase for k in next_collision(own, item.prefix_stop).objects
-        )
-        assert facts.contacts[0].objects == pair
-        courses = [meeting.objects for meeting in facts.courses]
-        assert pair not in courses[1:]
 
 
 # Settings.
