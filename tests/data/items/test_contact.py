@@ -45,9 +45,9 @@ QUOTA = Quota(4, 8)
 
 def settings(folder_name: str, **changes) -> BenchmarkConfig:
     cfg = compose("data.build", BuildCommand, ["benchmark=tiny_contact"]).benchmark
-    cfg.name, cfg.scenes, cfg.test_share = folder_name, 60, 0.7
+    cfg.name, cfg.scenes, cfg.test_share = folder_name, 48, 0.7
     cells = dict.fromkeys(("collision_gap16", "collision_gap26"), QUOTA)
-    cfg.selection = replace(cfg.selection, event=cells)
+    cfg.selection = SelectionConfig(event=cells)
     return replace(cfg, **changes)
 
 
