@@ -184,8 +184,9 @@ def empty_benchmark(
     ):
         return UserError(
             f"no scene of the benchmark {cfg.name} has a collision with a prefix of "
-            f"{contact.OBSERVED} frames before it: raise benchmark.world.start.speed or "
-            f"benchmark.world.objects.min_count of world={cfg.world.name}, so that objects meet",
+            f"{contact.OBSERVED} frames before it: raise benchmark.world.start.distance of world="
+            f"{cfg.world.name} if objects meet earlier, or benchmark.world.start.speed if they do "
+            "not meet",
             code="no-collisions",
         )
     reasons = "".join(f" ({count} {what})" for what, count in left_out.items() if count)

@@ -68,6 +68,7 @@ def summarize_store(store: Store) -> str:
         )
         if store.manifest["config"]["distractors"] == CONTACT:
             lines[-1] += (
-                "; in scenes without a collision after a prefix, raise benchmark.world.start.speed"
+                "; if many scenes have no collision after a prefix, raise "
+                "benchmark.world.start.distance or start.speed"
             )
     return "\n".join(lines)

@@ -13,7 +13,7 @@ import pytest
 from conf.compose import compose
 from conf.errors import UserError
 from conf.schema import BenchmarkConfig, BuildCommand, Quota, RetrievalTrackConfig, SelectionConfig
-from data.build import check_quota_names, ensure_items
+from data.build import check_quota_names, empty_benchmark, ensure_items
 from data.checks.counts import summarize_store
 from data.checks.statistics import compute_statistics, format_statistics
 from data.items.contact import (
@@ -285,14 +285,11 @@ def test_statistics_report_horizons_on_both_splits(
 # Settings.
 
 
-@pytest.mark.slow
-def test_world_without_collisions_is_named(tmp_path: Path) -> None:
-    cfg = settings("still", scenes=6)
-    cfg.world.start.speed = [0.01, 0.02]
-    with pytest.raises(UserError) as caught:
-        ensure_items(cfg, tmp_path, Workers(1))
-    assert caught.value.code == "no-collisions"
-    assert "benchmark.world.start.speed" in str(caught.value)
+def test_world_whose_collisions_come_too_early_is_named(scene: Scene) -> None:
+    early = replace(scene, collisions=(replace(scene.collisions[0], frame=OBSERVED - 1),))
+    error = empty_benchmark(settings("early"), {"train": ["s"], "test": []}, lambda _: early, {})
+    assert error.code == "no-collisions"
+    assert "benchmark.world.start.distance" in str(error)
 
 
 @pytest.mark.slow
@@ -306,7 +303,7 @@ def test_reasons_of_dropped_items_are_counted(tmp_path: Path) -> None:
     assert store.manifest["counts"]["items dropped, outcomes too alike/event"] > 0
     summary = summarize_store(store)
     assert "short: event/collision_gap10/test has 0 of 8" in summary
-    assert "benchmark.world.start.speed" in summary.splitlines()[-1]
+    assert "benchmark.world.start.distance" in summary.splitlines()[-1]
 
 
 @pytest.mark.parametrize(
