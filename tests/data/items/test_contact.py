@@ -331,3 +331,10 @@ def test_small_preset_is_a_fifth_of_the_full_one() -> None:
         ]
         assert totals[0] == 5 * totals[1]
     assert small.world == full.world
+
+
+def test_laptop_preset_has_large_displacements_and_horizons() -> None:
+    cfg = compose("data.build", BuildCommand, ["benchmark=tiny_contact"]).benchmark
+    assert cfg.world == WORLD
+    assert cfg.selection.min_displacement >= 24
+    assert cfg.selection.event.keys() == {"collision_gap16", "collision_gap26"}
