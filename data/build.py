@@ -19,13 +19,14 @@ from conf.runs import compare_settings, flatten, lock_file
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.checks.counts import count_records, summarize_store
 from data.frames.prerender import FRAMES_RECORD, prerender_frames
+from data.items import contact
 from data.items.cells import family_quotas, list_subtypes, load_cached, make_items_and_queries
 from data.items.database import make_databases
 from data.items.intervention_pairs import CHANGES
 from data.items.queries import BUILDERS
 from data.oracle.displacement import visible_positions
 from data.parallel import Workers
-from data.records import COUNTERFACTUAL, SPLITS, Scene, SelectionItem
+from data.records import CONTACT, COUNTERFACTUAL, SPLITS, Scene, SelectionItem
 from data.render.blender import check_blender
 from data.sources.scenes import make_scenes
 from data.store import (
@@ -177,6 +178,18 @@ def empty_benchmark(
             "or benchmark.world.parts, which may hide the objects",
             code="impossible-world",
         )
+    if cfg.distractors == CONTACT and not any(
+        contact.collision_timings(gap, scene_of(name))
+        for gap in contact.CELLS.values()
+        for name in names
+    ):
+        return UserError(
+            f"no scene of the benchmark {cfg.name} has a collision with a prefix of "
+            f"{contact.OBSERVED} frames before it: raise benchmark.world.start.distance of world="
+            f"{cfg.world.name} if objects meet earlier, or benchmark.world.start.speed if they do "
+            "not meet",
+            code="no-collisions",
+        )
     reasons = "".join(f" ({count} {what})" for what, count in left_out.items() if count)
     return UserError(
         f"benchmark {cfg.name} would contain no item and no query{reasons}: raise "
@@ -208,12 +221,14 @@ def check_quota_names(cfg: BenchmarkConfig) -> None:
     for key, (settings, options) in named.items():
         if settings and not options:
             problems.append(
-                f"benchmark.{key}: suite {cfg.suite} lacks this family; remove its quotas"
+                f"benchmark.{key}: suite {cfg.suite} with benchmark.distractors={cfg.distractors} "
+                "lacks this family; remove its quotas"
             )
             continue
         problems += [
             f"benchmark.{key}.{name}: unknown name; did you mean "
-            f"{nearest_key(name, options) or options[0]}? The names are {', '.join(options)}"
+            f"{nearest_key(name, options) or options[0]}? With benchmark.distractors="
+            f"{cfg.distractors}, the names are {', '.join(options)}"
             for name in settings
             if name not in options
         ]

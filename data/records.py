@@ -182,8 +182,8 @@ class FrameRef:
 @dataclass(frozen=True)
 class Candidate(FrameRef):
     """One of an item's four frames. `source` is `target` or the kind of distractor: same_offset,
-    same_obj_match, same_time, same_near, same_far, cross_scene, alternative, ghost, mass, bounce,
-    aim, actual or intervention."""
+    same_obj_match, same_time, same_near, same_far, cross_scene or alternative; of a contact item,
+    mass, bounce, aim or ghost; of a pair about an intervention, actual or intervention."""
 
     source: str = "target"
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from conf.errors import UserError
-from conf.schema import RelationBounds
+from conf.schema import TeacherConfig
 from dynapix.benchmark import Item
 from teacher.numbers.detection import find_numbers
-from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates
 from teacher.reading.claims import VERDICTS, Claim
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
+from teacher.vocabulary import describe_item
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,7 @@ def sufficiency(item: Item, text: str) -> float:
 
 def _extract_predicates(item: Item) -> RelationalPredicates:
     store = item._benchmark.store
-    predicates = extract_predicates(
-        item.record, store.scene(item.scene_id), store.scene, RelationBounds()
-    )
+    predicates = describe_item(item.record, store, TeacherConfig())
     if predicates is None:
         raise UserError(
             f"{item.item_id} has no predicates: its prefix is too short",

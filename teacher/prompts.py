@@ -71,6 +71,8 @@ def format_facts(predicates: Predicates) -> dict[str, Any]:
         # Empty lists would say that there are none.
         for unknown in ("courses", "contacts", "close"):
             del facts[unknown]
+    if heavier := facts.pop("heavier"):
+        facts["weights"] = [f"{one}: heavier than {other}" for one, other in heavier]
     if not is_relational:
         return facts
     decision = choose_statements(predicates)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from data.records import SelectionItem
+from data.oracle.contacts import next_collision
+from data.records import CONTACT, SelectionItem
 from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import Predicates, RelationalPredicates
 
@@ -28,7 +30,18 @@ def describe_item(
     """Return all predicates of an item; None if its prefix is too short."""
     # The scene of the target is the one whose future the item asks for.
     scene = store.scene(item.target.scene_id)
-    return extract_predicates(item, scene, store.scene, cfg.bounds)
+    predicates = extract_predicates(item, scene, store.scene, cfg.bounds)
+    if predicates is None or item.distractors != CONTACT:
+        return predicates
+    masses = store.manifest["config"]["world"]["objects"]["mass"]
+    light, heavy = sorted(
+        (masses[scene.objects[k].material] * scene.object_scales[k] ** 3, k)
+        for k in next_collision(scene, item.prefix_stop).objects
+    )
+    if heavy[0] == light[0]:
+        return predicates
+    names = tuple(scene.objects[k].noun_phrase for _, k in (heavy, light))
+    return replace(predicates, heavier=(names,))
 
 
 def choose_vocabulary(predicates: RelationalPredicates, cfg: TeacherConfig) -> Predicates:

@@ -7,7 +7,7 @@ from collections import Counter
 from conf.schema import BenchmarkConfig
 from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR, PAIRED
 from data.items.cells import builder_name, cell_quotas
-from data.records import SPLITS, FrameRef, RetrievalQuery, SelectionItem
+from data.records import CONTACT, SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from data.store import Store
 
 
@@ -70,4 +70,9 @@ def summarize_store(store: Store) -> str:
             "  to fill them, raise benchmark.scenes, or lower their quotas or "
             "benchmark.selection.min_displacement"
         )
+        if store.manifest["config"]["distractors"] == CONTACT:
+            lines[-1] += (
+                "; if many scenes have no collision after a prefix, raise "
+                "benchmark.world.start.distance or start.speed"
+            )
     return "\n".join(lines)

@@ -8,15 +8,19 @@ training split, for each family.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from data.items.contact import has_ghost
 from data.items.scores import compare_candidates, order_target_first, rank_shares
 from data.records import SelectionItem
+from data.seeded_order import named_rng
 
 PENALTY = 1e-2
 """Weight of the squared coefficients in the loss of the logistic model."""
+FOLDS = 10
+"""Number of parts of the scenes in a cross-validation."""
 
 
 def score_simple_strategies(
@@ -78,4 +82,21 @@ def score_logistic_model(
         if train.any():
             weights = fit_logistic(features[train], answers[train])
             right[test] = (features[test] @ weights).argmax(axis=-1) == answers[test]
+    return right
+
+
+def cross_validate_logistic_model(
+    items: Sequence[SelectionItem], scores: np.ndarray, answers: np.ndarray
+) -> np.ndarray:
+    """Return for each item whether the logistic model of its family is right, (N,), when it is
+    trained on the items of the scenes of the other folds, of both splits."""
+    scenes = sorted({item.scene_id for item in items})
+    order = named_rng(0, "folds").permutation(len(scenes))
+    fold = {scenes[k]: position % FOLDS for position, k in enumerate(order)}
+    right = np.full(len(items), np.nan)
+    for held_out in range(FOLDS):
+        splits = ["test" if fold[item.scene_id] == held_out else "train" for item in items]
+        parted = [replace(i, split=split) for i, split in zip(items, splits, strict=True)]
+        tested = score_logistic_model(parted, scores, answers)
+        right = np.where(np.isnan(tested), right, tested)
     return right

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from data.checks.baselines import score_scene_alone, score_velocity
 from data.checks.shortcuts import (
+    cross_validate_logistic_model,
     score_logistic_model,
     score_not_the_ghost,
     score_simple_strategies,
@@ -32,17 +33,17 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
 
     Returns:
         ``scenes``: distributions of objects, collisions and event frames. ``answers``: items by
-        letter. ``cells``: items by family, subtype and split. ``candidates``: median displacements,
-        and items by number of distractors earlier than the target, by category. ``shortcuts``:
-        accuracies on the test split of the strategies of `data.checks.shortcuts` and of the
-        baseline `velocity`, by category. ``retrieval``: measures of a ranker that only recognises
-        the scene, on the standard test. ``shortfalls``: cells with fewer records than their quotas.
-        A category is a family, a kind of distractors in the event family, or a difficulty in the
-        window family.
+        letter. ``cells``: items by family, subtype and split; contact items also by the kinds of
+        their distractors. ``candidates``: median displacements, and items by number of distractors
+        earlier than the target, by category. ``shortcuts``: accuracies on the test split of the
+        strategies of `data.checks.shortcuts` and of the baseline `velocity`, by category.
+        ``shortcuts, both splits``: the same over all contact items. ``retrieval``: measures of a
+        ranker that only recognises the scene, on the standard test. ``shortfalls``: cells with
+        fewer records than their quotas. A category is a family, a kind of distractors in the event
+        family (of contact items: a subtype), or a difficulty in the window family.
     """
     items, config = store.selection(), store.manifest["config"]
     queries = store.standard_test()
-    cells = [f"{item.family}/{item.subtype}" for item in items]
     progress = tqdm(items, desc="comparing candidates", unit="item")
     compared = [compare_item(item, store.scene, config) for item in progress]
     rows = pd.DataFrame([_describe_item(*each) for each in zip(items, compared, strict=True)])
@@ -52,30 +53,44 @@ def compute_statistics(store: Store, blind: bool = False) -> dict[str, Any]:
     for count in range(4):
         candidates[f"{count} earlier"] = earlier.get(count, pd.Series(dtype=int))
     scores = np.stack([each.item_scores() for each in compared])
-    shortcuts = measure_shortcuts(items, scores, store, blind)
+    tables = {"shortcuts": measure_shortcuts(items, scores, store, blind)}
+    if has_contact_items(items):
+        tables["shortcuts, both splits"] = measure_shortcuts(items, scores, store, both=True)
     return {
         "scenes": describe_scenes(store),
         "answers": rows["letter"].value_counts().reindex(list(LETTERS), fill_value=0).to_dict(),
-        "cells": pd.crosstab(cells, [item.split for item in items]).to_dict("index"),
+        "cells": count_cells(items).to_dict("index"),
         "candidates": candidates.fillna(0).to_dict("index"),
-        "shortcuts": shortcuts.astype(object).where(shortcuts.notna(), None).to_dict("index"),
+        **{
+            name: table.astype(object).where(table.notna(), None).to_dict("index")
+            for name, table in tables.items()
+        },
         "retrieval": score_scene_alone(queries, store.database()) if queries else {},
         "shortfalls": store.manifest["shortfalls"],
     }
 
 
 def measure_shortcuts(
-    items: list[SelectionItem], scores: np.ndarray, store: Store, blind: bool
+    items: list[SelectionItem],
+    scores: np.ndarray,
+    store: Store,
+    blind: bool = False,
+    both: bool = False,
 ) -> pd.DataFrame:
     """Return the accuracy of each shortcut on the items of the test split, by category, given the
-    scores (N, S, 4) of the items' candidates."""
+    scores (N, S, 4) of the items' candidates.
+
+    Args:
+        both: Whether to take the items of both splits. The logistic model is then cross-validated.
+    """
     answers = np.array([item.answer for item in items])
-    is_contact = any(item.distractors == CONTACT for item in items)
+    is_contact = has_contact_items(items)
     names = (*SCORES, *COLLISION_SCORES) if is_contact else SCORES
     right = pd.DataFrame(score_simple_strategies(names, scores, answers))
     if is_contact:
         right["not the ghost"] = score_not_the_ghost(items)
-    right[LOGISTIC] = score_logistic_model(items, scores, answers)
+    score_logistic = cross_validate_logistic_model if both else score_logistic_model
+    right[LOGISTIC] = score_logistic(items, scores, answers)
     right[VELOCITY] = [score_velocity(item, store) for item in items]
     if blind:
         from data.checks.blind_models import score_blind_models
@@ -83,9 +98,25 @@ def measure_shortcuts(
         right = right.assign(**score_blind_models(items, store, store.manifest["seed"]))
     names = list(right)
     right["category"] = [list(list_categories(item)) for item in items]
-    test = right[[item.split == "test" for item in items]]
-    categories = test.explode("category").groupby("category")
+    counted = right[[both or item.split == "test" for item in items]]
+    categories = counted.explode("category").groupby("category")
     return categories[names].mean().assign(items=categories.size())
+
+
+def count_cells(items: list[SelectionItem]) -> pd.DataFrame:
+    """Count items by cell and split; of contact items, also those with each kind of distractor."""
+    cells = [f"{item.family}/{item.subtype}" for item in items]
+    counts = pd.crosstab(cells, [item.split for item in items])
+    if has_contact_items(items):
+        kinds = pd.Series([{c.source for c in item.candidates} for item in items]).explode()
+        present = pd.crosstab(np.array(cells)[kinds.index], kinds.to_numpy())
+        counts = counts.join(present.drop(columns="target"))
+    return counts
+
+
+def has_contact_items(items: list[SelectionItem]) -> bool:
+    """Return whether any items have other outcomes of a collision as distractors."""
+    return any(item.distractors == CONTACT for item in items)
 
 
 def describe_scenes(store: Store) -> dict[str, Any]:
@@ -121,7 +152,7 @@ def list_categories(item: SelectionItem) -> Iterator[str]:
     """Yield the categories of an item; see `compute_statistics`."""
     yield item.family
     if item.family == "event":
-        yield f"event, {item.distractors}"
+        yield item.subtype if item.distractors == CONTACT else f"event, {item.distractors}"
     if item.difficulty is not None:
         yield f"window, {item.difficulty}"
 
@@ -131,8 +162,6 @@ def format_statistics(statistics: dict[str, Any]) -> str:
     scenes = statistics["scenes"]
     candidates = pd.DataFrame(statistics["candidates"]).T.round().astype(int)
     cells = pd.DataFrame(statistics["cells"]).T
-    shortcuts = pd.DataFrame(statistics["shortcuts"]).filter(regex="^(?!event, )").astype(float)
-    shortcuts.loc[shortcuts.index != "items"] *= 100
     sections = [
         f"Objects per scene:    {_join(scenes['objects'])}\n"
         f"Collisions per scene: {_join(scenes['collisions'])} "
@@ -141,12 +170,19 @@ def format_statistics(statistics: dict[str, Any]) -> str:
         "(minimum, quartiles, maximum)\n"
         f"Answers:              {_join(statistics['answers'])}",
         "Accuracy on the test split, %; only velocity predicts, given the moment and velocities\n"
-        + shortcuts.to_string(float_format="{:.1f}".format, na_rep="-"),
+        + _format_shortcuts(statistics["shortcuts"]),
         "Candidates: median displacement in px from the target to the nearest distractor and\n"
         "between any two candidates; items by number of distractors earlier than the target\n"
         + candidates.to_string(),
-        "Items\n" + cells.to_string(),
+        "Items (contact items: also by kinds of distractors)\n" + cells.to_string(),
     ]
+    if both := statistics.get("shortcuts, both splits"):
+        sections.insert(
+            2,
+            "Accuracy on both splits, %, with a standard error of 43 / sqrt(items); the logistic\n"
+            "model is trained on the scenes of the other folds of a cross-validation\n"
+            + _format_shortcuts(both),
+        )
     if retrieval := statistics["retrieval"]:
         measures = "  ".join(f"{name} {value:.3g}" for name, value in retrieval.items())
         sections.append(f"Standard test, a ranker that only recognises the scene\n{measures}")
@@ -155,6 +191,12 @@ def format_statistics(statistics: dict[str, Any]) -> str:
             "Short of their quotas\n" + "\n".join(f"{k}: {n}" for k, n in shortfalls.items())
         )
     return "\n\n".join(sections)
+
+
+def _format_shortcuts(shortcuts: dict[str, dict[str, float]]) -> str:
+    table = pd.DataFrame(shortcuts).filter(regex="^(?!event, )").astype(float)
+    table.loc[table.index != "items"] *= 100
+    return table.to_string(float_format="{:.1f}".format, na_rep="-")
 
 
 def _join(counts: dict[str, int]) -> str:

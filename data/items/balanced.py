@@ -78,7 +78,7 @@ class BalancedPicker(DistractorPicker):
         for _ in range(TRIES if recipe.family == "time" else 1):
             if item := self._try_item(recipe, scene, timing, groups):
                 return item
-        self.dropped += 1
+        self.dropped["no suitable distractors"] += 1
         return None
 
     def _try_item(

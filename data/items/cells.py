@@ -92,8 +92,8 @@ def make_items_and_queries(
             made = [SelectionItem.from_row(row) for row in part["rows"]]
             items += made
             scores |= zip((i.item_id for i in made), part.get("scores", []), strict=False)
-            reason = "no suitable distractors" if is_balanced(cfg) else "too alike"
-            dropped[f"items dropped, {reason}/{name.partition('/')[0]}"] += part["dropped"]
+            for reason, count in part["dropped"].items():
+                dropped[f"items dropped, {reason}/{name.partition('/')[0]}"] += count
     if is_balanced(cfg):
         items = _choose_balanced(cfg, items, scores)
     return items, queries, dict(dropped)

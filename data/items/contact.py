@@ -67,6 +67,8 @@ STRAY = 1 / 3
 simulation from the end of the prefix."""
 TRUE = TARGET + 1
 """Index of the simulated true outcome among the frames from which candidates are chosen."""
+NO_COLLISION = "no collision after a prefix"
+"""Why there is no item in a scene without timings."""
 APART = 0.95
 """Minimum distance of the objects of a ghost, as a share of the sum of their radii."""
 
@@ -78,7 +80,8 @@ def make_contact_recipe(subtype: str) -> Recipe:
         "subtype": subtype, "question": EVENT_QUESTION, "framing": "future", "distractors": CONTACT,
         "gap": LEAD + gap,
     }  # fmt: skip
-    return Recipe("event", partial(collision_timings, gap), lambda timing: fields, lambda *_: [])
+    timings = partial(collision_timings, gap)
+    return Recipe("event", timings, lambda timing: fields, lambda *_: [], lacks=NO_COLLISION)
 
 
 def collision_timings(gap: int, scene: Scene) -> list[Timing]:
@@ -110,14 +113,16 @@ class ContactPicker(BalancedPicker):
         self._tries[scene.scene_id] += 1
         if self._tries[scene.scene_id] > TRIES:
             return None
-        item = self._make_from_outcomes(recipe, scene, timing, about)
-        self.dropped += item is None
-        return item
+        made = self._make_from_outcomes(recipe, scene, timing, about)
+        if isinstance(made, SelectionItem):
+            return made
+        self.dropped[made] += 1
+        return None
 
     def _make_from_outcomes(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
-    ) -> SelectionItem | None:
-        """Make an item from new outcomes, or return None if no choice of them is suitable."""
+    ) -> SelectionItem | str:
+        """Make an item from new outcomes, or return why no choice of them is suitable."""
         stop, target, least = timing.stop, timing.target, self.cell.min_displacement
         pair = next_collision(scene, stop).objects
         sources, branches = zip(*sample_outcomes(scene, stop, pair, self.rng), strict=True)
@@ -125,7 +130,7 @@ class ContactPicker(BalancedPicker):
         frames = outcome_frames(scene, timing, motions, self.world)
         displacement = frame_displacements(frames, about)
         if displacement[TARGET, TRUE] > STRAY * least:
-            return None
+            return "target cannot be simulated again"
         suitable = [
             TRUE + k
             for k, (source, motion) in enumerate(zip(sources, motions, strict=True))
@@ -139,12 +144,12 @@ class ContactPicker(BalancedPicker):
         ]
         choices = distinct_choices(np.array(choices, int).reshape(-1, 4), displacement, least)
         if not len(choices):
-            return None
+            return "outcomes too alike"
         compared = self._compare_outcomes(scene, timing, frames)
         eligible = eligible_candidates(with_ghost)
         best = self.balances[with_ghost].choose(compared.scores(choices), eligible)
         if best is None:
-            return None
+            return "refused by the balance"
         chosen = choices[best].tolist()
         candidates = [Candidate(scene.scene_id, target)]
         for k in (frame - TRUE for frame in chosen[1:]):

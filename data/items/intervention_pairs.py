@@ -162,13 +162,13 @@ class InterventionPicker(ContactPicker):
 
     def _make_from_outcomes(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
-    ) -> SelectionItem | None:
-        """Make an item from new futures, or return None if no choice of them is suitable."""
+    ) -> SelectionItem | str:
+        """Make an item from new futures, or return why no choice of them is suitable."""
         stop, target, least = timing.stop, timing.target, self.cell.min_displacement
         subtype = recipe.fields(timing)["subtype"]
         possible = [*find_interventions(subtype, scene, stop, self.world)]
         if not possible:
-            return None
+            return "no such intervention"
         chosen = possible[self.rng.integers(len(possible))]
         branches = [chosen.branch, *sample_variations(scene, stop, chosen, self.rng)]
         simulated = simulate_futures(scene, stop, target, branches, self.world)
@@ -183,12 +183,12 @@ class InterventionPicker(ContactPicker):
         choices = np.array([(ACTUAL, CHANGED, *pair) for pair in pairs])
         choices = distinct_choices(choices, displacement, least)
         if not len(choices):
-            return None
+            return "futures too alike"
         compared = self._compare(frames, [stop, *[target] * len(motions)])
         scores = [compared.scores(choices[:, order]) for order in RIGHT.values()]
         best = self.balance.choose(np.concatenate(scores))
         if best is None:
-            return None
+            return "refused by the balance"
         candidates = []
         for frame in choices[best].tolist():
             source = SOURCES.get(frame, "alternative")

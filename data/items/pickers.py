@@ -7,8 +7,9 @@ chooses the distractors.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any
 
@@ -64,6 +65,7 @@ class Recipe:
         subjects: Returns the indices of the objects whose positions count in frames of the item's
             scene. Without any, there is no item at this timing. In frames of other scenes, all
             objects count.
+        lacks: What a scene without timings lacks, if such scenes are counted.
     """
 
     family: str
@@ -72,20 +74,21 @@ class Recipe:
     pools: Callable[[Scene, Timing, DistractorPicker], Sequence[Pool]]
     subjects: Callable[[Scene, Timing], tuple[int, ...]] = visible_objects
     suite: str = "dynapix"
+    lacks: str = ""
 
 
 @dataclass
 class DistractorPicker:
     """Takes the first distractors of the recipe's pools that differ visibly from each other.
 
-    Cross-scene distractors come from the scenes of the split. `dropped` counts the timings for
-    which too few distractors are suitable.
+    Cross-scene distractors come from the scenes of the split. `dropped` counts the timings at which
+    no item can be made, by reason.
     """
 
     cell: CellInputs
     split: str
     rng: np.random.Generator
-    dropped: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
 
     def make_item(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
@@ -105,7 +108,7 @@ class DistractorPicker:
                 if all(self._displacement(candidate, c, about) >= bound for c in chosen):
                     chosen.append(candidate)
         if len(chosen) < 4:
-            self.dropped += 1
+            self.dropped["too alike"] += 1
             return None
         least = min(self._displacement(a, b) for a, b in combinations(chosen, 2))
         return new_item(recipe, scene, timing, chosen, least)
@@ -168,14 +171,15 @@ def fill_quota(
     recipe: Recipe,
     cell: CellInputs,
     make_picker: Callable[..., DistractorPicker] = DistractorPicker,
-) -> tuple[list[SelectionItem], int]:
+) -> tuple[list[SelectionItem], Counter[str]]:
     """Make the items of one cell, at most one per scene, from scenes in a seeded order. An item has
     the first timing, in a random order, at which one can be made.
 
     Returns:
-        The items of each split up to its quota, and the number of timings that were dropped.
+        The items of each split up to its quota, and the number of timings that were dropped by
+        reason, with that of the scenes that lack timings.
     """
-    items, dropped = [], 0
+    items, dropped = [], Counter[str]()
     for split in SPLITS:
         scene_ids = cell.scene_ids[split]
         rng = named_rng(cell.seed, cell_name, split)
@@ -186,6 +190,8 @@ def fill_quota(
                 break
             scene = cell.scene_of(scene_ids[index])
             timings = recipe.timings(scene)
+            if recipe.lacks and not timings:
+                dropped[recipe.lacks] += 1
             for timing in (timings[k] for k in rng.permutation(len(timings))):
                 about = recipe.subjects(scene, timing)
                 if about and (item := picker.make_item(recipe, scene, timing, about)):

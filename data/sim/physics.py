@@ -162,7 +162,7 @@ class Simulator:
 
         Equal arguments give bit-identical results. A branch with the states of the scene is close
         to an uninterrupted simulation, but not equal, because Bullet keeps contacts from step to
-        step.
+        step. So a branch is also close, but not equal, to the same branch after others.
         """
         fixed = self._reset(world)
         handles = [

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from conf.schema import RelationBounds
+from conf.schema import TeacherConfig
 from data.checks.intervals import Interval, SceneBootstrap
 from data.records import SelectionItem
-from teacher.predicates.extraction import extract_predicates
 from teacher.predicates.facts import RelationalPredicates
 from teacher.reading.claims import Claim
 from teacher.validation.reasons import (
@@ -21,6 +20,7 @@ from teacher.validation.reasons import (
     ResponseReasons,
     read_response,
 )
+from teacher.vocabulary import describe_item
 
 if TYPE_CHECKING:
     from data.store import Store
@@ -86,8 +86,7 @@ def read_reasons(
 def item_predicates(item: SelectionItem, store: Store) -> RelationalPredicates | None:
     """Return all predicates of an item, with which claims are compared; None if the item has no
     predicates, because its prefix is too short."""
-    scene = store.scene(item.target.scene_id)
-    return extract_predicates(item, scene, store.scene, RelationBounds())
+    return describe_item(item, store, TeacherConfig())
 
 
 def _summarize_part(claims: Sequence[Sequence[Claim]], scenes: SceneBootstrap) -> PartSummary:

@@ -9,9 +9,9 @@ from math import dist, hypot
 import numpy as np
 
 from conf.schema import RelationBounds
-from data.oracle.contacts import collisions_in
+from data.oracle.contacts import collisions_in, next_collision
 from data.oracle.displacement import MODEL_SIZE
-from data.records import LETTERS, Candidate, Scene, SelectionItem
+from data.records import CONTACT, LETTERS, Candidate, Scene, SelectionItem
 from teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
@@ -98,6 +98,15 @@ def extract_predicates(
     )
     if facts is None:
         return None
+    if item.distractors == CONTACT:
+        # A text names few pairs: first the one on whose collision the item turns.
+        pair = next_collision(scene, item.prefix_stop).objects
+        names = tuple(scene.objects[k].noun_phrase for k in pair)
+        courses, contacts = (
+            tuple(sorted(meetings, key=lambda meeting: meeting.objects != names))
+            for meetings in (facts.courses, facts.contacts)
+        )
+        facts = replace(facts, courses=courses, contacts=contacts)
     candidates = tuple(
         CandidateFacts(letter, True, False, ())
         if letter == item.letter
@@ -122,6 +131,8 @@ def extract_predicates(
 
 def name_moment(item: SelectionItem) -> str:
     """Return an item's target in words. The events of some subtypes are no collisions."""
+    if item.distractors == CONTACT:
+        return "after the collision"
     if item.framing == "future" and item.subtype in EVENT_MOMENTS:
         return EVENT_MOMENTS[item.subtype]
     return {"future": "at the collision", "contact": "just after the collision"}.get(

@@ -117,7 +117,8 @@ class Facts:
     `entering` and `leaving` are the objects that come into view and go out of view from the cut to
     the target. `courses` are pairs on a collision course at the cut. `contacts` are all pairs that
     collide from the cut to the target. `close` are pairs that are very close at the target. These
-    three are unknown, and empty, if `records_contacts` is false.
+    three are unknown, and empty, if `records_contacts` is false. `heavier` are pairs of which the
+    first object is known to be heavier, by its material.
     """
 
     instant: str
@@ -129,6 +130,7 @@ class Facts:
     contacts: tuple[Meeting, ...]
     close: tuple[Closeness, ...]
     records_contacts: bool = field(default=True, kw_only=True)
+    heavier: tuple[tuple[str, str], ...] = field(default=(), kw_only=True)
 
 
 @dataclass(frozen=True)

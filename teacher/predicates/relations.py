@@ -56,7 +56,8 @@ VALUES = {
 }
 """The values of each kind of relation."""
 KINDS = {value: kind for kind, values in VALUES.items() for value in values}
-"""The kind of each value."""
+KINDS |= {"heavier than": "weight", "lighter than": "weight"}
+"""The kind of each value. Weights are not relations of a frame, but the reader reads them alike."""
 CHANGES = ("passing", "arrival", "edge")
 """Kinds of relations that describe a change from the cut to the target."""
 SYMMETRIC = {"side", "height", "gap", "cover"}

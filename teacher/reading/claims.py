@@ -46,7 +46,7 @@ class Claim(NamedTuple):
     "close", "close region" (of a close pair), "place of either" (of the pair or its second object).
     For a candidate: "agrees", "other objects"; objects: "region", "lacks", "extra", "displaced".
     For two or three objects, of the scene or of a candidate: the kinds of relations (see
-    `teacher.predicates.relations`).
+    `teacher.predicates.relations`), and "weight".
     """
 
     kind: str
@@ -76,6 +76,7 @@ class IndexedPredicates:
         self.courses = {frozenset(m.objects): m.when for m in predicates.courses}
         self.contacts = {frozenset(m.objects): m.when for m in predicates.contacts}
         self.close = {frozenset(c.objects): c.region for c in predicates.close}
+        self.heavier = predicates.heavier
         self.records_contacts = predicates.records_contacts
         self.candidates = {c.letter: c for c in predicates.candidates}
         self.differences: dict[str, dict[str, Difference]] = {
@@ -118,6 +119,9 @@ class IndexedPredicates:
         """Return whether a claim without its negation holds; None if predicates do not tell."""
         if not self.records_contacts and (claim.kind in PAIR_CHECKS or claim.kind == "gap"):
             return None
+        if claim.kind == "weight":
+            pair = claim.subjects[:: 1 if claim.value == "heavier than" else -1]
+            return pair in self.heavier or (False if pair[::-1] in self.heavier else None)
         if claim.kind in VALUES:
             return self._truth_of_relation(claim)
         if claim.candidate is not None:

@@ -154,6 +154,7 @@ class Writer:
         for contact in facts.contacts[: self.detail.pairs]:
             if frozenset(contact.objects) not in on_course:
                 parts.append(f"{name_pair(contact.objects)} will also meet")
+        parts += [f"the {one} is heavier than the {other}" for one, other in facts.heavier]
         still = ("stays", "unseen")
         movers = [o for o in ranked if o.extent not in still or o.enters or o.leaves]
         struck = {name for m in facts.contacts for name in m.objects}

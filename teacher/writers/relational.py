@@ -55,6 +55,7 @@ def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> Re
         courses=tuple(m for m in p.courses if kept.issuperset(m.objects)),
         contacts=tuple(m for m in p.contacts if kept.issuperset(m.objects)),
         close=tuple(c for c in p.close if kept.issuperset(c.objects)),
+        heavier=tuple(pair for pair in p.heavier if kept.issuperset(pair)),
     )
 
 

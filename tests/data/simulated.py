@@ -10,8 +10,8 @@ from data.sources.scenes import record_scene
 
 CLEVRER = WorldConfig()
 WORLDS = [
-    "above", "clevrer", "dusk", "falling", "masses", "movi_a", "near", "physion", "ramp", "screen",
-    "settling",
+    "above", "above_masses", "clevrer", "dusk", "falling", "masses", "movi_a", "near", "physion",
+    "ramp", "screen", "settling",
 ]  # fmt: skip
 """Names of the presets in conf/world."""
 
