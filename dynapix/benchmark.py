@@ -15,7 +15,7 @@ import numpy as np
 
 from conf.errors import UserError
 from conf.files import expand_path
-from conf.schema.benchmark import POOLS, store_name
+from conf.schema.benchmark import INTERVENTIONS, POOLS, store_name
 from data.frames.frame_cache import FrameReader
 from data.records import (
     FAMILIES,
@@ -331,6 +331,11 @@ class Benchmark:
     def selection(self) -> Lazy[Item]:
         """The selection items of the split."""
         return Lazy(Item, self.store.selection(self.split), self)
+
+    @cached_property
+    def interventions(self) -> Lazy[Item]:
+        """The items of the split in pairs about what comes and what would have come."""
+        return Lazy(Item, self.store.selection(self.split, INTERVENTIONS), self)
 
     @cached_property
     def retrieval(self) -> Lazy[Query]:

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.files import expand_path, write_json, write_json_lines, write_text
+from conf.schema.benchmark import PAIRED
 from data.records import LETTERS
 from dynapix.benchmark import Benchmark, Item, refuse_repeated
 from dynapix.saved_runs import saved_run
@@ -231,7 +232,8 @@ class Result:
         records = [item.record for item in self.items]
         name, build = self.benchmark.name, self.benchmark.store.identity
         asked = [(TEXT, None, TEXT)] if self._texts else []
-        return build_selection_report([choices], records, name, build, self.seed, asked=asked)
+        suite = records[0].suite if records[0].suite in PAIRED else None
+        return build_selection_report([choices], records, name, build, self.seed, suite, asked)
 
     @property
     def accuracy(self) -> SelectionResult:
@@ -337,7 +339,8 @@ class Result:
                 f"{folder} is a result on another benchmark or build than {benchmark.store.folder}",
                 code="different-builds",
             )
-        by_id = {item.item_id: item for item in benchmark.selection}
+        every = (*benchmark.selection, *benchmark.interventions)
+        by_id = {item.item_id: item for item in every}
         if missing := [name for name, _ in predictions if name not in by_id]:
             raise UserError(
                 f"{folder} has {len(missing)} items that the {benchmark.split} split of "
@@ -352,9 +355,10 @@ class Result:
         return cls(benchmark, name, tuple(items), tuple(outcomes), seed)
 
     def __str__(self) -> str:
-        from evaluation.reporting.tables import selection_table
+        from evaluation.reporting.tables import pair_table, selection_table
 
         lines = [str(selection_table([self.accuracy], self.items[0].record.suite))]
+        lines += [str(pair_table(self.report.pairs))] if self.report.pairs else []
         if self.failures:
             reasons = Counter(failure.reason for failure in self.failures)
             [(reason, count)] = reasons.most_common(1)

@@ -12,15 +12,23 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from conf.schema.benchmark import INTERVENTIONS
 from data.items.recipes import pair_key
 from data.records import INTERVENTION, SelectionItem, sample_prefix_frames
 
 
 def pair_items(items: Sequence[SelectionItem]) -> list[tuple[SelectionItem, SelectionItem]]:
-    """Return the pairs among `items` of a paired suite, in order: matched-anchor pairs as (event
-    item, time item), and pairs about interventions as (actual future, changed future)."""
-    second = {pair_key(item): item for item in items if _is_second(item)}
-    return [(item, second[pair_key(item)]) for item in items if not _is_second(item)]
+    """Return the complete pairs among `items` of a paired suite, in order: matched-anchor pairs as
+    (event item, time item), and pairs about interventions as (actual future, changed future)."""
+    second = {_full_key(item): item for item in items if _is_second(item)}
+    first = [item for item in items if not _is_second(item)]
+    return [(item, second[_full_key(item)]) for item in first if _full_key(item) in second]
+
+
+def _full_key(item: SelectionItem) -> tuple[str, ...]:
+    """Return what the items of a pair share. A collision can have several interventions."""
+    is_about_change = item.suite == INTERVENTIONS
+    return pair_key(item), item.subtype if is_about_change else ""
 
 
 def _is_second(item: SelectionItem) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from conf.schema.benchmark import MATCHED_ANCHOR
+from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
 from data.items.controls import pair_items
 from data.publish.contact_sheets import SheetRows, draw_sheet
 from data.records import SPLITS
@@ -44,6 +44,9 @@ def draw_sheets(store: Store, examples: int, seed: int) -> Iterator[Sheet]:
     for pair in pair_items(store.selection(suite=MATCHED_ANCHOR)):
         group = "Controls", "pairs that differ only in the anchor", f"controls-{MATCHED_ANCHOR}"
         groups[group].append(pair)
+    for pair in pair_items(store.selection(suite=INTERVENTIONS)):
+        change = pair[0].subtype
+        groups["Interventions", change, f"{INTERVENTIONS}-{change}"].append(pair)
     for (section, title, name), examples_of_group in groups.items():
         count = len(examples_of_group)
         order = named_rng(seed, "gallery", name).permutation(count)[:examples]

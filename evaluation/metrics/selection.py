@@ -12,6 +12,7 @@ import numpy as np
 
 from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
 from data.checks.intervals import SceneBootstrap
+from data.items.controls import pair_items
 from data.items.recipes import TIME_CELLS
 from data.records import LETTERS, SelectionItem
 from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
@@ -113,7 +114,7 @@ def _score_interventions(
     choices: Mapping[str, Choices], items: Sequence[SelectionItem], seed: int
 ) -> dict[str, list[PairScores]]:
     """Return the scores of pairs about interventions; none for other items."""
-    if items[0].suite != INTERVENTIONS:
+    if items[0].suite != INTERVENTIONS or not pair_items(items):
         return {}
     ids = [item.item_id for item in items]
     return {

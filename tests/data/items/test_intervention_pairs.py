@@ -199,6 +199,14 @@ def made_up_pairs(count: int) -> list[SelectionItem]:
     return items
 
 
+def test_interventions_on_one_collision_are_pairs_of_their_own() -> None:
+    items = made_up_pairs(1)
+    others = [replace(i, item_id=f"faster-{i.item_id}", subtype="faster") for i in items]
+    pairs = pair_items([items[0], *others, items[1]])
+    assert pairs == [(items[0], items[1]), (others[0], others[1])]
+    assert pair_items([items[0], others[1]]) == []
+
+
 def score(answers: list[tuple[str, str]]) -> dict[str, float]:
     """The scores of the answers to pairs, those of the actual item first."""
     items = made_up_pairs(len(answers))
