@@ -33,7 +33,7 @@ from data.items.futures import (
 )
 from data.items.pickers import Recipe, Timing, new_item
 from data.items.recipes import EVENT_QUESTION, pair_key
-from data.items.scores import SCORES, Balance
+from data.items.scores import Balance
 from data.oracle.contacts import group_contacts, next_collision
 from data.oracle.displacement import frame_displacements
 from data.records import (
@@ -77,8 +77,6 @@ ACTUAL, CHANGED = 1, 2
 """Indices of the scene's own future and of the changed one among the frames from which candidates
 are chosen."""
 SOURCES = {ACTUAL: "target", CHANGED: INTERVENTION}
-RIGHT = {"actual": [0, 1, 2, 3], "changed": [1, 0, 2, 3]}
-"""Orders of the candidates of a choice in which the target of either item comes first."""
 
 
 def make_intervention_recipe(change: str) -> Recipe:
@@ -158,7 +156,7 @@ class InterventionPicker(ContactPicker):
     """Makes the items about the scene's own future in the pairs of one subtype and one split."""
 
     def __post_init__(self) -> None:
-        self.balance = Balance(self.rng, [(target, s) for target in RIGHT for s in SCORES])
+        self.balance = Balance(self.rng)
 
     def _make_from_outcomes(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
@@ -185,8 +183,9 @@ class InterventionPicker(ContactPicker):
         if not len(choices):
             return "futures too alike"
         compared = self._compare(frames, [stop, *[target] * len(motions)])
-        scores = [compared.scores(choices[:, order]) for order in RIGHT.values()]
-        best = self.balance.choose(np.concatenate(scores))
+        # The changed future is often beyond the scene's own one, such as that of a faster object,
+        # so that only the ranks of both together can be even.
+        best = self.balance.choose(compared.scores(choices), targets=(0, 1))
         if best is None:
             return "refused by the balance"
         candidates = []

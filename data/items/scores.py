@@ -200,19 +200,26 @@ class Balance:
         """Return the excess of each rank (4,) in a score."""
         return self.excess[self.names.index(score)]
 
-    def choose(self, scores: np.ndarray, eligible: Sequence[int] = (0, 1, 2, 3)) -> int | None:
+    def choose(
+        self,
+        scores: np.ndarray,
+        eligible: Sequence[int] = (0, 1, 2, 3),
+        targets: Sequence[int] = (0,),
+    ) -> int | None:
         """Return the choice of candidates that keeps the counts of ranks most even, and count it.
 
         Args:
             scores: (S, T, 4) scores of T choices; the first of four candidates is the target.
             eligible: The candidates that could be the target as far as their kind tells. By chance,
                 the target has the rank of each of them equally often.
+            targets: The candidates that are targets. Those of a pair of items are counted together.
 
         Returns:
             The index of the choice, or None if each would make the count of a rank differ too much
             from its chance (see `LIMIT`) and the counts less even as a whole.
         """
-        excess = self.excess + rank_excess(scores, eligible).swapaxes(0, 1)
+        added = sum(rank_excess(scores, eligible, target) for target in targets)
+        excess = self.excess + added.swapaxes(0, 1)
         unevenness = (excess**2).sum(axis=(1, 2))
         # Without the second condition, a cell could reach counts at which it refuses every item.
         bound = LIMIT + TOLERANCE * self.items
@@ -225,13 +232,15 @@ class Balance:
         return best
 
 
-def rank_excess(scores: np.ndarray, eligible: Sequence[int] = (0, 1, 2, 3)) -> np.ndarray:
+def rank_excess(
+    scores: np.ndarray, eligible: Sequence[int] = (0, 1, 2, 3), target: int = 0
+) -> np.ndarray:
     """Return the distribution of the target's rank (see `rank_shares`), less the mean distribution
     of the eligible candidates, (..., 4)."""
     if len(eligible) == 4:
-        return rank_shares(scores) - 1 / 4
+        return rank_shares(scores, target) - 1 / 4
     chance = np.mean([rank_shares(scores, k) for k in eligible], axis=0)
-    return rank_shares(scores) - chance
+    return rank_shares(scores, target) - chance
 
 
 def compare_item(
