@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from textwrap import fill
 
 from PIL import Image
 
@@ -24,6 +25,8 @@ from data.store import Store
 INK, GREEN = "#222222", "#1a7f37"
 CELL_WIDTH, CAPTION_HEIGHT, HEADING_HEIGHT = 2.3, 0.5, 0.6
 """Sizes in inches."""
+LINE_HEIGHT, LINE_CHARACTERS = 0.2, 165
+"""Height in inches of a further line of a heading, and the maximum number of its characters."""
 GAP = 0.12
 """Width of the gap between the prefix and the candidates, as a fraction of a cell's width."""
 DPI = 100
@@ -58,14 +61,16 @@ def draw_sheet(rows: Sequence[Row]) -> bytes:
     prefix = max(len(row.prefix) for row in rows)
     columns = prefix + max(len(row.candidates) for row in rows)
     image = rows[0].prefix[0].image
-    height = HEADING_HEIGHT + CELL_WIDTH * image.height / image.width + CAPTION_HEIGHT
+    lines = max(row.heading.count("\n") for row in rows)
+    heading_height = HEADING_HEIGHT + LINE_HEIGHT * (lines - 1)
+    height = heading_height + CELL_WIDTH * image.height / image.width + CAPTION_HEIGHT
     figure = Figure(figsize=(CELL_WIDTH * (columns + GAP), height * len(rows)), dpi=DPI)
     strips = figure.subfigures(len(rows), squeeze=False)[:, 0]
     layout = {
         "width_ratios": [1.0] * prefix + [GAP] + [1.0] * (columns - prefix),
         "gridspec_kw": {
             "left": 0.01, "right": 0.99, "wspace": 0.06,
-            "bottom": CAPTION_HEIGHT / height, "top": 1 - HEADING_HEIGHT / height,
+            "bottom": CAPTION_HEIGHT / height, "top": 1 - heading_height / height,
         },
     }  # fmt: skip
     for row, strip in zip(rows, strips, strict=True):
@@ -102,7 +107,7 @@ class SheetRows:
         heading, cells = (self._item if isinstance(record, SelectionItem) else self._query)(record)
         frames = sample_prefix_frames(record.prefix_start, record.prefix_stop, PREFIX_FRAMES)
         prefix = [self._caption_frame(FrameRef(record.scene_id, f), f"frame {f}") for f in frames]
-        return Row(f"{heading}\n{record.question}", prefix, cells)
+        return Row(f"{heading}\n{fill(record.question, LINE_CHARACTERS)}", prefix, cells)
 
     def _item(self, item: SelectionItem) -> tuple[str, list[CaptionedFrame]]:
         """Return the heading and the candidates of an item, with the answer marked."""
