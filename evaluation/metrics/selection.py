@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
-from data.checks.intervals import SceneBootstrap
+from data.checks.intervals import Interval, SceneBootstrap
 from data.items.controls import pair_items
 from data.items.recipes import TIME_CELLS
 from data.records import LETTERS, SelectionItem
@@ -136,15 +136,22 @@ def _selection_result(
     suite: str | None,
 ) -> SelectionResult:
     accuracy = accuracy_by_family([i.family for i in items], choices.credits, scenes)
-    by_horizon = scenes.group_means(choices.credits, [horizon_of(i) or "" for i in items])
-    ordered = sorted(filter(None, by_horizon), key=horizon_order)
     letters, parse_rate = choices.letters, None
     if choices.mode not in (BASELINE, SIMILARITY):
         parse_rate = sum(x is not None for x in letters) / len(letters)
     return SelectionResult(
         benchmark, choices.name, choices.mode, accuracy.families, accuracy.macro, accuracy.micro,
-        parse_rate, len(items), {h: by_horizon[h] for h in ordered}, suite, choices.control,
+        parse_rate, len(items), accuracy_by_horizon(items, choices.credits, scenes), suite,
+        choices.control,
     )  # fmt: skip
+
+
+def accuracy_by_horizon(
+    items: Sequence[SelectionItem], credits: Sequence[float], scenes: SceneBootstrap
+) -> dict[str, Interval]:
+    """Return the mean credit of the items of each horizon, shortest first."""
+    by_horizon = scenes.group_means(credits, [horizon_of(item) or "" for item in items])
+    return {h: by_horizon[h] for h in sorted(filter(None, by_horizon), key=horizon_order)}
 
 
 def horizon_of(item: SelectionItem) -> str | None:

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.schema.benchmark import PAIRED
+from data.checks.intervals import Interval, SceneBootstrap
 from data.checks.observer import SIMULATES, load_observers
 from data.checks.observer_curve import CEILING_ERROR, ObserverCurve, observer_curves
 from data.frames.frame_cache import FrameReader
@@ -25,6 +26,7 @@ from evaluation.metrics.baselines import baseline_results
 from evaluation.metrics.future_moment import FutureMoment, measure_future_moment
 from evaluation.metrics.reasons import item_predicates, read_reasons
 from evaluation.metrics.results import SelectionResult
+from evaluation.metrics.selection import accuracy_by_horizon
 from evaluation.metrics.significance import PairedComparison
 from evaluation.reporting.measurements import Measurement, compare_models
 from evaluation.reporting.run_responses import ItemResponse, Responses
@@ -32,6 +34,8 @@ from teacher.cited_rationales import list_facts
 from teacher.reading.claims import Claim
 from teacher.sections import SECTIONS
 
+SHOWN_ERRORS = (1.0, 4.0, 16.0)
+"""Errors (px) of the observers whose accuracy by horizon is plotted."""
 PREFIX_FRAMES = 6
 """Number of frames of the prefix that are shown, evenly spread."""
 FRAME_WIDTH = 160
@@ -51,6 +55,8 @@ class ItemBrowser:
         baselines: Results of the baselines on the same items, by `Measurement.group`.
         observers: Curves of the observers on the same items, by `Measurement.item_set`; empty for
             items that no observer has seen.
+        observer_horizons: Accuracies by horizon of observers that simulate, by
+            `Measurement.item_set` and label.
         future_moment: By `Measurement.group` and label of a model: the shares of its answers that
             show the true future and the true moment of balanced time items.
     """
@@ -61,6 +67,7 @@ class ItemBrowser:
     comparisons: dict[str, list[PairedComparison]] = field(default_factory=dict)
     baselines: dict[str, list[SelectionResult]] = field(default_factory=dict)
     observers: dict[str, dict[str, ObserverCurve]] = field(default_factory=dict)
+    observer_horizons: dict[str, dict[str, dict[str, Interval]]] = field(default_factory=dict)
     future_moment: dict[str, dict[str, FutureMoment]] = field(default_factory=dict)
 
     def add_group(
@@ -127,6 +134,12 @@ class ItemBrowser:
             own = [items[name] for name in m.responses if name in seen]
             if len(own) == m.result.n and m.item_set not in self.observers:
                 self.observers[m.item_set] = observer_curves(results, own, seed)
+                scenes = SceneBootstrap([item.scene_id for item in own], seed)
+                shares = results[SIMULATES].loc[[item.item_id for item in own]]
+                self.observer_horizons[m.item_set] = {
+                    f"observer with {error:g} px": accuracy_by_horizon(own, shares[error], scenes)
+                    for error in SHOWN_ERRORS
+                }
         return seen
 
 

@@ -211,6 +211,7 @@ def build_selection_details(
     for benchmark, rows in group_by_item_set(selections).items():
         if horizons := {m.label: m.result.horizons for m in rows if m.result.horizons}:
             plot = partial(figures.plot_accuracies, with_paper=rows[0].benchmark not in transfers)
+            horizons |= browser.observer_horizons.get(benchmark, {})
             caption = f"Accuracy by horizon on {benchmark}."
             section.figures.append(
                 Figure(file_stem(f"horizons-{benchmark}"), caption, plot, horizons)

@@ -386,5 +386,7 @@ def test_accuracies_are_reported_as_errors_of_observers(report, micro_store, mon
     [right] = [line for line in table.splitlines() if line.startswith("| cot (reasoning)")]
     assert "| 1 | 100.0 |" in right
     assert "observer-micro" in {path.stem for path in (folder / "figures").glob("*.svg")}
+    [horizons] = (folder / "figures").glob("horizons-micro.svg")
+    assert "observer with 4 px" in horizons.read_text()
     for item in page_data(folder)["items"]:
         assert "is right in 100% of its draws" in item["truth"][-1]
