@@ -231,9 +231,9 @@ class SelectionItem:
                 f"item {self.item_id}: prefix {self.prefix_start} to {self.prefix_stop} "
                 f"does not end before target {self.target_frame}"
             )
-        is_target = [c.source == "target" for c in self.candidates]
-        frames = {(c.scene_id, c.frame) for c in self.candidates}
-        if len(frames) != 4 or is_target != [k == self.answer for k in range(4)]:
+        frames = [(c.scene_id, c.frame) for c in self.candidates]
+        shown = frames[self.answer : self.answer + 1]
+        if len(frames) != 4 or [frames.count(frame) for frame in shown] != [1]:
             raise ValueError(
                 f"item {self.item_id}: expected four candidates, the target only at index "
                 f"{self.answer}"

@@ -114,7 +114,7 @@ def select_items(
     items = store.selection("test", suite)
     if not items:
         problem = f"{store.folder} has no test items of the {suite or store.suite} suite"
-        if suite is not None:
+        if suite in PAIR_SOURCES:
             key, preset = PAIR_SOURCES[suite]
             problem += f": set benchmark.selection.{key}, or choose a benchmark={preset}"
         raise UserError(problem, code="no-items")

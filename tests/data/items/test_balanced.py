@@ -158,7 +158,7 @@ def test_wrong_moments_follow_the_prefix(subtype: str, seconds: float) -> None:
     found = set()
     for _ in range(200):
         # Each item counts for one of the sides.
-        picker.balance.counts_of("moment")[:] = rng.uniform(-1, 1, 4)
+        picker.balance.excess_of("moment")[:] = rng.uniform(-1, 1, 4)
         found.update(picker._wrong_moment(scene, timing, (0,)))
     assert timing.stop < min(found) < timing.target < max(found) < scene.frames
     assert timing.target not in found
