@@ -29,6 +29,9 @@ class MemoryStore:
     def selection(self, split: str | None = None) -> list[SelectionItem]:
         return [i for i in self.items if split in (None, i.split)]
 
+    def training_items(self) -> list[SelectionItem]:
+        return self.selection("train")
+
 
 def make_store(folder: Path, count: int) -> MemoryStore:
     """Return a store with `count` items, each with its own scene. The prefix of item-5 is too short

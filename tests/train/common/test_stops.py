@@ -80,8 +80,8 @@ class OneMore:
     def __init__(self, store: Store, item: SelectionItem) -> None:
         self.store, self.item = store, item
 
-    def selection(self, split: str) -> list[SelectionItem]:
-        return [*self.store.selection(split), self.item]
+    def training_items(self) -> list[SelectionItem]:
+        return [*self.store.training_items(), self.item]
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.store, name)
