@@ -71,7 +71,6 @@ class SelectionConfig(Settings):
     matched: Quota = field(default_factory=Quota)
     """Pairs of matched-anchor items. The two questions of a pair ask for the same target, one by an
     event and the other by a time."""
-
     interventions: dict[str, Quota] = field(default_factory=dict)
     """Pairs of items about interventions, by subtype: absent, heavier, lighter, faster, other_side.
     One question of a pair asks for what comes, and the other for what would have come."""
@@ -247,10 +246,8 @@ class BenchmarkConfig(Settings):
                 f"{group}recipe={self.item_recipe}: their scenes are simulated again; set "
                 f"{group}simulator=bullet and {group}recipe=dynapix, or remove these quotas"
             )
-        mass = self.world.objects.mass
-        if (
-            about := [name for name in asked if name in MASS_CHANGES]
-        ) and mass.metal <= mass.rubber:
+        mass, about = self.world.objects.mass, [name for name in asked if name in MASS_CHANGES]
+        if about and mass.metal <= mass.rubber:
             yield (
                 f"{group}selection.interventions.{', '.join(about)} with world={self.world.name}: "
                 f"metal is not heavier than rubber there (objects.mass.metal={mass.metal:g}, "

@@ -15,7 +15,6 @@ from data.items.contact import collision_timings
 from data.items.controls import pair_items
 from data.items.futures import scene_states, simulate_futures
 from data.items.intervention_pairs import (
-    CHANGES,
     InterventionPicker,
     find_interventions,
     join_collisions,
@@ -87,6 +86,8 @@ def test_a_vanished_object_is_in_no_candidate(made, scenes: dict[str, Scene]) ->
     pairs, folder = made
     for actual, _ in pairs:
         if actual.subtype != "absent":
+            assert "None of the four images" not in actual.question
+            assert actual.target.scene_id == actual.scene_id
             continue
         futures = [load_scene(scene_path(folder, c.scene_id)) for c in actual.candidates]
         shown = np.stack([each.in_view[actual.target_frame] for each in futures])
@@ -145,6 +146,7 @@ def test_only_a_world_of_two_masses_has_questions_about_mass(scenes: dict[str, S
 def test_an_object_on_the_other_side_comes_from_the_mirrored_place(
     scenes: dict[str, Scene],
 ) -> None:
+    checked = 0
     for scene in scenes.values():
         if (stop := first_timing(scene)) is None:
             continue
@@ -158,6 +160,8 @@ def test_an_object_on_the_other_side_comes_from_the_mirrored_place(
             )
             middle = (before[k, :2] + after[k, :2]) / 2
             assert np.abs(before[:, :2] - middle).sum(axis=-1).min() < 1e-6
+            checked += 1
+    assert checked
 
 
 def test_the_contacts_of_an_unchanged_continuation_are_those_of_the_scene(
@@ -229,10 +233,6 @@ def test_guesses_get_the_stated_shares_of_pairs() -> None:
     assert score([*product("ABCD", repeat=2)])["both"] == pytest.approx(1 / 16)
     different = [pair for pair in product("ABCD", repeat=2) if pair[0] != pair[1]]
     assert score(different)["both"] == pytest.approx(1 / 12)
-
-
-def test_every_intervention_has_words() -> None:
-    assert {text.format("cube", "sphere").partition(" ")[0] for text in CHANGES.values()} == {"the"}
 
 
 def test_masses_of_a_world_are_checked_before_its_scenes_are_simulated() -> None:
