@@ -14,7 +14,7 @@ from conf.schema.world import ByMaterial, ObjectsConfig
 from data.oracle.contacts import group_contacts
 from data.records import FPS, Collision, Scene, SceneObject
 from data.sim.parts import part_box, surface_height
-from data.sim.physics import Body, has_repeated, shared_simulator
+from data.sim.physics import Body, Branch, has_repeated, shared_simulator
 from data.sim.sampling import sample_scene
 from data.sim.shapes import RADIUS
 from tests.children import run_child
@@ -176,3 +176,33 @@ def test_surface_height_follows_a_tilted_part() -> None:
         # After a turn by 90 degrees, the ramp descends along y.
         assert surface_height([box], np.array([0.3, y])) == pytest.approx(top - slope * y)
     assert surface_height([box], np.array([3.0, 0.0])) == 0
+
+
+@pytest.mark.parametrize("mass", [1 / 16, 1 / 4, 1.0, 4.0, 16.0])
+@pytest.mark.parametrize("restitution", [0.5, 1.0, 1.4])
+def test_head_on_collision_of_a_branch_follows_newtons_law(mass: float, restitution: float) -> None:
+    """A moving sphere hits one at rest. Their momentum stays, and they separate at the coefficient
+    of restitution times the speed of approach. Bullet also pushes overlapping bodies apart, which
+    adds at most a tenth of this speed, whatever the masses and the restitution."""
+    world = WorldConfig(physics=PhysicsConfig(floor_friction=0.0, object_friction=0.0))
+    states = np.zeros((2, 13))
+    states[:, 2], states[:, 6] = RADIUS, 1.0
+    speed = 1.5
+    states[0, 0], states[0, 7] = -1.0, speed
+    branches = [
+        Branch(states),
+        Branch(states, masses=[mass, 1.0], restitution=restitution),
+        Branch(states, passing=(0, 1)),
+    ]
+    balls = [SceneObject("sphere", "metal", color) for color in ("red", "blue")]
+    _, changed, ghost = shared_simulator().simulate_branches(
+        balls, [1.0, 1.0], states, branches, world, 26
+    )
+    # Bullet multiplies the coefficients of the two bodies.
+    e = (world.physics.restitution.metal * restitution) ** 2
+    one, other = changed.velocities[-1, :, 0]
+    assert changed.touching
+    assert mass * one + other == pytest.approx(mass * speed)
+    assert 0 <= other - one - e * speed < 0.1 * speed
+    assert not ghost.touching
+    np.testing.assert_allclose(ghost.velocities[-1, :, 0], [speed, 0.0], atol=1e-6)
