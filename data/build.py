@@ -19,10 +19,10 @@ from conf.runs import compare_settings, flatten, lock_file
 from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
 from data.checks.counts import count_records, summarize_store
 from data.frames.prerender import FRAMES_RECORD, prerender_frames
-from data.items import contact
 from data.items.cells import family_quotas, list_subtypes, load_cached, make_items_and_queries
 from data.items.database import make_databases
-from data.items.intervention_pairs import CHANGES
+from data.items.futures import contact
+from data.items.futures.interventions import CHANGES
 from data.items.queries import BUILDERS
 from data.oracle.displacement import visible_positions
 from data.parallel import Workers

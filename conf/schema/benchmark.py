@@ -23,7 +23,7 @@ WINDOW_FAMILIES = {"G1": "AC", "G2": "ABC", "G3": "AC", "G4": "AB"}
 WINDOW_HORIZONS = (8, 16, 24)
 """Number of frames from the last frame of a window item's prefix to its target."""
 MASS_CHANGES = ("heavier", "lighter")
-"""The interventions on the mass of an object (see `data.items.intervention_pairs`)."""
+"""The interventions on the mass of an object (see `data.items.futures.interventions`)."""
 WINDOW_DIFFICULTIES = ("easy", "hard")
 MATCHED_ANCHOR = "matched_anchor"
 """Name of the suite of the matched-anchor items."""

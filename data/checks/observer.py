@@ -29,7 +29,7 @@ from conf.files import is_writable, write_bytes
 from conf.runs import lock_file
 from conf.schema import WorldConfig
 from conf.schema.settings import from_dict
-from data.items.futures import scene_states, simulate_futures
+from data.items.futures.simulation import scene_states, simulate_futures
 from data.oracle.displacement import DIAGONAL, MODEL_SIZE, visible_positions
 from data.parallel import Workers, batched
 from data.records import Scene, SelectionItem, sample_prefix_frames

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from data.items.contact import has_ghost
+from data.items.futures.contact import has_ghost
 from data.items.scores import compare_candidates, order_target_first, rank_shares
 from data.records import SelectionItem
 from data.seeded_order import named_rng

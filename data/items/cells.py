@@ -24,11 +24,12 @@ import numpy as np
 from conf.files import write_bytes
 from conf.schema import BenchmarkConfig, Quota
 from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
-from data.items import contact, recipes, transfer
-from data.items.balanced import BalancedPicker
-from data.items.balanced_subset import RESERVE, choose_items
-from data.items.contact import ContactPicker
-from data.items.intervention_pairs import (
+from data.items import recipes, transfer
+from data.items.futures import contact
+from data.items.futures.balanced import BalancedPicker
+from data.items.futures.balanced_subset import RESERVE, choose_items
+from data.items.futures.contact import ContactPicker
+from data.items.futures.interventions import (
     InterventionPicker,
     make_intervention_pair,
     make_intervention_recipe,

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from conf.schema import TeacherConfig
-from data.items.contact import LEAD, collision_timings
+from data.items.futures.contact import LEAD, collision_timings
 from data.oracle.contacts import next_collision
 from data.records import CONTACT, Candidate, Scene, SelectionItem
 from teacher.narrator import write_rationale

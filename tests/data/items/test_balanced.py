@@ -21,8 +21,8 @@ from conf.schema import (
 )
 from data.build import ensure_items
 from data.checks.counts import summarize_store
-from data.items import balanced as balanced_items
-from data.items.balanced_subset import choose_items
+from data.items.futures import balanced as balanced_items
+from data.items.futures.balanced_subset import choose_items
 from data.items.pickers import CellInputs, shuffle_candidates
 from data.items.recipes import TIME_CELLS, time_timings
 from data.items.scores import compare_item, order_target_first

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from data.checks.shortcuts import fit_logistic, score_logistic_model, score_simple_strategies
-from data.items.balanced_subset import choose_items, item_deviations
+from data.items.futures.balanced_subset import choose_items, item_deviations
 from data.items.scores import LIMIT, SCORES, TOLERANCE, Balance, compare_candidates, rank_shares
 
 

@@ -16,7 +16,7 @@ from conf.schema import BenchmarkConfig, BuildCommand, Quota, RetrievalTrackConf
 from data.build import check_quota_names, empty_benchmark, ensure_items
 from data.checks.counts import summarize_store
 from data.checks.statistics import compute_statistics, format_statistics
-from data.items.contact import (
+from data.items.futures.contact import (
     APART,
     CELLS,
     GHOST_SHARE,
@@ -28,7 +28,7 @@ from data.items.contact import (
     sample_outcomes,
     share_of_quota,
 )
-from data.items.futures import scene_states, simulate_futures
+from data.items.futures.simulation import scene_states, simulate_futures
 from data.items.pickers import fill_quota
 from data.items.scores import compare_item, rank_excess
 from data.oracle.contacts import collisions_in, next_collision, touching_pairs

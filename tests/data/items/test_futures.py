@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data.items.futures import (
+from data.items.futures.simulation import (
     MOVING,
     alternative_scene,
     branches_of_velocities,

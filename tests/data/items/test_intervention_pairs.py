@@ -11,16 +11,16 @@ import pytest
 
 from conf.schema import Quota
 from conf.schema.world import ByMaterial
-from data.items.contact import collision_timings
 from data.items.controls import pair_items
-from data.items.futures import scene_states, simulate_futures
-from data.items.intervention_pairs import (
+from data.items.futures.contact import collision_timings
+from data.items.futures.interventions import (
     InterventionPicker,
     find_interventions,
     join_collisions,
     make_intervention_pair,
     make_intervention_recipe,
 )
+from data.items.futures.simulation import scene_states, simulate_futures
 from data.items.pickers import CellInputs, fill_quota
 from data.records import Candidate, Scene, SelectionItem
 from data.sim.physics import Branch, shared_simulator

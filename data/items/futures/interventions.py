@@ -21,9 +21,9 @@ import numpy as np
 
 from conf.schema import WorldConfig
 from conf.schema.benchmark import INTERVENTIONS
-from data.items.balanced import distinct_choices
-from data.items.contact import DIRECTIONS, ContactPicker, collision_timings, sample_outcomes
-from data.items.futures import (
+from data.items.futures.balanced import distinct_choices
+from data.items.futures.contact import DIRECTIONS, ContactPicker, collision_timings, sample_outcomes
+from data.items.futures.simulation import (
     MAX_LOG_FACTOR,
     MOVING,
     scene_states,

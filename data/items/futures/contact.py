@@ -23,14 +23,14 @@ from itertools import combinations
 import numpy as np
 
 from conf.schema import WorldConfig
-from data.items.balanced import (
+from data.items.futures.balanced import (
     TARGET,
     TRIES,
     BalancedPicker,
     distinct_choices,
     least_displacement,
 )
-from data.items.futures import (
+from data.items.futures.simulation import (
     scene_states,
     scene_with_states,
     simulate_futures,
@@ -178,8 +178,8 @@ def sample_outcomes(
     """Sample outcomes of the collision of a pair after frame `stop`, each with what differs in it:
     the true outcome first, and the ghost last.
 
-    As in `data.items.futures.sample_velocities`, masses and directions have a random distance from
-    a centre, and so have the true ones.
+    As the velocities of balanced items, masses and directions have a random distance from a centre,
+    and so have the true ones.
     """
     states = scene_states(scene)[stop].astype(float)
     yield "target", Branch(states)

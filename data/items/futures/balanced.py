@@ -1,7 +1,7 @@
 """Makes selection items that only a prediction solves: distractors are alternative futures.
 
 The candidates are the target and frames of other futures of the scene
-(`data.items.futures`), chosen so that no score without prediction reveals the target
+(`data.items.futures.simulation`), chosen so that no score without prediction reveals the target
 (`data.items.scores`). In the time family, two candidates show the right moment
 and two a wrong one, and two show the scene's own future and two another one.
 
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from conf.schema import WorldConfig
-from data.items.futures import (
+from data.items.futures.simulation import (
     Group,
     alternative_scene,
     branches_of_velocities,
