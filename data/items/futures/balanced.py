@@ -213,9 +213,12 @@ def distinct_choices(choices: np.ndarray, displacement: np.ndarray, least: float
     return choices[pairs.min(axis=(1, 2)) >= least]
 
 
-def least_displacement(frames: Scene, chosen: Sequence[int]) -> float:
-    """Return the smallest displacement of an object between two of the chosen frames, px."""
-    pairs = frame_displacements(frames)[np.ix_(chosen, chosen)]
+def least_displacement(
+    frames: Scene, chosen: Sequence[int], about: tuple[int, ...] | None = None
+) -> float:
+    """Return the smallest displacement of an object of `about` (all by default) between two of the
+    chosen frames, px."""
+    pairs = frame_displacements(frames, about)[np.ix_(chosen, chosen)]
     return float(pairs[np.triu_indices(len(chosen), 1)].min())
 
 

@@ -22,7 +22,6 @@ from itertools import combinations
 
 import numpy as np
 
-from conf.schema import WorldConfig
 from data.items.futures.balanced import (
     TARGET,
     TRIES,
@@ -31,8 +30,9 @@ from data.items.futures.balanced import (
     least_displacement,
 )
 from data.items.futures.simulation import (
+    future_frames,
+    own_motion,
     scene_states,
-    scene_with_states,
     simulate_futures,
     turn_velocity,
 )
@@ -127,7 +127,8 @@ class ContactPicker(BalancedPicker):
         pair = next_collision(scene, stop).objects
         sources, branches = zip(*sample_outcomes(scene, stop, pair, self.rng), strict=True)
         motions = simulate_futures(scene, stop, target, branches, self.world)
-        frames = outcome_frames(scene, timing, motions, self.world)
+        own = own_motion(scene, stop, target)
+        frames = future_frames(scene, stop, [own, *motions], self.world)
         displacement = frame_displacements(frames, about)
         if displacement[TARGET, TRUE] > STRAY * least:
             return "target cannot be simulated again"
@@ -195,15 +196,6 @@ def sample_outcomes(
         aimed[striker, 7:] = turn_velocity(states[striker, 7:], angle)
         yield "aim", Branch(aimed)
     yield GHOST, Branch(states, passing=pair)
-
-
-def outcome_frames(
-    scene: Scene, timing: Timing, motions: Sequence[Motion], world: WorldConfig
-) -> Scene:
-    """Return as a scene the last observed frame, the target and the last frame of each motion."""
-    own = scene_states(scene)[[timing.stop, timing.target]]
-    others = [motion.states[-1] for motion in motions]
-    return scene_with_states(scene, "outcomes", np.stack([*own, *others]), world)
 
 
 def is_suitable(source: str, pair: tuple[int, int], motion: Motion, radii: Sequence[float]) -> bool:

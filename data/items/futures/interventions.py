@@ -12,7 +12,7 @@ the images that lack it would reveal the answer.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -21,13 +21,20 @@ import numpy as np
 
 from conf.schema import WorldConfig
 from conf.schema.benchmark import INTERVENTIONS
-from data.items.futures.balanced import distinct_choices
-from data.items.futures.contact import DIRECTIONS, ContactPicker, collision_timings, sample_outcomes
+from data.items.futures.balanced import distinct_choices, least_displacement
+from data.items.futures.contact import (
+    DIRECTIONS,
+    STRAY,
+    ContactPicker,
+    collision_timings,
+    sample_outcomes,
+)
 from data.items.futures.simulation import (
     MAX_LOG_FACTOR,
     MOVING,
+    future_frames,
+    own_motion,
     scene_states,
-    scene_with_states,
     simulate_futures,
     turn_velocity,
 )
@@ -73,9 +80,9 @@ CLEAR = 1.1
 radii."""
 FAR = 100.0
 """Distance behind the camera to which an object that vanishes is moved, simulator units."""
-ACTUAL, CHANGED = 1, 2
-"""Indices of the scene's own future and of the changed one among the frames from which candidates
-are chosen."""
+ACTUAL, CHANGED, UNCHANGED = 1, 2, 3
+"""Indices of the scene's own future, the changed one and the own one simulated again among the
+frames at the target's moment. Candidates are the first two, and two of the further frames."""
 SOURCES = {ACTUAL: "target", CHANGED: INTERVENTION}
 
 
@@ -170,14 +177,15 @@ class InterventionPicker(ContactPicker):
         chosen = possible[self.rng.integers(len(possible))]
         branches = [chosen.branch, *sample_variations(scene, stop, chosen, self.rng)]
         simulated = simulate_futures(scene, stop, target, branches, self.world)
-        own = Motion(scene_states(scene)[stop : target + 1].astype(float), {})
-        motions = [own, *simulated]
+        motions = [own_motion(scene, stop, target), *simulated]
         if chosen.vanishes:
             motions = [without_object(motion, chosen.changed, self.world) for motion in motions]
             about = tuple(k for k in about if k != chosen.changed)
         frames = future_frames(scene, stop, motions, self.world)
         displacement = frame_displacements(frames, about)
-        pairs = combinations(range(CHANGED + 1, frames.frames), 2)
+        if displacement[ACTUAL, UNCHANGED] > STRAY * least:
+            return "target cannot be simulated again"
+        pairs = combinations(range(UNCHANGED + 1, frames.frames), 2)
         choices = np.array([(ACTUAL, CHANGED, *pair) for pair in pairs])
         choices = distinct_choices(choices, displacement, least)
         if not len(choices):
@@ -206,19 +214,19 @@ class InterventionPicker(ContactPicker):
         question = EVENT_QUESTION
         if chosen.vanishes:
             question = UNSEEN.format(scene.objects[chosen.changed].noun_phrase) + question
-        shown = frame_displacements(frames, about)[np.ix_(choices[best], choices[best])]
-        least = float(shown[np.triu_indices(4, 1)].min())
+        least = least_displacement(frames, choices[best], about)
         return new_item(recipe, scene, timing, candidates, least, question=question)
 
 
 def sample_variations(
     scene: Scene, stop: int, intervention: Intervention, rng: np.random.Generator
 ) -> Iterator[Branch]:
-    """Sample variations of a scene's own future, which are other outcomes of its next collision,
-    and of the changed future, in which the objects that move have other velocities."""
+    """Yield the unchanged continuation of a scene, then variations of its own future, which are
+    other outcomes of its next collision, and of the changed future, in which the objects that move
+    have other velocities."""
     pair = next_collision(scene, stop).objects
-    outcomes = [*sample_outcomes(scene, stop, pair, rng)]
-    yield from (branch for source, branch in outcomes[1:] if source != GHOST)
+    outcomes = sample_outcomes(scene, stop, pair, rng)
+    yield from (branch for source, branch in outcomes if source != GHOST)
     states = intervention.branch.states
     speeds = np.linalg.norm(states[:, 7:9], axis=-1)
     varied = np.repeat(states[None], VARIATIONS, axis=0)
@@ -234,13 +242,6 @@ def without_object(motion: Motion, index: int, world: WorldConfig) -> Motion:
     """Return a motion in which an object vanishes after the first frame."""
     states = np.concatenate([motion.states[:1], move_away(motion.states[1:], index, world)])
     return replace(motion, states=states)
-
-
-def future_frames(scene: Scene, stop: int, motions: Sequence[Motion], world: WorldConfig) -> Scene:
-    """Return as a scene the last observed frame and the last frame of each motion."""
-    own = scene_states(scene)[stop]
-    states = np.stack([own, *(motion.states[-1] for motion in motions)])
-    return scene_with_states(scene, "futures", states, world)
 
 
 def join_collisions(scene: Scene, stop: int, motion: Motion) -> tuple[Collision, ...]:
