@@ -43,7 +43,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
-from transformers import PreTrainedModel, TrainingArguments
+from transformers import PreTrainedModel, ProcessorMixin, Qwen3VLProcessor, TrainingArguments
 
 if TYPE_CHECKING:
     from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
@@ -86,6 +86,19 @@ def encoder_outputs(layers: Iterable[torch.Tensor]) -> BaseModelOutputWithDeepst
     return BaseModelOutputWithDeepstackFeatures(
         pooler_output=(merged,), deepstack_features=[(layer,) for layer in deepstack]
     )
+
+
+def write_clips_as_released(processor: ProcessorMixin) -> None:
+    """Let the prompts of a Qwen3-VL have one pair of vision tokens around each group of frames.
+
+    Released chat templates write a clip as `<|vision_start|><|video_pad|><|vision_end|>`. The
+    processors of that time replaced these three tokens; since transformers 5.10 they replace the
+    placeholder alone, and a second pair would remain around the whole clip.
+    """
+    if isinstance(processor, Qwen3VLProcessor) and processor.chat_template:
+        clip = processor.video_token
+        marked = f"{processor.vision_start_token}{clip}{processor.vision_end_token}"
+        processor.chat_template = processor.chat_template.replace(marked, clip)
 
 
 def keep_differentiable(model: nn.Module) -> None:

@@ -37,7 +37,7 @@ from models.checks import (
     check_processor,
     first_line,
 )
-from models.compat import keep_differentiable
+from models.compat import keep_differentiable, write_clips_as_released
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
@@ -86,6 +86,7 @@ def load_base(
             cfg.model, **weight_options(cfg, precision), **origin, output_loading_info=True
         )
         check_complete(cfg.model, info["missing_keys"])
+    write_clips_as_released(processor)
     choose_attention(model, precision, cfg.max_length)
     pin_sizes(processor, cfg.image_size, cfg.frames)
     processor.tokenizer.padding_side = "left"

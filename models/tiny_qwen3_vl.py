@@ -121,7 +121,14 @@ def build_processor(
         extra_special_tokens=list(SPECIAL_TOKENS[1:]),
     )
     pixels = image_size * image_size
-    shared = {"patch_size": patch, "merge_size": MERGE, "temporal_patch_size": TEMPORAL}
+    shared = {
+        "patch_size": patch,
+        "merge_size": MERGE,
+        "temporal_patch_size": TEMPORAL,
+        # As in the released Qwen3-VL models, for images and videos alike.
+        "image_mean": [0.5, 0.5, 0.5],
+        "image_std": [0.5, 0.5, 0.5],
+    }
     return Qwen3VLProcessor(
         image_processor=Qwen2VLImageProcessor(
             size={"shortest_edge": 32 * 32, "longest_edge": pixels}, **shared

@@ -35,7 +35,7 @@ from models.checks import (
     check_modules,
     check_processor,
 )
-from models.compat import keep_differentiable
+from models.compat import keep_differentiable, write_clips_as_released
 from models.distributed import main_first
 from models.loading import (
     check_available,
@@ -103,6 +103,7 @@ def load_retriever(
             processing_kwargs=PROCESSING,
         )
     check_processor("retriever", source, config, backbone.processor)
+    write_clips_as_released(backbone.processor)
     pin_sizes(backbone.processor, cfg.image_size, cfg.frames)
     options = {
         "prompts": {"query": cfg.query_instruction, "document": cfg.frame_instruction},
