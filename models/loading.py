@@ -21,6 +21,7 @@ from transformers import (
     BitsAndBytesConfig,
     PreTrainedModel,
     ProcessorMixin,
+    Qwen3VLVideoProcessor,
 )
 from transformers.utils import logging as transformers_logging
 
@@ -120,21 +121,29 @@ def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
 
 
 def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
-    """Make a processor resize frames to one size in images and in videos of up to `frames` frames.
+    """Make a processor resize a frame to one size in images and in clips of up to 2 x `frames`.
 
-    Its edge is the multiple of the edge of a visual token (patch size x merge size) nearest to
-    image_size. By default, a video has another pixel budget than an image, and one frame could get
-    two sizes.
+    A square frame of `image_size` px gets the edge that is the nearest multiple of the edge of a
+    visual token (patch size x merge size). Larger frames are shrunk to about this area. By default,
+    a video has another pixel budget than an image, and one frame could get two sizes. In clips of
+    an odd number of frames, processors count a frame too many or too few, and frames whose area is
+    near the limit can differ.
     """
     step = processor.image_processor.patch_size * processor.image_processor.merge_size
-    edge = round(image_size / step) * step
-    # Both edges are numbers of pixels. A video gets twice the pixels of its frames: then it is not
-    # shrunk if its number of frames is odd and the processor pads it.
-    budgets = ((processor.image_processor, 1), (processor.video_processor, 2 * frames))
-    for part, images in budgets:
-        part.size = {"shortest_edge": step * step, "longest_edge": images * edge * edge}
-    processor.video_processor.do_sample_frames = False
-    processor.video_processor.cap_pixels_per_frame = False
+    # An eighth more than the tokens of a square frame: then this frame is not shrunk in an odd
+    # clip, of which a processor counts at most 8 frames for 7.
+    tokens = -(-(round(image_size / step) ** 2) * 8 // 7)
+    limit = {"shortest_edge": step * step, "longest_edge": tokens * step * step}
+    video = processor.video_processor
+    processor.image_processor.size, video.size = limit, dict(limit)
+    if isinstance(video, Qwen3VLVideoProcessor):
+        # Its budget is that of a whole clip, which it divides by the number of frames.
+        video.size["longest_edge"] *= 2 * frames
+        video.max_video_tokens = tokens
+        video.cap_pixels_per_frame = True
+    else:
+        video.cap_pixels_per_frame = False
+    video.do_sample_frames = False
 
 
 def load_student(
@@ -143,7 +152,9 @@ def load_student(
     """Load a student for training: its base, with new adapters if the preset has adapters."""
     base, processor = load_base(cfg, precision, corpus)
     prepare_for_training(base)
-    return (add_adapters(base, cfg.lora) if cfg.lora.rank else base), processor
+    if cfg.lora.rank:
+        return name_base(add_adapters(base, cfg.lora), cfg), processor
+    return base, processor
 
 
 def prepare_for_training(base: PreTrainedModel) -> None:
@@ -219,13 +230,24 @@ def load_trainable(
     with explain_damage(folder):
         check_adapters(folder, base, cfg.lora.rank, cfg.model)
         model = peft.PeftModel.from_pretrained(base, folder, is_trainable=True)
-    return without_embeddings(model), processor
+    return name_base(without_embeddings(model), cfg), processor
 
 
 def without_embeddings(model: nn.Module) -> nn.Module:
     """Let a model with adapters save these alone. By default, PEFT looks up the base on the hub at
     each save, to find out whether its table of embeddings has grown."""
     model.save_pretrained = partial(model.save_pretrained, save_embedding_layers=False)
+    return model
+
+
+def name_base(model: nn.Module, cfg: StudentConfig | RetrieverConfig) -> nn.Module:
+    """Let saved adapters name their base so that the libraries find it from any directory: a folder
+    by its absolute path, a hub model by its name and revision. Loading with this project ignores
+    these entries, and takes the base from the settings of the run."""
+    for config in model.peft_config.values():
+        is_folder = Path(cfg.model).is_dir()
+        config.base_model_name_or_path = str(Path(cfg.model).resolve()) if is_folder else cfg.model
+        config.revision = None if is_folder else cfg.revision
     return model
 
 

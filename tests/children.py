@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 TIMEOUT = 500
@@ -36,3 +38,12 @@ def run_child(
             raise
     assert not check or child.returncode == 0, errors
     return subprocess.CompletedProcess(command, child.returncode, output, errors)
+
+
+def run_card(folder: Path, elsewhere: Path) -> str:
+    """Run the code in the card of a trained folder with the libraries alone, in another directory.
+    Return what it prints."""
+    code = (folder / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    done = run_child([sys.executable, "-c", code], check=True, cwd=elsewhere, env=environment)
+    return done.stdout

@@ -35,6 +35,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from models.retriever.embedder import load_retriever, tokenizer_texts
     from train.common.checkpoints import newest_checkpoint
     from train.common.journal import run_metrics
+    from train.common.model_card import write_run_card
     from train.common.training_loop import explain_load_errors, run_training
     from train.retriever.batches import read_pools, split_queries
     from train.retriever.trainer_setup import build_trainer
@@ -75,10 +76,12 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     shrink = "retriever.image_size or retriever.frames"
     best_step = run_training(trainer, run, checkpoint, lower, shrink)
 
+    metrics = run_metrics(run.folder, best_step)
     if rank() == 0:
         model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
+        write_run_card(run, cfg, metrics)
     log.info("the retriever is in %s", run.folder / "retriever")
-    return run_metrics(run.folder, best_step)
+    return metrics
 
 
 if __name__ == "__main__":

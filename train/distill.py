@@ -68,7 +68,7 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     trainer = build_trainer(
         cfg, trained, run, model, teacher, processor, training, validation, checkpoint
     )
-    return train_and_save(trainer, processor, run, checkpoint, precision, "train.batch")
+    return train_and_save(trainer, processor, run, checkpoint, trained, "train.batch")
 
 
 if __name__ == "__main__":

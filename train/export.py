@@ -44,7 +44,7 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
     from models.checks import ADAPTER_WEIGHTS
     from models.resolved_settings import RESOLVED
     from models.trained_runs import EXPORT, read_export_record, settings_file
-    from train.common.model_card import build_model_card
+    from train.common.model_card import CARD, build_model_card
 
     name, run_folder, settings = find_run(cfg.run, cfg.product, cfg.checkpoints)
     saved, folder = run_folder / cfg.product, run.folder / cfg.product
@@ -76,8 +76,9 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
         for file_name in RECORDS:
             shutil.copy(run_folder / file_name, partial)
         shutil.copy(settings_file(run_folder), partial / "config.yaml")
-        card = build_model_card(name, settings, run_folder, cfg.format, measured)
-        card.save(partial / "README.md")
+        metrics = read_json(run_folder / "metrics.json")
+        card = build_model_card(name, settings, run_folder, folder, cfg.format, measured, metrics)
+        card.save(partial / CARD)
         record = {"run": name, "format": cfg.format, "weights": weights, "measured": measured}
         write_json(partial / EXPORT, record)
     for measure, value in measured.items():

@@ -60,7 +60,7 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
         cfg, run, trained.student, model, processor, training, validation, checkpoint
     )
     shrink = "train.batch or train.responses"
-    return train_and_save(trainer, processor, run, checkpoint, precision, shrink)
+    return train_and_save(trainer, processor, run, checkpoint, trained, shrink)
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from train.common import training_loop
     from train.common.checkpoints import newest_checkpoint
     from train.common.journal import run_metrics
+    from train.common.model_card import write_run_card
     from train.student.dataset import load_datasets, tokenizer_corpus
     from train.student.trainer_setup import build_trainer
 
@@ -75,10 +76,12 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     best_step = training_loop.run_training(trainer, run, checkpoint, lower, shrink)
 
     weights = training_loop.gather_weights(trainer)
+    metrics = run_metrics(run.folder, best_step)
     if rank() == 0:
         loading.save_student(model, processor, run.folder / "student", precision, weights)
+        write_run_card(run, cfg, metrics)
     log.info("the student is in %s", run.folder / "student")
-    return run_metrics(run.folder, best_step)
+    return metrics
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 from sentence_transformers.util import is_sentence_transformer_model
-from transformers import AutoConfig
+from transformers import AutoConfig, AutoProcessor
 
 from conf.errors import UserError
 from conf.runs import rank, world_size
@@ -38,10 +38,10 @@ from models.checks import (
 from models.compat import keep_differentiable, write_clips_as_released
 from models.distributed import main_first
 from models.loading import (
-    check_available,
     explain_damage,
     explain_unloadable,
     lora_config,
+    name_base,
     pin_sizes,
     weight_options,
 )
@@ -123,6 +123,7 @@ def load_retriever(
         backbone.requires_grad_(False)
         with lora_config("retriever", cfg.lora) as config:
             model.add_adapter(config)
+        name_base(backbone.model, cfg)
         for weight in backbone.parameters():
             if weight.requires_grad:
                 # Updates of the adapters would vanish in bf16's rounding.
@@ -155,16 +156,20 @@ def load_head(model: Retriever, folder: Path) -> None:
 def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retriever:
     """Load a retriever that `train.contrastive` or `train.export` saved in `folder`.
 
-    Unless they are merged, adapters are loaded on their base, which is quantised as in training.
+    Unless they are merged, adapters are loaded on the base of the preset, which is quantised as in
+    training, with the processor in `folder`.
 
     Raises:
         UserError: `folder` contains no complete retriever, or its base is not on this machine.
     """
-    if (folder / EXPORT).exists() and not (folder / ADAPTER_CONFIG).exists():
+    if (folder / ADAPTER_CONFIG).exists():
+        model = load_retriever(cfg, precision, [], folder)
+        with explain_damage(folder):
+            load_adapters(model, folder)
+            model[0].processor = AutoProcessor.from_pretrained(folder)
+        return model.eval()
+    if (folder / EXPORT).exists():
         return load_merged(folder, cfg)
-    if (folder / ADAPTER_CONFIG).exists() and cfg.model is not None:
-        # Otherwise a missing base would look like a damaged run.
-        check_available("retriever", cfg.model)
     weights = weight_options(cfg, precision)
     model = _load_saved(folder, cfg, model_kwargs=weights, trust_remote_code=cfg.trust_remote_code)
     if cfg.late is not None:

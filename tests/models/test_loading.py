@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
+import json
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from transformers import AutoModelForImageTextToText, AutoProcessor
@@ -108,3 +113,32 @@ def test_an_error_names_a_model_that_cannot_be_loaded(preset, monkeypatch, tmp_p
     (tmp_path / "empty").mkdir()
     with raises_user_error("unloadable-model"):
         loading.load_student(replace(cfg, model=str(tmp_path / "empty")), "bf16", list)
+
+
+def test_a_frame_has_one_size_in_images_and_clips(processor) -> None:
+    """Also at native 192 x 128, at other aspect ratios, and in clips of other lengths."""
+    processor = copy.deepcopy(processor)
+    sizes = [(192, 128), (128, 192), (480, 320), (64, 32), (640, 96), (40, 300), (1280, 720)]
+    for edge, frames in itertools.product((96, 120, 336), (2, 3, 7, 8, 12, 16)):
+        loading.pin_sizes(processor, edge, 12)
+        for width, height in [*sizes, (edge, edge)]:
+            frame = np.zeros((height, width, 3), np.uint8)
+            image = processor.image_processor([frame], return_tensors="pt").image_grid_thw[0]
+            clip = processor.video_processor([np.stack([frame] * frames)], return_tensors="pt")
+            assert clip.video_grid_thw[0, 1:].tolist() == image[1:].tolist(), (edge, width, height)
+        assert image[1:].tolist() == [2 * round(edge / 32)] * 2
+
+
+def test_adapters_name_their_base_from_any_directory(nf4_cfg, tmp_path, monkeypatch) -> None:
+    """Adapters that are trained further name the place where the base is now."""
+    base = Path(nf4_cfg.model)
+    monkeypatch.chdir(base.parent)
+    cfg = replace(nf4_cfg, model=base.name)
+    model, processor = loading.load_student(cfg, "fp32", list)
+    loading.save_student(model, processor, tmp_path / "student", "fp32")
+    settings = tmp_path / "student" / "adapter_config.json"
+    assert json.loads(settings.read_text())["base_model_name_or_path"] == str(base)
+    elsewhere = json.loads(settings.read_text()) | {"base_model_name_or_path": "/gone"}
+    settings.write_text(json.dumps(elsewhere))
+    again, _ = loading.load_trainable(cfg, "fp32", tmp_path / "student")
+    assert again.peft_config["default"].base_model_name_or_path == str(base)

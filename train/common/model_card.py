@@ -1,4 +1,4 @@
-"""Build the model card of an export from the records of its training run."""
+"""Build the model cards of trained runs and of exports."""
 
 from __future__ import annotations
 
@@ -6,58 +6,109 @@ from dataclasses import asdict
 from pathlib import Path
 
 import yaml
-from huggingface_hub import ModelCard, ModelCardData
+from huggingface_hub import ModelCard, ModelCardData, try_to_load_from_cache
 
-from conf.files import read_json
+from conf.files import read_json, read_json_if_valid
 from conf.multirun.table import AT_START_SUFFIX
+from conf.runs import Run
 from conf.schema import ContrastiveCommand, SftCommand
+from models.checks import ADAPTER_CONFIG
 from models.fingerprints import is_hub_model
 from models.resolved_settings import read_resolved
+from models.student.prompts import choose_instruction
+from models.trained_runs import modes_of_regime
 from train.common.journal import BEST_STEP
+
+CARD = "README.md"
+QWEN3_VL = "Qwen3VLProcessor"
+"""The processor that writes the times of a clip into the prompt."""
+TIMES = (
+    "true times in seconds, which the processor writes before each pair of frames "
+    "(`<0.5 seconds>`) from the frame rate and the indices of the frames"
+)
+
+
+def write_run_card(
+    run: Run, settings: SftCommand | ContrastiveCommand, metrics: dict[str, float]
+) -> None:
+    """Write the card of the student or retriever of a run, which ends with `metrics`."""
+    product = "student" if isinstance(settings, SftCommand) else "retriever"
+    format = "adapter" if getattr(settings, product).lora.rank else "whole"
+    folder = run.folder / product
+    card = build_model_card(run.name, settings, run.folder, folder, format, {}, metrics)
+    card.save(folder / CARD)
 
 
 def build_model_card(
     name: str,
     settings: SftCommand | ContrastiveCommand,
-    folder: Path,
+    run: Path,
+    location: Path,
     format: str,
     measured: dict[str, float],
+    metrics: dict[str, float],
 ) -> ModelCard:
-    """Return the card of an export.
+    """Return the card of a trained student or retriever.
 
     Args:
         name: Name of the training run.
         settings: Settings of the training run.
-        folder: Folder of the training run.
-        format: bf16, fp32 or adapter.
+        run: Folder of the training run, with its student or retriever.
+        location: Folder from which the card's code loads the model.
+        format: bf16, fp32, adapter, or whole for a model all of whose weights were trained.
         measured: What `train.common.output_comparison.compare_outputs` returned; empty without a
             comparison.
+        metrics: Metrics of the run.
     """
     student = isinstance(settings, SftCommand)
     product = "student" if student else "retriever"
     preset, train = getattr(settings, product), settings.train
     narrated = student and train.regime != "answer_only"
     on_hub = is_hub_model(preset.model)
-    metrics = read_json(folder / "metrics.json")
+    saved = run / product
+    record = read_json(run / "run.json") if (run / "run.json").exists() else {}
+    base = None
+    if format == "adapter":
+        base = read_json(saved / ADAPTER_CONFIG)["base_model_name_or_path"]
+    licence = read_licence(preset.model, preset.revision)
+    if student:
+        modes = modes_of_regime(train.regime)
+        prompts = {
+            f"end of a prompt in {m} mode": choose_instruction(m, train.regime) for m in modes
+        }
+    else:
+        own = read_json(saved / "config_sentence_transformers.json")["prompts"]
+        prompts = {f"prompt of a {kind}": text or "none" for kind, text in own.items()}
+    processor = read_json_if_valid(saved / "processor_config.json")
+    writes_times = processor.get("processor_class") == QWEN3_VL
     merged_library = "transformers" if student else "sentence-transformers"
     return ModelCard.from_template(
         ModelCardData(
             # A local folder is not a model that the hub could link to.
             base_model=preset.model if on_hub else None,
+            license=licence,
             library_name="peft" if format == "adapter" else merged_library,
             pipeline_tag="image-text-to-text" if student else "sentence-similarity",
             tags=["dynapix", train.regime if student else "retriever"],
         ),
         template_path=str(Path(__file__).with_suffix(".md")),
         name=name,
+        student=student,
         product=product,
+        kind="SentenceTransformer" if student or not preset.late else "MultiVectorEncoder",
+        location=location.resolve(),
         format=format,
+        quantized=format == "adapter" and preset.quantization == "nf4",
         preset=preset,
-        digest=None if on_hub else read_resolved(folder).get("base"),
+        base=base,
+        prompts=prompts,
+        times=TIMES if writes_times else "those that the processor of the base tells the model",
+        licence=licence,
+        digest=None if on_hub else read_resolved(run).get("base"),
         benchmark=settings.benchmark,
         seed=settings.seed,
         teacher=settings.teacher if narrated else None,
-        record=read_json(folder / "run.json"),
+        record=record,
         settings=yaml.safe_dump({product: asdict(preset), "train": asdict(train)}, sort_keys=False),
         items="items" if student else "queries",
         best_step=metrics.get(BEST_STEP),
@@ -66,3 +117,14 @@ def build_model_card(
         at_start=AT_START_SUFFIX,
         measured=measured,
     )
+
+
+def read_licence(model: str | None, revision: str | None) -> str | None:
+    """Return the licence that the card of a base names, if the card is on this machine."""
+    if model is None:
+        return None
+    path = Path(model) / CARD
+    if is_hub_model(model):
+        cached = try_to_load_from_cache(model, CARD, revision=revision)
+        path = Path(cached) if isinstance(cached, str) else path
+    return ModelCard.load(path).data.license if path.exists() else None

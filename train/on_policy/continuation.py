@@ -27,6 +27,7 @@ from models.trained_runs import (
     read_trained_settings,
 )
 from train.common.journal import run_metrics
+from train.common.model_card import write_run_card
 from train.common.training_loop import run_training
 
 log = logging.getLogger(__name__)
@@ -122,19 +123,22 @@ def train_and_save(
     processor: ProcessorMixin,
     run: Run,
     checkpoint: Path | None,
-    precision: str,
+    trained: SftCommand,
     shrink: str,
 ) -> dict[str, float]:
     """Train a student, save it in the run's folder, and return the run's metrics.
 
     Args:
         trainer: A trainer with a `response_sampler`.
+        trained: The settings of the student, from `resolve_continuation`.
         shrink: Settings that save memory if they are lowered, but change the result.
     """
     lower = "lower train.micro_batch or train.sampling_batch,"
     best_step = run_training(trainer, run, checkpoint, lower, shrink)
+    metrics, folder = run_metrics(run.folder, best_step), run.folder / "student"
     if rank() == 0:
-        loading.save_student(trainer.model, processor, run.folder / "student", precision)
+        loading.save_student(trainer.model, processor, folder, trained.train.precision)
+        write_run_card(run, trained, metrics)
     trainer.response_sampler.close()
-    log.info("the student is in %s", run.folder / "student")
-    return run_metrics(run.folder, best_step)
+    log.info("the student is in %s", folder)
+    return metrics

@@ -24,10 +24,11 @@ from conf.schema import (
 from models import compat, loading
 from models.resolved_settings import resolve_run
 from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
-from tests.children import run_child
+from tests.children import run_card, run_child
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import export
+from train.common.model_card import write_run_card
 from train.common.output_comparison import require_benchmark
 
 METRICS = {"recall@10_at_start": 0.25, "recall@10": 0.5}
@@ -138,6 +139,19 @@ def test_the_card_describes_the_run(forms) -> None:
     assert card.data.pipeline_tag == "sentence-similarity"
     assert "  widths:\n  - 64\n  - 32\n" in card.text
     assert "| recall@10 | 0.25 | 0.5 |" in card.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", ["run", "fp32", "adapter"])
+def test_the_code_of_the_card_runs_from_another_directory(
+    settings, runs, forms, tmp_path, format
+) -> None:
+    folder = runs / "contrastive" / "run" / "retriever"
+    if format == "run":
+        write_run_card(Run("run", folder.parent), settings, METRICS)
+    else:
+        folder = forms[format][1]
+    assert "tensor([[" in run_card(folder, tmp_path)
 
 
 def test_a_missing_benchmark_is_not_built(settings, runs, tmp_path) -> None:

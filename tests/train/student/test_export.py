@@ -33,11 +33,11 @@ from models.student.collator import encode
 from models.student.prompts import selection_sample
 from models.trained_runs import read_trained_settings, run_title
 from teacher.narrate import ensure_rationales
-from tests.children import run_child
+from tests.children import run_card, run_child
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train import export
-from train.common.model_card import build_model_card
+from train.common.model_card import build_model_card, write_run_card
 from train.common.output_comparison import ModelOutputs, compare_outputs
 from train.student.merge import StudentMerge
 
@@ -257,12 +257,26 @@ def test_the_card_describes_the_run(settings, runs, exports) -> None:
     ):
         assert row in card.text
     hub = replace(settings, student=replace(settings.student, model="Qwen/Qwen3-VL-2B-Instruct"))
+    run = runs / "sft" / "run"
     card = build_model_card(
-        "run", hub, runs / "sft" / "run", "bf16", {"answer_logit_difference": 0.0125}
+        "run", hub, run, run / "student", "bf16", {"answer_logit_difference": 0.0125}, METRICS
     )
     assert card.data.base_model == "Qwen/Qwen3-VL-2B-Instruct"
     assert "| answer logit difference | 0.0125 |" in card.text
     assert "unquantised base" not in card.text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", ["run", "fp32", "adapter"])
+def test_the_code_of_the_card_runs_from_another_directory(
+    settings, runs, exports, tmp_path, format
+) -> None:
+    folder = runs / "sft" / "run" / "student"
+    if format == "run":
+        write_run_card(Run("run", folder.parent), settings, METRICS)
+    else:
+        folder = exports[format][1]
+    run_card(folder, tmp_path)
 
 
 def test_differences_are_relative_to_the_values_or_their_scale() -> None:
