@@ -45,12 +45,14 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     matcher = next(
         open_embedders(matcher_folder, matcher_settings, store, run.folder, cfg.matcher.batch)
     )
+    chosen = [text_matching.ROUTES[key] for key in routes]
+    # No text is written for a matcher that cannot be loaded, or cannot embed what a route compares.
+    matcher.try_out(None if all(route.captions for route in chosen) else database[0])
     student = trained.student
     sample_of = partial(text_sample, FrameReader(store, student.image_size), student.frames)
     model = open_generator(cfg, folder, trained)
     name = model.name
     log.info("collecting the texts of %s", name)
-    chosen = [text_matching.ROUTES[key] for key in routes]
     responses = text_matching.collect_texts(
         cfg, student, model, sample_of, chosen, queries, database, store, run.folder
     )

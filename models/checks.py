@@ -37,8 +37,6 @@ PROCESSOR_FIELDS = {
 """Fields of a processor, and the fields of the model's configuration that they must equal."""
 SINGLE_VECTOR_MODULES = ("Transformer", "Pooling", "Normalize")
 """Types of the modules of a single-vector retriever, of which only the first has weights."""
-POOLING = "lasttoken"
-"""Sentence-transformers' name of the pooling of a single-vector retriever."""
 
 
 def check_family(model: str, config: PreTrainedConfig) -> None:
@@ -140,57 +138,26 @@ def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) 
             )
 
 
-def check_is_qwen3_vl(model: str, config: PreTrainedConfig) -> None:
-    """Raise UserError if a retriever's base is not a Qwen3-VL, on whose attention masks, positions
-    and vision features the trainer relies."""
-    if config.model_type != "qwen3_vl":
-        raise UserError(
-            f"retriever.model={model} is a {config.model_type}; retriever.encoder=qwen3_vl loads "
-            "and trains Qwen3-VL models only, such as Qwen3-VL-Embedding",
-            code="unsupported-model",
-        )
-
-
-def check_modules(saved: str | Path, revision: str | None = None, late: bool = False) -> None:
-    """Check that a saved retriever is only a backbone, last-token pooling and normalisation.
-
-    Args:
-        saved: Folder of the retriever, or its name on the hub.
-        late: Whether it is the base of a multi-vector retriever, which ignores its pooling.
-
-    Raises:
-        UserError: The retriever has other modules, whose weights would be lost if it were used as a
-            base; or it does not pool the last token; or the list of its modules is damaged.
-    """
-    from sentence_transformers.sentence_transformer.modules import Pooling
+def check_late_base(source: str, config: PreTrainedConfig, revision: str | None) -> None:
+    """Raise UserError if a model cannot be the base of a multi-vector retriever: it is no Qwen3-VL,
+    by whose tokens the scored tokens are found, or it is a saved retriever with modules after its
+    backbone whose weights would be lost."""
     from sentence_transformers.util import load_file_path
 
-    try:
-        path = load_file_path(str(saved), "modules.json", revision=revision)
-        modules = json.loads(Path(path).read_text())
-        paths = {module["type"].rpartition(".")[2]: module["path"] for module in modules}
-        pooling = None
-        if "Pooling" in paths:
-            config = Pooling.load_config(str(saved), paths["Pooling"], revision=revision)
-            pooling = config.get("pooling_mode")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    if config.model_type != "qwen3_vl":
         raise UserError(
-            f"{saved} is damaged: its list of modules cannot be read ({error}); train or download "
-            "it again",
-            code="damaged-file",
-        ) from error
-    if lost := [kind for kind in paths if kind not in SINGLE_VECTOR_MODULES]:
-        raise UserError(
-            f"{saved} has modules after its backbone that would be lost if it were used as a base "
-            f"({', '.join(lost)}): give another base, or evaluate the run that trained it "
-            "(model=RUN)",
+            f"retriever.model={source} is a {config.model_type}, but late interaction finds the "
+            "tokens to score in Qwen3-VL only: set retriever.late=null, or give a Qwen3-VL",
             code="unsupported-model",
         )
-    if not late and pooling != POOLING:
-        actual = f"with {pooling} pooling" if pooling else "without pooling"
+    path = load_file_path(source, "modules.json", revision=revision)
+    modules = json.loads(Path(path).read_text()) if path else []
+    kinds = [module["type"].rpartition(".")[2] for module in modules]
+    if lost := [kind for kind in kinds if kind not in SINGLE_VECTOR_MODULES]:
         raise UserError(
-            f"{saved} was saved {actual}, but embeddings are taken from the last token "
-            f"({POOLING}): give a run of train.contrastive or a Qwen3-VL-Embedding model",
+            f"{source} has modules after its backbone that would be lost if it were used as a base "
+            f"({', '.join(lost)}): give another base, or evaluate the run that trained it "
+            "(model=RUN)",
             code="unsupported-model",
         )
 

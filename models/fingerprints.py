@@ -23,13 +23,17 @@ PROCESSOR_FILES = (
     "*processor_config.json",
     "*token*.json",
     "chat_template*",
+    "config_sentence_transformers.json",
+    "modules.json",
+    "*_Pooling/config.json",
     "additional_chat_templates/*",
     "merges.txt",
     "sentence_bert_config.json",
     "tokenizer.model",
     "vocab.*",
 )
-"""Patterns of the files that define how text and pixels become a model's input."""
+"""Patterns of the files that define how text and pixels become a model's input, and how a retriever
+pools its output."""
 
 
 def settings_key(settings: Any) -> str:

@@ -45,9 +45,11 @@ from models.trained_runs import EXPORT
 UNQUANTIZED = ["model.visual", "visual", "lm_head"]
 """Prefixes of the names of modules that are not quantised. The vision tower is model.visual in a
 generative model, and visual in a model without a language head."""
+UNQUANTIZED += ["vision_tower", "vision_model", "multi_modal_projector", "connector"]
 DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
-LOAD_ERRORS = (OSError, ValueError, KeyError, TypeError, SafetensorError)
-"""Errors that libraries raise for files that are missing, truncated or of another kind."""
+LOAD_ERRORS = (OSError, ValueError, KeyError, TypeError, ImportError, SafetensorError)
+"""Errors that libraries raise for files that are missing, truncated or of another kind, and for
+packages that a model's own code needs."""
 
 Corpus = Callable[[], Iterable[str]]
 """Returns the texts on which the tokenizer of a built model is trained."""

@@ -53,8 +53,8 @@ def student_cfg() -> StudentConfig:
 def retriever_cfg() -> RetrieverConfig:
     return RetrieverConfig(
         name="small", architecture=SMALL, quantization="none", lora=LoraConfig(rank=0),
-        image_size=96,
-        widths=[64, 32],
+        image_size=96, widths=[64, 32], query_instruction="Retrieve images or text.",
+        frame_instruction="Represent the user's input.",
     )  # fmt: skip
 
 

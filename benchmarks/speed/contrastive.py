@@ -46,7 +46,7 @@ from models import compat
 from models.fast_layers import use_fast_layers
 from models.precision import resolve_precision
 from models.retriever import embedder
-from models.retriever.embedder import Retriever
+from models.retriever.inputs import Retriever, frame_input, query_input
 from train.retriever.batches import QueryBatchSampler
 from train.retriever.trainer import NUMBER, numbered_rows
 from train.retriever.trainer_setup import build_trainer
@@ -149,10 +149,10 @@ def build_plain_trainer(
 ) -> Trainer:
     """Return a trainer with the library's collator and losses."""
     columns = ["query", "target", *(f"negative_{k}" for k in range(cfg.train.hard_negatives))]
-    prompts = dict.fromkeys(columns, cfg.retriever.frame_instruction)
+    prompts = dict.fromkeys(columns, model.prompts["document"])
     collator = FrameCollator(
         preprocess_fn=model.preprocess,
-        prompts=prompts | {"query": cfg.retriever.query_instruction},
+        prompts=prompts | {"query": model.prompts["query"]},
     )
     collator.load = lambda number: load_columns(queries[number], columns, frames, cfg)
     ranking = CachedMultipleNegativesRankingLoss(
@@ -180,8 +180,8 @@ def load_columns(
     query: RetrievalQuery, columns: Sequence[str], frames: FrameReader, cfg: ContrastiveCommand
 ) -> dict[str, Any]:
     """Return the inputs of a query, its target and its hard negatives, with their pixels."""
-    images = (embedder.frame_input(f, frames) for f in (query.target, *query.hard_negatives))
-    inputs = [embedder.query_input(query, frames, cfg.retriever), *images]
+    images = (frame_input(f, frames) for f in (query.target, *query.hard_negatives))
+    inputs = [query_input(query, frames, cfg.retriever), *images]
     return dict(zip(columns, inputs, strict=False))
 
 

@@ -240,10 +240,11 @@ class ContrastiveCommand(CommandConfig):
                 f"train.hard_negatives={self.train.hard_negatives} is more than "
                 f"benchmark.retrieval.hard_negatives={self.benchmark.retrieval.hard_negatives}"
             )
-        if self.retriever.encoder != "qwen3_vl":
+        if self.retriever.encoder != "sentence_transformers":
             yield (
-                f"retriever.encoder={self.retriever.encoder} can be evaluated but not trained: "
-                "choose a Qwen3-VL retriever, such as retriever=qwen3_vl_emb_8b"
+                f"retriever.encoder={self.retriever.encoder} can be evaluated but not trained: set "
+                "retriever.encoder=sentence_transformers, or choose another retriever, such as "
+                "retriever=qwen3_vl_emb_8b"
             )
         weights, widths = self.train.width_weights, self.retriever.widths
         if weights is not None and (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from conf.schema.settings import MISSING, Settings, path, setting
 
-ENCODERS = ("qwen3_vl", "vlm2vec", "dual", "languagebind")
+ENCODERS = ("sentence_transformers", "vlm2vec", "dual", "languagebind")
 
 
 @dataclass
@@ -135,10 +135,11 @@ class LateConfig(Settings):
 
 @dataclass
 class RetrieverConfig(ModelConfig):
-    encoder: str = setting("qwen3_vl", ENCODERS)
-    """Kind of model. qwen3_vl and vlm2vec embed a prefix and its question as one input; dual (CLIP,
-    SigLIP 2) and languagebind embed them separately and add the embeddings. Only qwen3_vl can be
-    trained; the others are evaluated as released."""
+    encoder: str = setting("sentence_transformers", ENCODERS)
+    """How the model is loaded. sentence_transformers loads any model that this library loads, and
+    trains those that read images; a saved retriever keeps its pooling and its prompts, and another
+    model gets last-token pooling. vlm2vec, dual (CLIP, SigLIP 2) and languagebind are released
+    models that are only evaluated."""
     image_model: str | None = path(None)
     """Model that embeds frames, for languagebind only; `model` embeds prefixes and questions."""
     image_revision: str | None = None
@@ -148,10 +149,11 @@ class RetrieverConfig(ModelConfig):
     late: LateConfig | None = None
     """Settings of late interaction, with one vector per token; +exp=late_interaction sets them.
     null embeds each query and each frame as a single vector."""
-    query_instruction: str = "Retrieve images or text relevant to the user's query."
-    """System prompt of a query."""
-    frame_instruction: str = "Represent the user's input."
-    """System prompt of a frame."""
+    query_instruction: str | None = None
+    """Prompt of a query: the system message of a chat model. null keeps the prompt of a saved
+    retriever; a model without pooling gets that of Qwen3-VL-Embedding."""
+    frame_instruction: str | None = None
+    """Prompt of a frame, as `query_instruction`."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)

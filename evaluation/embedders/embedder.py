@@ -24,7 +24,7 @@ from data.records import FrameRef, RetrievalQuery, SelectionItem
 from data.store import Store
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.metrics.results import UNTRAINED
-from models.checks import check_modules, check_widths
+from models.checks import check_widths
 from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
 from models.precision import resolve_precision
 from models.resolved_settings import check_base
@@ -84,6 +84,17 @@ class Embedder:
         from evaluation.embedders.joint_encoder import load_encoder
 
         return load_encoder(self.preset, self.precision, self.saved)
+
+    def try_out(self, frame: FrameRef | None) -> None:
+        """Embed a text and, unless it is None, a frame, and release the encoder.
+
+        Raises:
+            UserError: The encoder cannot be loaded, or cannot embed one of them.
+        """
+        self.encoder.embed_texts(["A frame."])
+        if frame is not None:
+            self.encoder.embed_frames([frame], self.frames)
+        self.__dict__.pop("encoder")
 
     def embed_queries(self, queries: Sequence[Query]) -> EmbeddingCache:
         """Embed prefixes with their questions. The cache stores them by `Query.name`."""
@@ -190,16 +201,13 @@ def open_embedders(
         run: Folder of the evaluation. A base that is built from a seed is saved there.
 
     Raises:
-        UserError: The weights of a trained retriever's local base have changed since the training,
-            or its modules are damaged or not supported.
+        UserError: The weights of a trained retriever's local base have changed since the training.
     """
     preset, precision = trained.retriever, resolve_precision(trained.train.precision)
     inputs = store, FrameReader(store, preset.image_size), batch
     if folder is not None:
         check_base(folder, preset)
         saved = product_folder(folder, "retriever")
-        if preset.late is None:
-            check_modules(saved)
         digests = (
             weights_digest(model_id(preset.model, preset.revision), saved),
             processor_digest(saved),
@@ -216,7 +224,8 @@ def open_embedders(
             load_retriever(preset, precision, texts, base)
         preset = replace(preset, architecture=None, model=str(base))
     preset = pin_revisions(preset)
-    name = f"{UNTRAINED} {preset.name}" if preset.encoder == "qwen3_vl" else preset.name
+    released = preset.encoder in ("vlm2vec", "dual", "languagebind")
+    name = preset.name if released else f"{UNTRAINED} {preset.name}"
     name += ", late" if preset.late is not None else ""
     source = model_id(preset.model, preset.revision)
     image_source = model_id(preset.image_model, preset.image_revision)

@@ -14,10 +14,11 @@ from data.records import FrameRef
 from evaluation.embedders.cache import pad_rows
 from evaluation.embedders.embedder import Encoder, Query
 from models.compat import keep_freed_memory
-from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
+from models.retriever.embedder import load_retriever, load_trained
+from models.retriever.inputs import encode, model_inputs
 
 if TYPE_CHECKING:
-    from models.retriever.embedder import Retriever
+    from models.retriever.inputs import Retriever
 
 MAX_TOKEN_PAIRS = 64 * 512**2
 """Maximum entries of the attention mask of a batch of texts: 64 texts of 512 tokens, the default
@@ -32,29 +33,20 @@ class JointEncoder:
         self._model, self._preset = model, preset
 
     def embed_queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
-        inputs = [query_input(query, frames, self._preset) for query in queries]
-        return self._encode(inputs, self._preset.query_instruction, "query")
+        return self._encode(*model_inputs(self._model, queries, frames, self._preset))
 
     def embed_frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray:
-        inputs = [frame_input(ref, frames) for ref in refs]
-        return self._encode(inputs, self._preset.frame_instruction, "document")
+        return self._encode(*model_inputs(self._model, refs, frames, self._preset))
 
     def embed_texts(self, texts: list[str]) -> np.ndarray:
         longest = max(map(len, self._model.tokenizer(texts)["input_ids"]))
         size = max(1, MAX_TOKEN_PAIRS // max(1, longest) ** 2)
-        instruction = self._preset.query_instruction
-        batches = [self._encode(batch, instruction, "query") for batch in batched(texts, size)]
-        return np.concatenate(batches)
+        return np.concatenate([self._encode(batch, "query") for batch in batched(texts, size)])
 
-    def _encode(self, inputs: list[Any], prompt: str, kind: str) -> np.ndarray:
+    def _encode(self, inputs: list[Any], kind: str) -> np.ndarray:
         """Embed inputs of one kind, query or document. A row holds the vector of an input, or all
         of its vectors one after the other."""
-        task = {} if self._preset.late is None else {"task": kind}
-        embeddings = self._model.encode(
-            inputs, prompt=prompt, batch_size=len(inputs), convert_to_numpy=True,
-            show_progress_bar=False, **task,
-        )  # fmt: skip
-        return pad_rows([np.ravel(e) for e in embeddings])
+        return pad_rows([v.numpy().ravel() for v in encode(self._model, inputs, kind, len(inputs))])
 
 
 def load_encoder(preset: RetrieverConfig, precision: str, saved: Path | None) -> Encoder:

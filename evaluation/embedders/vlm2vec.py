@@ -54,7 +54,9 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
     backbone.register_forward_pre_hook(use_text_positions)
     pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    return SentenceTransformer(modules=[backbone, pooling, Normalize()], device=device)
+    prompts = {"query": preset.query_instruction, "document": preset.frame_instruction}
+    modules = [backbone, pooling, Normalize()]
+    return SentenceTransformer(modules=modules, device=device, prompts=prompts)
 
 
 def use_text_positions(module: Any, args: tuple[dict[str, Any]]) -> None:

@@ -1,16 +1,17 @@
-"""Load retrievers with sentence-transformers, and embed queries and frames.
+"""Load retrievers with sentence-transformers.
 
-Inputs have the form of Qwen3-VL-Embedding's: the instruction is the system message, a video and a
-question (a query) or an image (a frame) are the user message, and a generation prompt follows. The
-embedding is the normalised hidden state of the last token, or one vector per token
-(`models.retriever.multi_vector`). Saved retrievers are plain `SentenceTransformer` or
-`MultiVectorEncoder` models.
+Any model that the library loads can be a retriever; `models.retriever.inputs` gives it its inputs.
+A saved retriever keeps its modules and its prompts. Another model takes its inputs in the form of
+Qwen3-VL-Embedding's: the prompt is the system message, the query or the frame is the user message,
+and a generation prompt follows. The embedding is the normalised hidden state of the last token, or
+one vector per token (`models.retriever.multi_vector`). Trained retrievers are saved as plain
+`SentenceTransformer` or `MultiVectorEncoder` models.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +20,17 @@ from safetensors.torch import load_file
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 from sentence_transformers.util import is_sentence_transformer_model
-from transformers import AutoConfig, AutoProcessor
+from transformers import AutoProcessor
 
-from conf.errors import UserError
-from conf.runs import rank, world_size
+from conf.runs import rank
 from conf.schema import RetrieverConfig
-from data.frames.frame_cache import FrameReader
-from data.records import FrameRef, RetrievalQuery, sample_prefix_frames
+from data.records import RetrievalQuery
 from models.attention import choose_attention
 from models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
     PEFT_PREFIX,
-    check_is_qwen3_vl,
-    check_modules,
+    check_late_base,
     check_processor,
 )
 from models.compat import keep_differentiable, write_clips_as_released
@@ -45,15 +43,12 @@ from models.loading import (
     pin_sizes,
     weight_options,
 )
+from models.parameter_counts import language_targets
+from models.retriever.inputs import Retriever, query_form
 from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
-from models.student.prompts import list_timestamps, load_clip
+from models.student.prompts import list_timestamps
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
-
-Retriever = SentenceTransformer | MultiVectorEncoder
-"""A single-vector or a multi-vector retriever."""
-QueryOrFrame = RetrievalQuery | FrameRef
-"""An input of a retriever."""
 
 PROCESSING = {
     # By default, sentence-transformers truncates long inputs, even within a video. Here, inputs are
@@ -62,12 +57,17 @@ PROCESSING = {
     "video": {"do_sample_frames": False},
     "chat_template": {"add_generation_prompt": True},
 }
+DEFAULT_PROMPTS = {
+    "query": "Retrieve images or text relevant to the user's query.",
+    "document": "Represent the user's input.",
+}
+"""Prompts of a chat model that is no saved retriever: those of Qwen3-VL-Embedding."""
 
 
 def load_retriever(
     cfg: RetrieverConfig, precision: str, texts: list[str], folder: Path
 ) -> Retriever:
-    """Load a retriever for training.
+    """Load a retriever for training, or a released one.
 
     Args:
         precision: bf16 or fp32, the precision of the forward and backward passes.
@@ -75,10 +75,9 @@ def load_retriever(
         folder: Where a built base is saved before it is loaded.
 
     Raises:
-        UserError: The model is not on this machine and cannot be downloaded; it is not a Qwen3-VL
-            or has the processor of another model; it is a saved retriever that does not pool the
-            last token, or that has other modules after its backbone; or `lora.targets` is an
-            invalid pattern or matches no module that LoRA supports.
+        UserError: The model is not on this machine and cannot be downloaded; it has the processor
+            of another model; it cannot be the base of a multi-vector retriever; or it shall be
+            trained and reads no images, or `lora.targets` is invalid or matches no module.
     """
     source = cfg.model
     if cfg.architecture is not None:
@@ -89,39 +88,21 @@ def load_retriever(
                 processor = build_processor(texts, sizes.vocabulary, cfg.image_size, sizes.patch)
                 build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
                 processor.save_pretrained(folder)
-    origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     with explain_unloadable("retriever", source):
-        if is_sentence_transformer_model(source, revision=cfg.revision):
-            check_modules(source, cfg.revision, late=cfg.late is not None)
-        config = AutoConfig.from_pretrained(source, **origin)
-        check_is_qwen3_vl(source, config)
-        backbone = Transformer(
-            source,
-            model_kwargs={**weight_options(cfg, precision), **origin},
-            processor_kwargs=origin,
-            config_kwargs=origin,
-            processing_kwargs=PROCESSING,
-        )
-    check_processor("retriever", source, config, backbone.processor)
-    write_clips_as_released(backbone.processor)
-    pin_sizes(backbone.processor, cfg.image_size, cfg.frames)
-    options = {
-        "prompts": {"query": cfg.query_instruction, "document": cfg.frame_instruction},
-        "device": "cuda" if torch.cuda.is_available() else "cpu",
-    }
-    if cfg.late is not None:
-        model = MultiVectorEncoder(modules=multi_vector_modules(backbone, cfg.late), **options)
-        keep_head_fp32(model)
-    else:
-        pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
-        model = SentenceTransformer(modules=[backbone, pooling, Normalize()], **options)
+        model = _load_base(cfg, source, weight_options(cfg, precision))
+    backbone = model[0]
+    prepare_processor(backbone, cfg, source)
+    given = {"query": cfg.query_instruction, "document": cfg.frame_instruction}
+    model.prompts |= {kind: prompt for kind, prompt in given.items() if prompt is not None}
     # Training rows contain indices instead of texts, of which a model card can show no examples.
     model.model_card_data.generate_widget_examples = False
     choose_attention(backbone.model, precision, cfg.max_length)
     keep_differentiable(backbone)
     if cfg.lora.rank:
-        backbone.requires_grad_(False)
-        with lora_config("retriever", cfg.lora) as config:
+        query_form(model, cfg)
+        (model if cfg.late is None else backbone).requires_grad_(False)
+        targets = language_targets(backbone.model, cfg.lora.targets)
+        with lora_config("retriever", replace(cfg.lora, targets=targets)) as config:
             model.add_adapter(config)
         name_base(backbone.model, cfg)
         for weight in backbone.parameters():
@@ -129,6 +110,56 @@ def load_retriever(
                 # Updates of the adapters would vanish in bf16's rounding.
                 weight.data = weight.data.float()
     return model
+
+
+def _load_base(cfg: RetrieverConfig, source: str, weights: dict[str, Any]) -> Retriever:
+    """Load a saved retriever with its own modules, or a model with those of this project."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
+    if cfg.late is None and is_sentence_transformer_model(source, revision=cfg.revision):
+        return SentenceTransformer(source, device=device, model_kwargs=weights, **origin)
+    backbone = Transformer(
+        source,
+        model_kwargs={**weights, **origin},
+        processor_kwargs=origin,
+        config_kwargs=origin,
+    )
+    options: dict[str, Any] = {"prompts": dict(DEFAULT_PROMPTS), "device": device}
+    if cfg.late is None and backbone.module_output_name == "sentence_embedding":
+        # The towers of a model such as CLIP have no prompts, and their outputs need no pooling.
+        return SentenceTransformer(modules=[backbone, Normalize()], device=device)
+    backbone.processing_kwargs = PROCESSING
+    if cfg.late is None:
+        pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
+        return SentenceTransformer(modules=[backbone, pooling, Normalize()], **options)
+    check_late_base(source, backbone.config, cfg.revision)
+    model = MultiVectorEncoder(modules=multi_vector_modules(backbone, cfg.late), **options)
+    keep_head_fp32(model)
+    return model
+
+
+def prepare_processor(backbone: Transformer, cfg: RetrieverConfig, source: str) -> None:
+    """Let the processor of a retriever's backbone give frames one size, and read inputs whole.
+    Raise UserError if it is the processor of another model."""
+    processor, kind, own = backbone.processor, backbone.config.model_type, {}
+    if kind.startswith("qwen") and "message" in backbone.modality_config:
+        check_processor("retriever", source, backbone.config, processor)
+        write_clips_as_released(processor)
+        pin_sizes(processor, cfg.image_size, cfg.frames)
+    elif hasattr(getattr(processor, "image_processor", None), "do_image_splitting"):
+        processor.image_processor.do_image_splitting = False
+    if "message" in backbone.modality_config:
+        own = {key: PROCESSING[key] for key in ("text", "video")}
+    elif text_tower := getattr(backbone.config, "text_config", None):
+        # A text tower truncates texts, as by its authors.
+        own = {"text": {"max_length": text_tower.max_position_embeddings}}
+        if kind.startswith("siglip"):
+            # SigLIP was trained without an attention mask: it attends to the padding.
+            own["text"] |= {"padding": "max_length", "return_attention_mask": False}
+    settings = backbone.processing_kwargs
+    backbone.processing_kwargs = {
+        **settings, **{key: settings.get(key, {}) | values for key, values in own.items()}
+    }  # fmt: skip
 
 
 def load_adapters(model: Retriever, folder: Path) -> None:
@@ -196,8 +227,8 @@ def tokenizer_texts(queries: list[RetrievalQuery], cfg: RetrieverConfig) -> list
     roles = ["system", "user", "assistant"]
     return [
         *questions,
-        cfg.query_instruction,
-        cfg.frame_instruction,
+        cfg.query_instruction or DEFAULT_PROMPTS["query"],
+        cfg.frame_instruction or DEFAULT_PROMPTS["document"],
         *roles,
         *list_timestamps(),
     ] * 10
@@ -207,70 +238,3 @@ def longest_query(queries: list[RetrievalQuery], tokenizer: Any) -> RetrievalQue
     """Return the query with the most tokens. Only questions differ: all clips have one length."""
     encoded = tokenizer([q.question for q in queries], add_special_tokens=False).input_ids
     return queries[max(range(len(queries)), key=lambda k: len(encoded[k]))]
-
-
-def query_input(query: RetrievalQuery, frames: FrameReader, cfg: RetrieverConfig) -> dict[str, Any]:
-    """Return a query as an input of sentence-transformers: the prefix as a video with its true
-    times, and the question."""
-    indices = sample_prefix_frames(query.prefix_start, query.prefix_stop, cfg.frames)
-    clip = load_clip(query.scene_id, indices, frames)
-    array = torch.from_numpy(clip.pixels).permute(0, 3, 1, 2)
-    return {"video": {"array": array, "video_metadata": clip.metadata}, "text": query.question}
-
-
-def frame_input(frame: FrameRef, frames: FrameReader) -> Any:
-    """Return a frame as an input of sentence-transformers: an image."""
-    return frames.image(frame.scene_id, frame.frame)
-
-
-def model_inputs(
-    items: Sequence[QueryOrFrame], frames: FrameReader, cfg: RetrieverConfig
-) -> tuple[list[Any], str]:
-    """Return inputs of sentence-transformers, and their instruction; all items are of one type."""
-    if isinstance(items[0], FrameRef):
-        return [frame_input(frame, frames) for frame in items], cfg.frame_instruction
-    return [query_input(query, frames, cfg) for query in items], cfg.query_instruction
-
-
-def embed(
-    model: Retriever,
-    items: Sequence[QueryOrFrame],
-    frames: FrameReader,
-    cfg: RetrieverConfig,
-    batch: int,
-) -> list[torch.Tensor]:
-    """Embed queries or frames; all items are of one type.
-
-    Args:
-        batch: Number of items per rank whose pixels are in memory at the same time.
-
-    Returns:
-        For each item an fp32 tensor on the CPU, (width,) or, with many vectors, (vectors, width).
-
-    Raises:
-        UserError: An embedding is not finite.
-    """
-    encode = model.encode_document if isinstance(items[0], FrameRef) else model.encode_query
-    rows: list[torch.Tensor] = []
-    # In a distributed evaluation, each call divides its inputs among the ranks.
-    step = batch * world_size()
-    for start in range(0, len(items), step):
-        part = items[start : start + step]
-        inputs, instruction = model_inputs(part, frames, cfg)
-        embedded = encode(inputs, prompt=instruction, batch_size=batch, show_progress_bar=False)
-        vectors = [torch.as_tensor(row).float().cpu() for row in embedded]
-        check_finite(vectors, part)
-        rows += vectors
-    return rows
-
-
-def check_finite(vectors: Sequence[torch.Tensor], items: Sequence[QueryOrFrame]) -> None:
-    """Raise UserError if the embedding of an item has a NaN or an Inf."""
-    for item, embedded in zip(items, vectors, strict=True):
-        if not embedded.isfinite().all():
-            kind = "frame" if isinstance(item, FrameRef) else "query"
-            raise UserError(
-                f"non-finite embedding (NaN or Inf) for {kind} {item.name}: lower train.lr or set "
-                "train.precision=fp32; the checkpoints written so far are kept",
-                code="non-finite-embedding",
-            )

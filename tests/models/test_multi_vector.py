@@ -13,13 +13,8 @@ from transformers import dynamic_module_utils
 
 from conf.compose import compose, register
 from conf.schema import ContrastiveCommand, LateConfig
-from models.retriever.embedder import (
-    frame_input,
-    load_retriever,
-    load_trained,
-    query_input,
-    tokenizer_texts,
-)
+from models.retriever.embedder import load_retriever, load_trained, tokenizer_texts
+from models.retriever.inputs import frame_input, query_input
 from models.retriever.multi_vector import find_scored_tokens
 from models.retriever.scored_tokens import ScoredTokens
 from train.common.audit import audit_retriever

@@ -17,7 +17,7 @@ from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
 from models.checks import check_widths
 from models.parameter_counts import check_parameter_counts, count_parameters
-from models.retriever.embedder import Retriever, frame_input, query_input
+from models.retriever.inputs import Retriever, model_inputs, preprocess
 from models.retriever.multi_vector import find_scored_tokens
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
@@ -62,7 +62,11 @@ def audit_retriever(
     """
     if cfg.late is None:
         check_widths(cfg, model.get_embedding_dimension())
-    query_inputs = model.preprocess([query_input(query, frames, cfg)], prompt=cfg.query_instruction)
+    query_inputs, frame_inputs = (
+        preprocess(model, *model_inputs(model, [one], frames, cfg)) for one in (query, query.target)
+    )
+    # A model with separate towers reads the question alone, and a frame without tokens.
+    query_inputs = query_inputs.get("texts", query_inputs)
     length = query_inputs["input_ids"].shape[1]
     if length > cfg.max_length:
         raise UserError(
@@ -70,15 +74,14 @@ def audit_retriever(
             f"{cfg.max_length}: raise it, or lower retriever.image_size or retriever.frames",
             code="sample-too-long",
         )
-    frame_inputs = model.preprocess(
-        [frame_input(query.target, frames)], prompt=cfg.frame_instruction
-    )
     lines = describe_model(model, model[0].processor, cfg, {**frame_inputs, **query_inputs})
     for name, inputs in (("the longest query", query_inputs), ("a frame", frame_inputs)):
-        ids = inputs["input_ids"]
+        if (ids := inputs.get("input_ids")) is None:
+            continue
         if cfg.late is None:
-            # The embedding is the hidden state of the last token alone.
-            scored = [k == ids.shape[1] - 1 for k in range(ids.shape[1])]
+            # The embedding is the hidden state of the last token, or pools those of all tokens.
+            one = any(getattr(part, "pooling_mode", None) == "lasttoken" for part in model)
+            scored = [not one or k == ids.shape[1] - 1 for k in range(ids.shape[1])]
         else:
             mask = inputs["attention_mask"]
             scored = find_scored_tokens(model).scored(ids, mask)[0].tolist()
@@ -96,11 +99,11 @@ def describe_model(
     of vision tokens in `inputs` (time x rows x columns; a step of time is a pair of frames)."""
     towers = count_parameters(model)
     check_parameter_counts(towers, cfg.name, cfg.quantization, cfg.lora.rank)
-    merge = processor.image_processor.merge_size
     grids = []
     for name, medium in (("video_grid_thw", "a video"), ("image_grid_thw", "an image")):
         if name in inputs:
             time, height, width = inputs[name][0].tolist()
+            merge = processor.image_processor.merge_size
             grids.append(f"{medium} of {time} x {height // merge} x {width // merge} tokens")
     lines = [
         f"audit of {cfg.name} ({cfg.quantization}, {'LoRA' if cfg.lora.rank else 'all weights'})",

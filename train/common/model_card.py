@@ -22,10 +22,15 @@ from train.common.journal import BEST_STEP
 CARD = "README.md"
 QWEN3_VL = "Qwen3VLProcessor"
 """The processor that writes the times of a clip into the prompt."""
-TIMES = (
-    "true times in seconds, which the processor writes before each pair of frames "
-    "(`<0.5 seconds>`) from the frame rate and the indices of the frames"
-)
+TIMES = {
+    "video": (
+        "true times, from the frame rate and the indices of the frames; a processor of Qwen3-VL "
+        "writes them in seconds before each pair of frames (`<0.5 seconds>`)"
+    ),
+    "images": "a text before each frame, in seconds (`<0.5 seconds>`)",
+    "separate": "none: a clip is the mean of its frames",
+}
+"""Times of a clip, by the form of the input (`models.retriever.inputs`)."""
 
 
 def write_run_card(
@@ -80,7 +85,9 @@ def build_model_card(
         own = read_json(saved / "config_sentence_transformers.json")["prompts"]
         prompts = {f"prompt of a {kind}": text or "none" for kind, text in own.items()}
     processor = read_json_if_valid(saved / "processor_config.json")
-    writes_times = processor.get("processor_class") == QWEN3_VL
+    modalities = read_json_if_valid(saved / "sentence_bert_config.json").get("modality_config", {})
+    form = "images" if "message" in modalities else "separate"
+    form = "video" if student or processor.get("processor_class") == QWEN3_VL else form
     merged_library = "transformers" if student else "sentence-transformers"
     return ModelCard.from_template(
         ModelCardData(
@@ -102,7 +109,8 @@ def build_model_card(
         preset=preset,
         base=base,
         prompts=prompts,
-        times=TIMES if writes_times else "those that the processor of the base tells the model",
+        form=form,
+        times=TIMES[form],
         licence=licence,
         digest=None if on_hub else read_resolved(run).get("base"),
         benchmark=settings.benchmark,

@@ -13,7 +13,7 @@ from data.frames.frame_cache import FrameReader
 from data.items.database import UniqueFrames
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
-from models.retriever.embedder import Retriever, embed
+from models.retriever.inputs import Retriever, embed
 
 FRAME_STEP = 6
 """Interval, in frames, between the frames of a scene that are considered for the database."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,8 +12,10 @@ from accelerate.utils import send_to_device
 from conf.schema import RetrieverConfig
 from data.frames.frame_cache import FrameReader
 from models.compat import encode_images, encoder_outputs
-from models.retriever.embedder import QueryOrFrame, Retriever, model_inputs
+from models.retriever.inputs import QueryOrFrame, Retriever, model_inputs, preprocess
 from models.student.collator import MEDIA
+
+log = logging.getLogger(__name__)
 
 FEATURES = "vision_features"
 """Prefix of the inputs that hold outputs of the vision tower, such as vision_features_image."""
@@ -27,7 +30,8 @@ class RetrieverInputs:
         cfg: The retriever's preset, with its instructions and the number of frames of a prefix.
         bf16: Whether the vision tower computes in bf16.
         reuse_features: Whether to compute the outputs of the frozen vision tower in the first pass
-            of a step only, and to keep them for the second pass, if there is one.
+            of a step only, and to keep them for the second pass, if there is one. Only Qwen3-VL
+            takes such outputs; other models compute them again.
     """
 
     def __init__(
@@ -39,7 +43,10 @@ class RetrieverInputs:
         reuse_features: bool = False,
     ) -> None:
         self._model, self._frames, self._cfg = model, frames, cfg
-        self._bf16, self._reuse = bf16, reuse_features
+        takes_features = model[0].config.model_type == "qwen3_vl"
+        self._bf16, self._reuse = bf16, reuse_features and takes_features
+        if reuse_features and not takes_features:
+            log.info("train.reuse_features has no effect: %s takes pixels only", cfg.name)
         self._kept: dict[tuple[QueryOrFrame, ...], dict[str, Any]] = {}
         model[0].register_forward_pre_hook(pass_features)
 
@@ -48,8 +55,7 @@ class RetrieverInputs:
         kept = self._kept.pop(tuple(items), None)
         if kept is not None:
             return kept
-        inputs, instruction = model_inputs(items, self._frames, self._cfg)
-        return self._model.preprocess(inputs, prompt=instruction)
+        return preprocess(self._model, *model_inputs(self._model, items, self._frames, self._cfg))
 
     def prepare(
         self, items: Sequence[QueryOrFrame], inputs: dict[str, Any], is_first_of_two: bool

@@ -29,7 +29,7 @@ from torch.nn.functional import cross_entropy, normalize
 
 from conf.runs import rank, world_size
 from data.records import FrameRef
-from models.retriever.embedder import QueryOrFrame, Retriever, check_finite
+from models.retriever.inputs import QueryOrFrame, Retriever, check_finite, forward
 from train.retriever.inputs import RetrieverInputs
 
 In = TypeVar("In")
@@ -118,8 +118,7 @@ class RankingLoss(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return vectors (items, vectors, width), and a mask (items, vectors) of scored vectors."""
         task = "document" if isinstance(part[0], FrameRef) else "query"
-        # The outputs have the type of the inputs, and DDP finds their tensors in a plain dict only.
-        outputs = self.model(dict(inputs), task=task)
+        outputs = forward(self.model, inputs, task)
         if (single := outputs.get("sentence_embedding")) is not None:
             return single[:, None], single.new_ones(len(single), 1, dtype=torch.bool)
         return outputs["token_embeddings"], outputs["attention_mask"].bool()
@@ -160,7 +159,9 @@ class RankingLoss(nn.Module):
             defer = k < len(parts) - 1 and world_size() > 1
             with self.model.no_sync() if defer else nullcontext(), torch.enable_grad(), states[k]:
                 embedded, _ = self._embed(part, inputs)
-                (factor * (embedded.float() * gradients[k].float()).sum()).backward()
+                # A frozen image tower has no gradient.
+                if embedded.requires_grad:
+                    (factor * (embedded.float() * gradients[k].float()).sum()).backward()
 
 
 def identical_frames(frames: Sequence[FrameRef], targets: torch.Tensor) -> torch.Tensor:

@@ -11,14 +11,8 @@ from conf.schema import ContrastiveCommand, LoraConfig
 from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
 from models import compat, loading
-from models.retriever.embedder import (
-    Retriever,
-    embed,
-    load_head,
-    load_merged,
-    load_retriever,
-    load_trained,
-)
+from models.retriever.embedder import load_head, load_merged, load_retriever, load_trained
+from models.retriever.inputs import Retriever, embed
 from train.common.output_comparison import ModelOutputs, require_benchmark
 from train.retriever.batches import split_queries
 

@@ -18,7 +18,8 @@ from sentence_transformers.sentence_transformer.data_collator import (
 )
 
 from models.checks import ADAPTER_WEIGHTS
-from models.retriever.embedder import QueryOrFrame, load_adapters
+from models.retriever.embedder import load_adapters
+from models.retriever.inputs import QueryOrFrame
 from train.retriever.batches import QueryBatchSampler
 
 NUMBER = "query"

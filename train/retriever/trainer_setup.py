@@ -10,12 +10,14 @@ from sentence_transformers import (
     SentenceTransformerTrainingArguments,
 )
 
+from conf.errors import UserError
 from conf.runs import Run, world_size
 from conf.schema import ContrastiveCommand, ContrastiveTrainConfig, RetrieverConfig
 from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
 from data.store import Store
-from models.retriever.embedder import Retriever, longest_query
+from models.retriever.embedder import longest_query
+from models.retriever.inputs import Retriever, query_form
 from train.common.arguments import common_arguments
 from train.common.audit import audit_retriever
 from train.common.callbacks import EpochCallback
@@ -51,9 +53,17 @@ def build_trainer(
         checkpoint: The checkpoint that the run resumes from, or None.
 
     Raises:
-        UserError: the model does not fit its preset, or the longest query is too long.
+        UserError: the model does not fit its preset or several ranks, or the longest query is too
+            long.
     """
     train, retriever = cfg.train, cfg.retriever
+    if world_size() > 1 and query_form(model, retriever) == "separate":
+        # DDP allows one forward pass before a backward pass.
+        raise UserError(
+            f"{retriever.name} embeds frames and questions separately, which only one rank can "
+            "train: start train.contrastive without a launcher",
+            code="unsupported-ranks",
+        )
     frames = FrameReader(store, retriever.image_size)
     log.info(audit_retriever(model, retriever, longest_query(training, model.tokenizer), frames))
     negatives = train.hard_negatives

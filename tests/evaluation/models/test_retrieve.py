@@ -26,6 +26,7 @@ from evaluation.embedders import joint_encoder
 from evaluation.embedders.embedder import EMBEDDINGS, Embedder, open_embedders
 from evaluation.metrics.results import SCENE_ALONE
 from models.retriever import embedder
+from models.retriever import inputs as retriever_inputs
 from tests.evaluation.metrics.reference import matrix_metrics, ranking_metrics
 from tests.evaluation.models.conftest import RETRIEVER, new_run, save_retriever
 from tests.user_errors import raises_user_error
@@ -77,9 +78,9 @@ def test_ranks_follow_the_definition_and_embeddings_are_computed_once(
     # The library computes equal embeddings, and the measures follow from them. Frames that score
     # within 1e-6 of the target may rank before or after it.
     model = SentenceTransformer(str(tmp_path / "run" / "retriever"), device="cpu")
-    inputs = [embedder.query_input(q, frames, RETRIEVER) for q in queries]
+    inputs = [retriever_inputs.query_input(q, frames, RETRIEVER) for q in queries]
     np.testing.assert_allclose(model.encode(inputs, prompt_name="query"), query_rows, atol=1e-5)
-    inputs = [embedder.frame_input(f, frames) for f in database]
+    inputs = [retriever_inputs.frame_input(f, frames) for f in database]
     np.testing.assert_allclose(model.encode(inputs, prompt_name="document"), frame_rows, atol=1e-5)
     targets = np.array([database.index(q.target) for q in queries])
     groups = 1 + len({q.builder for q in queries})
@@ -136,8 +137,10 @@ def test_a_multi_vector_retriever_is_measured_by_late_interaction(
     queries, database = micro_store.standard_test(), micro_store.database()
     frames = FrameReader(micro_store, 96)
     model = embedder.load_trained(cfg, "fp32", tmp_path / "run" / "retriever")
-    query_rows = model.encode_query([embedder.query_input(q, frames, RETRIEVER) for q in queries])
-    frame_rows = model.encode_document([embedder.frame_input(f, frames) for f in database])
+    query_rows = model.encode_query(
+        [retriever_inputs.query_input(q, frames, RETRIEVER) for q in queries]
+    )
+    frame_rows = model.encode_document([retriever_inputs.frame_input(f, frames) for f in database])
     targets = np.array([database.index(q.target) for q in queries])
     row = first["rows"][0]
     expected = matrix_metrics(model.similarity(query_rows, frame_rows).numpy(), targets, [1])

@@ -34,6 +34,7 @@ from evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
 from tests.evaluation.metrics.reference import matrix_metrics
 from tests.evaluation.models import released
 from tests.evaluation.models.conftest import NO_LORA, STUDENT, check_resumed, new_run, tear
+from tests.families import sentence_encoder
 from tests.user_errors import raises_user_error
 
 SERVED = StudentConfig(name="any", model="any", image_size=96, max_new_tokens=40)
@@ -249,3 +250,31 @@ def test_a_student_without_rationales_is_refused(measure, trained_student, tmp_p
     OmegaConf.save(config, tmp_path / "sft" / "config.yaml")
     with raises_user_error("unsupported-route", contains="cot_text"):
         measure(model=str(tmp_path / "sft"))
+
+
+def test_a_sentence_encoder_matches_captions_and_nothing_else(
+    store, tmp_path, micro, monkeypatch
+) -> None:
+    """For another route, it is refused before a text is written."""
+    minilm = RetrieverConfig(
+        name="minilm", model=str(sentence_encoder(tmp_path / "minilm")), widths=[32, 16], **NO_LORA
+    )
+    settings = EmbedderConfig(retriever=minilm, train=ContrastiveTrainConfig(precision="fp32"))
+    [matcher] = open_embedders(None, settings, store, tmp_path, 16)
+    queries, database = load_test(store)
+    texts = {
+        "prediction": {q.name: f"Frame {q.target.name}." for q in queries},
+        "caption": {f.name: f"Frame {f.name}." for f in database},
+    }
+    ranks = rank_by_text(ROUTES["predict_caption"], matcher, texts, queries, database)
+    assert not ranks.above.any()
+    monkeypatch.setattr("evaluation.generators.generator.open_generator", None)
+    for number, routes in enumerate((["predict_image"], None, ["cot_text", "predict_caption"])):
+        cfg = TwoStageCommand(
+            benchmark=micro, student=SERVED, store=str(store.folder.parent), routes=routes,
+            matcher=settings,
+        )  # fmt: skip
+        with raises_user_error("no-images", contains="routes=[predict_caption]"):
+            two_stage.main.__wrapped__(cfg, new_run(tmp_path / str(number)))
+    with raises_user_error("no-images", contains="minilm"):
+        matcher.embed_queries(queries)

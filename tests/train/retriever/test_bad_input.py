@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from safetensors.torch import load_file, save_file
 from sentence_transformers import SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Dense, Pooling, Transformer
@@ -19,6 +20,9 @@ from conf.errors import UserError
 from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
 from data import store
 from data.store import load_rows, save_rows, with_checksum
+from models.parameter_counts import check_parameter_counts, count_parameters
+from models.retriever.embedder import load_retriever
+from tests.families import qwen2_5_vl, sentence_encoder
 from tests.user_errors import raises_user_error
 from train import contrastive
 
@@ -121,38 +125,61 @@ def train_adapters_over(settings: ContrastiveCommand, folder: Path | str) -> Con
     return replace(settings, retriever=cfg)
 
 
-def test_a_base_with_trained_modules_after_its_backbone_is_refused(
+def test_a_multi_vector_base_with_modules_after_its_backbone_is_refused(
     contrastive_settings, saved_base, tmp_path
 ) -> None:
     saved = tmp_path / "saved"
     parts = [Transformer(saved_base), Pooling(64, pooling_mode="lasttoken"), Dense(64, 8)]
     SentenceTransformer(modules=parts).save_pretrained(str(saved), create_model_card=False)
-    assert_refused(train_adapters_over(contrastive_settings, saved), tmp_path / "run", "Dense")
     late = train_adapters_over(contrastive_settings, saved)
     late.retriever.late = LateConfig(width=8)
     assert_refused(late, tmp_path / "late", "Dense")
 
 
-def test_a_cached_hub_base_with_another_pooling_is_refused(
+def test_a_multi_vector_base_of_another_family_is_refused(contrastive_settings, tmp_path) -> None:
+    qwen2_5_vl(tmp_path / "base")
+    late = train_adapters_over(contrastive_settings, tmp_path / "base")
+    late.retriever.late = LateConfig(width=8)
+    assert_refused(late, tmp_path / "run", "qwen2_5_vl", "retriever.late=null")
+
+
+def test_a_model_that_reads_no_images_is_refused(contrastive_settings, tmp_path) -> None:
+    encoder = sentence_encoder(tmp_path / "encoder")
+    settings = train_adapters_over(contrastive_settings, encoder)
+    assert_refused(settings, tmp_path / "run", "reads images", code="no-images")
+
+
+def test_a_cached_hub_model_keeps_its_modules_and_names_its_commit(
     contrastive_settings, saved_base, tmp_path, monkeypatch
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     commit = "a1" * 20
     cached = tmp_path / "models--lab--embedder"
-    model = SentenceTransformer(modules=[Transformer(saved_base), Pooling(64, pooling_mode="mean")])
+    parts = [Transformer(saved_base), Pooling(64, pooling_mode="mean"), Dense(64, 8)]
+    model = SentenceTransformer(modules=parts, prompts={"query": "Find.", "document": ""})
     model.save_pretrained(str(cached / "snapshots" / commit), create_model_card=False)
     (cached / "refs").mkdir()
     (cached / "refs" / "main").write_text(commit)
-    cfg = train_adapters_over(contrastive_settings, "lab/embedder")
-    assert_refused(cfg, tmp_path / "run", "lab/embedder", "mean")
+    cfg = train_adapters_over(contrastive_settings, "lab/embedder").retriever
+    cfg = replace(cfg, revision=commit, query_instruction=None, frame_instruction=None)
+    loaded = load_retriever(cfg, "fp32", [], tmp_path)
+    assert loaded[1].pooling_mode == "mean"
+    assert torch.equal(loaded[2].linear.weight, model[2].linear.weight)
+    assert loaded.prompts == {"query": "Find.", "document": ""}
+    assert all("lora_" in name for name, p in loaded.named_parameters() if p.requires_grad)
+    config = loaded[0].model.peft_config["default"]
+    assert (config.base_model_name_or_path, config.revision) == ("lab/embedder", commit)
+    check_parameter_counts(count_parameters(loaded), "small", "none", 4)
 
 
-def test_a_base_of_another_family_is_refused(contrastive_settings, saved_base, tmp_path) -> None:
+def test_the_processor_of_another_model_is_refused(
+    contrastive_settings, saved_base, tmp_path
+) -> None:
     other = tmp_path / "other"
     shutil.copytree(saved_base, other)
     Qwen2VLConfig().save_pretrained(other)
-    assert_refused(train_adapters_over(contrastive_settings, other), tmp_path / "run", "qwen2_vl")
+    assert_refused(train_adapters_over(contrastive_settings, other), tmp_path / "run", str(other))
 
 
 def test_non_finite_weights_end_the_run_before_its_first_step(

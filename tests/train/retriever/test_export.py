@@ -23,7 +23,8 @@ from conf.schema import (
 )
 from models import compat, loading
 from models.resolved_settings import resolve_run
-from models.retriever.embedder import frame_input, load_retriever, load_trained, query_input
+from models.retriever.embedder import load_retriever, load_trained
+from models.retriever.inputs import frame_input, query_input
 from tests.children import run_card, run_child
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error

@@ -21,13 +21,8 @@ from torch.nn.utils.rnn import pad_sequence
 
 from conf.schema import LateConfig, LoraConfig, RetrieverConfig
 from models.fast_layers import use_fast_layers
-from models.retriever.embedder import (
-    Retriever,
-    embed,
-    load_retriever,
-    model_inputs,
-    tokenizer_texts,
-)
+from models.retriever.embedder import load_retriever, tokenizer_texts
+from models.retriever.inputs import Retriever, embed, model_inputs
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train.retriever.batches import batch_columns
@@ -106,8 +101,8 @@ def library(trained, distinct, frames) -> Gradients:
     model, cfg = trained
     features = []
     for column in batch_columns(distinct, NEGATIVES):
-        inputs, instruction = model_inputs(column, frames, cfg)
-        features.append(model.preprocess(inputs, prompt=instruction))
+        inputs, kind = model_inputs(model, column, frames, cfg)
+        features.append(model.preprocess(inputs, prompt=model.prompts[kind]))
     options = {"scale": scale(cfg), "mini_batch_size": 3}
     if cfg.late:
         loss = CachedMultiVectorMultipleNegativesRankingLoss(model, **options)
