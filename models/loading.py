@@ -42,10 +42,13 @@ from models.compat import keep_differentiable, write_clips_as_released
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.trained_runs import EXPORT
 
-UNQUANTIZED = ["model.visual", "visual", "lm_head"]
-"""Prefixes of the names of modules that are not quantised. The vision tower is model.visual in a
-generative model, and visual in a model without a language head."""
-UNQUANTIZED += ["vision_tower", "vision_model", "multi_modal_projector", "connector"]
+UNQUANTIZED = [
+    "model.visual", "visual", "vision_tower", "vision_model", "multi_modal_projector", "connector",
+    "visual_projection", "text_projection", "lm_head",
+]  # fmt: skip
+"""Prefixes of the names of modules that are not quantised. The vision tower of Qwen is model.visual
+in a generative model, and visual in a model without a language head; other names are those of
+retrievers of other families."""
 DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
 LOAD_ERRORS = (OSError, ValueError, KeyError, TypeError, ImportError, SafetensorError)
 """Errors that libraries raise for files that are missing, truncated or of another kind, and for
@@ -395,6 +398,15 @@ def explain_unloadable(group: str, model: str, key: str = "model") -> Iterator[N
         raise UserError(
             f"{group}.{key}={model} cannot be loaded from {where}: {first_line(error)}; "
             "restore its files, or give another model",
+            code="unloadable-model",
+        ) from error
+    except RuntimeError as error:
+        # A lack of memory is a RuntimeError, too.
+        if "ignore_mismatched_sizes" not in str(error):
+            raise
+        raise UserError(
+            f"{group}.{key}={model} has weights of other shapes than its config.json says: restore "
+            "the files that belong together, or give another model",
             code="unloadable-model",
         ) from error
 

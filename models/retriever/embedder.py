@@ -22,6 +22,7 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 from sentence_transformers.util import is_sentence_transformer_model
 from transformers import AutoProcessor
 
+from conf.errors import UserError
 from conf.runs import rank
 from conf.schema import RetrieverConfig
 from data.records import RetrievalQuery
@@ -91,6 +92,12 @@ def load_retriever(
     with explain_unloadable("retriever", source):
         model = _load_base(cfg, source, weight_options(cfg, precision))
     backbone = model[0]
+    if len(model) == 1 and backbone.module_output_name != "sentence_embedding":
+        raise UserError(
+            f"retriever.model={source} is a saved retriever without pooling, so its inputs have no "
+            "embedding: save it with a Pooling module, or give a base",
+            code="unsupported-model",
+        )
     prepare_processor(backbone, cfg, source)
     given = {"query": cfg.query_instruction, "document": cfg.frame_instruction}
     model.prompts |= {kind: prompt for kind, prompt in given.items() if prompt is not None}

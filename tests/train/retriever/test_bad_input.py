@@ -13,7 +13,6 @@ import torch
 from safetensors.torch import load_file, save_file
 from sentence_transformers import SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Dense, Pooling, Transformer
-from transformers import Qwen2VLConfig
 
 from conf.entry import Run
 from conf.errors import UserError
@@ -177,9 +176,21 @@ def test_the_processor_of_another_model_is_refused(
     contrastive_settings, saved_base, tmp_path
 ) -> None:
     other = tmp_path / "other"
-    shutil.copytree(saved_base, other)
-    Qwen2VLConfig().save_pretrained(other)
-    assert_refused(train_adapters_over(contrastive_settings, other), tmp_path / "run", str(other))
+    qwen2_5_vl(other)
+    for file in ("processor_config.json", "tokenizer.json", "tokenizer_config.json"):
+        shutil.copy(Path(saved_base) / file, other)
+    settings = train_adapters_over(contrastive_settings, other)
+    assert_refused(settings, tmp_path / "run", str(other), code="other-processor")
+
+
+def test_the_weights_of_another_model_are_refused(
+    contrastive_settings, saved_base, tmp_path
+) -> None:
+    other = tmp_path / "other"
+    qwen2_5_vl(other)
+    shutil.copy(Path(saved_base) / "model.safetensors", other)
+    settings = train_adapters_over(contrastive_settings, other)
+    assert_refused(settings, tmp_path / "run", str(other))
 
 
 def test_non_finite_weights_end_the_run_before_its_first_step(
