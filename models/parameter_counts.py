@@ -11,6 +11,10 @@ from conf.errors import UserError
 from models.compat import four_bit_entries
 
 TOWERS = ["vision", "language", "embeddings and head"]
+VISION = re.compile(
+    r"(^|\.)(visual|vision_\w+|image_tower|connector|aligner|(multi_modal|mm)_projector)\."
+)
+"""Names of vision towers, and of what projects their outputs to the language tower."""
 PROJECTION = "projection"
 """The projection of a multi-vector retriever's token states, all of whose weights are trained."""
 
@@ -32,7 +36,7 @@ def count_parameters(model: nn.Module) -> pd.DataFrame:
 
 
 def _tower_of(name: str) -> str:
-    if re.search(r"(^|\.)visual\.", name):
+    if VISION.search(name):
         return "vision"
     if re.fullmatch(r"\d+\.linear\.weight", name):
         return PROJECTION

@@ -55,6 +55,8 @@ Retriever = SentenceTransformer | MultiVectorEncoder
 QueryOrFrame = RetrievalQuery | FrameRef
 """An input of a retriever."""
 
+UNQUANTIZED = ("visual",)
+"""Modules of a Qwen3-VL without a head that are not quantised."""
 PROCESSING = {
     # By default, sentence-transformers truncates long inputs, even within a video. Here, inputs are
     # not truncated; `train.common.audit` raises an error before training if a query is too long.
@@ -97,7 +99,7 @@ def load_retriever(
         check_is_qwen3_vl(source, config)
         backbone = Transformer(
             source,
-            model_kwargs={**weight_options(cfg, precision), **origin},
+            model_kwargs={**weight_options(cfg, precision, UNQUANTIZED), **origin},
             processor_kwargs=origin,
             config_kwargs=origin,
             processing_kwargs=PROCESSING,
@@ -121,7 +123,7 @@ def load_retriever(
     keep_differentiable(backbone)
     if cfg.lora.rank:
         backbone.requires_grad_(False)
-        with lora_config("retriever", cfg.lora) as config:
+        with lora_config("retriever", cfg.lora, backbone.model) as config:
             model.add_adapter(config)
         for weight in backbone.parameters():
             if weight.requires_grad:
@@ -165,7 +167,7 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     if (folder / ADAPTER_CONFIG).exists() and cfg.model is not None:
         # Otherwise a missing base would look like a damaged run.
         check_available("retriever", cfg.model)
-    weights = weight_options(cfg, precision)
+    weights = weight_options(cfg, precision, UNQUANTIZED)
     model = _load_saved(folder, cfg, model_kwargs=weights, trust_remote_code=cfg.trust_remote_code)
     if cfg.late is not None:
         keep_head_fp32(model)

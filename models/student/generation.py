@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 from transformers import (
+    GenerationConfig,
     LogitsProcessor,
     LogitsProcessorList,
     ProcessorMixin,
@@ -21,6 +22,7 @@ from transformers import (
 
 from conf.schema import StudentConfig
 from models.loading import DTYPES
+from models.student.chat_format import find_end_token
 from models.student.kv_cache import create_cache
 from models.student.responses import THOUGHT_TAG, GeneratedText
 
@@ -56,8 +58,7 @@ def generate(
     with torch.no_grad(), autocast:
         ids = model.generate(
             **inputs,
-            max_new_tokens=limit,
-            do_sample=False,
+            generation_config=plain_config(processor, limit),
             past_key_values=create_cache(model),
             logits_processor=logits_processors,
         )
@@ -66,7 +67,7 @@ def generate(
     prompt_end = tokenizer.decode(prompt[0, -TAG_SEARCH_TOKENS:]).rstrip()
     start = THOUGHT_TAG if prompt_end.endswith(THOUGHT_TAG) else ""
     texts = tokenizer.batch_decode(new, skip_special_tokens=True)
-    ends = torch.tensor([tokenizer.eos_token_id, tokenizer.pad_token_id], device=new.device)
+    ends = torch.tensor(end_tokens(processor), device=new.device)
     is_end = torch.isin(new, ends)
     ended = is_end.any(dim=1) | (new.shape[1] < limit)
     # The tokens after the first end are padding.
@@ -77,6 +78,24 @@ def generate(
             texts, ended.tolist(), new.tolist(), lengths.tolist(), strict=True
         )
     ]
+
+
+def end_tokens(processor: ProcessorMixin) -> list[int]:
+    """Return the ids of the tokens that end a response: the end of a turn, of a text, padding."""
+    tokenizer = processor.tokenizer
+    ends = [find_end_token(processor), tokenizer.eos_token_id, tokenizer.pad_token_id]
+    return list(dict.fromkeys(ends))
+
+
+def plain_config(processor: ProcessorMixin, limit: int) -> GenerationConfig:
+    """Return a configuration of greedy decoding, which replaces the model's generation config, with
+    its sampling and its penalties."""
+    return GenerationConfig(
+        max_new_tokens=limit,
+        do_sample=False,
+        eos_token_id=end_tokens(processor),
+        pad_token_id=processor.tokenizer.pad_token_id,
+    )
 
 
 def sampling_processors(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProcessorList:
