@@ -7,7 +7,6 @@ Qwen do. Otherwise its frames go in as images, each after its time as text.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from transformers import ProcessorMixin, Qwen2_5_VLProcessor, Qwen3VLProcessor
@@ -25,20 +24,6 @@ EMPTY_THOUGHT = f"{THOUGHT_TAG}\n\n</think>\n\n"
 def takes_clips(processor: ProcessorMixin) -> bool:
     """Return whether clips go in as videos."""
     return isinstance(processor, TIMED_PROCESSORS)
-
-
-def show_frames_as_images(sample: Sample) -> Sample:
-    """Return a sample whose clip is replaced by its frames, each after its time in seconds."""
-    if sample.clip is None:
-        return sample
-    times = [index / sample.clip.fps for index in sample.clip.indices]
-    shown: list[dict[str, Any]] = []
-    for time in times:
-        shown += [{"type": "text", "text": f"At {time:.2f} s: "}, {"type": "image"}]
-        shown.append({"type": "text", "text": "\n"})
-    content = [p for part in sample.content for p in (shown if part["type"] == "video" else [part])]
-    images = [*sample.clip.pixels, *sample.images]
-    return replace(sample, content=content, clip=None, images=images)
 
 
 def write_prompt(sample: Sample, processor: ProcessorMixin, thinking: bool) -> str:

@@ -20,13 +20,8 @@ from transformers.video_utils import VideoMetadata
 
 from conf.errors import UserError
 from data.records import LETTERS
-from models.student.chat_format import (
-    find_end_token,
-    show_frames_as_images,
-    takes_clips,
-    write_prompt,
-)
-from models.student.prompts import Clip, Sample, answer_line
+from models.student.chat_format import find_end_token, takes_clips, write_prompt
+from models.student.prompts import Clip, Sample, answer_line, show_frames_as_images
 
 IGNORED = -100
 """Label of a token that is not in the loss: the default `ignore_index` of torch's cross-entropy."""
