@@ -6,9 +6,11 @@ batch nor on the response at which a killed command resumes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
+from peft import PeftModel
 from torch import nn
 from transformers import (
     GenerationConfig,
@@ -55,10 +57,9 @@ def generate(
     inputs = {name: value.to(device) for name, value in inputs.items() if name != "labels"}
     autocast = torch.autocast(device.type, DTYPES[precision], enabled=precision == "bf16")
     # Tensors that the model stores under torch.inference_mode could not be used in later training.
-    with torch.no_grad(), autocast:
+    with torch.no_grad(), autocast, plain_decoding(model, processor, limit):
         ids = model.generate(
             **inputs,
-            generation_config=plain_config(processor, limit),
             past_key_values=create_cache(model),
             logits_processor=logits_processors,
         )
@@ -87,15 +88,28 @@ def end_tokens(processor: ProcessorMixin) -> list[int]:
     return list(dict.fromkeys(ends))
 
 
-def plain_config(processor: ProcessorMixin, limit: int) -> GenerationConfig:
-    """Return a configuration of greedy decoding, which replaces the model's generation config, with
-    its sampling and its penalties."""
-    return GenerationConfig(
+@contextmanager
+def plain_decoding(model: nn.Module, processor: ProcessorMixin, limit: int) -> Iterator[None]:
+    """Replace a model's generation config, with its sampling and its penalties, by greedy decoding.
+
+    A config that is given to `generate` would be filled up with the values of the model's own.
+    """
+    plain = GenerationConfig(
         max_new_tokens=limit,
         do_sample=False,
         eos_token_id=end_tokens(processor),
         pad_token_id=processor.tokenizer.pad_token_id,
     )
+    # With adapters, peft copies the config of the whole model to its base.
+    models = [model, model.get_base_model()] if isinstance(model, PeftModel) else [model]
+    own = [part.generation_config for part in models]
+    for part in models:
+        part.generation_config = plain
+    try:
+        yield
+    finally:
+        for part, config in zip(models, own, strict=True):
+            part.generation_config = config
 
 
 def sampling_processors(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProcessorList:
