@@ -19,7 +19,6 @@ from conf.schema.benchmark import INTERVENTIONS, POOLS, store_name
 from data.frames.frame_cache import FrameReader
 from data.records import (
     FAMILIES,
-    LETTERS,
     SPLITS,
     FrameRef,
     RetrievalQuery,
@@ -27,8 +26,8 @@ from data.records import (
     sample_prefix_frames,
 )
 from data.store import MANIFEST, Store, open_store
-from models.student.chat_requests import image_part
-from models.student.prompts import MODES, choose_instruction
+from models.student.chat_requests import build_messages
+from models.student.prompts import MODES, selection_sample, show_frames_as_images
 from teacher.journal import read_accepted
 
 Record = TypeVar("Record")
@@ -217,22 +216,17 @@ class Item(PrefixQuestion):
     def messages(self, mode: str = "reasoning") -> list[dict[str, Any]]:
         """Return the prompt as a chat request in the format of OpenAI's API, with frames as PNGs.
 
-        The prefix is a sequence of images, each after its time, instead of a video. The question,
-        the candidates and the instruction are those of the commands.
+        The prefix is a sequence of images, each after its time, instead of a video. The prompt is
+        that of the commands for a model that is not told the times of a video.
 
         Args:
             mode: `reasoning` asks for a rationale and the letter, `answer` for the letter alone.
         """
         if mode not in MODES:
             raise UserError(f"mode={mode!r}: choose {' or '.join(MODES)}", code="unknown-option")
-        parts: list[dict[str, Any]] = []
-        for time, frame in zip(self.times, self.prefix, strict=True):
-            parts += [_text_part(f"Frame at {time:.2f} seconds:"), image_part(frame)]
-        parts.append(_text_part(self.question))
-        for letter, candidate in zip(LETTERS, self.candidates, strict=True):
-            parts += [_text_part(f"Candidate {letter}:"), image_part(candidate)]
-        parts.append(_text_part(choose_instruction(mode, "cot")))
-        return [{"role": "user", "content": parts}]
+        bench = self._benchmark
+        sample = selection_sample(self.record, mode, "cot", bench.reader, bench.frames)
+        return build_messages(show_frames_as_images(sample))
 
     @property
     def answer(self) -> str:
@@ -253,10 +247,6 @@ class Item(PrefixQuestion):
     def subtype(self) -> str:
         """The kind of item within its family."""
         return self.record.subtype
-
-
-def _text_part(text: str) -> dict[str, Any]:
-    return {"type": "text", "text": text}
 
 
 class Query(PrefixQuestion):

@@ -26,7 +26,7 @@ ADAPTER_CONFIG = "adapter_config.json"
 """File of their settings."""
 PEFT_PREFIX = "base_model.model."
 """Prefix that peft adds to the names of the modules that it adapts."""
-PROCESSOR_FIELDS = {
+QWEN_FIELDS = {
     "image_processor.patch_size": "vision_config.patch_size",
     "image_processor.merge_size": "vision_config.spatial_merge_size",
     "video_processor.patch_size": "vision_config.patch_size",
@@ -34,20 +34,22 @@ PROCESSOR_FIELDS = {
     "image_token_id": "image_token_id",
     "video_token_id": "video_token_id",
 }
-"""Fields of a processor, and the fields of the model's configuration that they must equal."""
+"""Fields of a processor of Qwen, and those of the model's configuration that they must equal."""
 SINGLE_VECTOR_MODULES = ("Transformer", "Pooling", "Normalize")
 """Types of the modules of a single-vector retriever, of which only the first has weights."""
 
 
 def check_family(model: str, config: PreTrainedConfig) -> None:
-    """Raise UserError if a student's base is not a Qwen vision-language model, whose prompts have
-    clips with true times."""
-    has_vision = getattr(config, "vision_config", None) is not None
-    if not (has_vision and config.model_type.startswith("qwen")):
-        kind = config.model_type if has_vision else f"{config.model_type}, without a vision tower"
+    """Raise UserError if a student's base is not a vision-language model of transformers."""
+    from transformers import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
+
+    # A model with code of its own registers it in its configuration.
+    own = "AutoModelForImageTextToText" in getattr(config, "auto_map", {})
+    if not own and type(config) not in MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING:
         raise UserError(
-            f"student.model={model} ({kind}): students are vision-language models of Qwen, such as "
-            "Qwen3-VL. Measure another model with dynapix.evaluate (docs/evaluation.md)",
+            f"student.model={model} ({config.model_type}) is no vision-language model that "
+            "transformers loads with AutoModelForImageTextToText: give another model, or measure "
+            "it with dynapix.evaluate (docs/evaluation.md)",
             code="unsupported-model",
         )
 
@@ -91,10 +93,12 @@ def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
         tokens, embedded = len(processor.tokenizer), config.get_text_config().vocab_size
         if tokens > embedded:
             return f"its tokenizer has {tokens} tokens, the model {embedded}"
-        for field, config_field in PROCESSOR_FIELDS.items():
+        fields = QWEN_FIELDS if config.model_type.startswith("qwen") else {}
+        for field, config_field in fields.items():
             actual, expected = attrgetter(field)(processor), attrgetter(config_field)(config)
             if actual != expected:
                 return f"its {field} is {actual}, the model's {expected}"
+        _ = processor.image_processor, processor.image_token
     except AttributeError as error:
         return f"it has no {error.name}"
     return None

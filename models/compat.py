@@ -46,7 +46,7 @@ from torch import nn
 from transformers import PreTrainedModel, ProcessorMixin, Qwen3VLProcessor, TrainingArguments
 
 if TYPE_CHECKING:
-    from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
+    from transformers.modeling_outputs import BaseModelOutputWithPooling
 
 
 def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
@@ -62,24 +62,26 @@ def checkpointing_arguments(enabled: bool) -> dict[str, Any]:
 def encode_images(
     model: PreTrainedModel, pixels: torch.Tensor, grid: torch.Tensor, bf16: bool
 ) -> list[torch.Tensor]:
-    """Return the outputs of Qwen3-VL's vision tower for each row of `grid`: an image, a clip, or a
+    """Return the outputs of a vision tower of Qwen for each row of `grid`: an image, a clip, or a
     pair of a clip's frames.
 
     Args:
         bf16: Whether the tower computes in bf16.
 
     Returns:
-        (1 + deepstack layers, tokens, hidden) tensors: the merged output, then the deepstack's.
+        (1 + deepstack layers, tokens, hidden) tensors: the merged output, then the deepstack's, of
+        which only Qwen3-VL has any.
     """
     with torch.no_grad(), torch.autocast(pixels.device.type, torch.bfloat16, enabled=bf16):
         outputs = model.get_image_features(pixels, grid)
-    layers = zip(outputs.pooler_output, *outputs.deepstack_features, strict=True)
-    return [torch.stack(image) for image in layers]
+    layers = [outputs.pooler_output, *getattr(outputs, "deepstack_features", [])]
+    return [torch.stack(image) for image in zip(*layers, strict=True)]
 
 
-def encoder_outputs(layers: Iterable[torch.Tensor]) -> BaseModelOutputWithDeepstackFeatures:
+def encoder_outputs(layers: Iterable[torch.Tensor]) -> BaseModelOutputWithPooling:
     """Return the vision tower's outputs for images or clips as an entry of `mm_encoder_outputs`,
-    which Qwen3-VL's `forward` takes instead of pixels. `layers` are as in `encode_images`."""
+    which the `forward` of a Qwen model takes instead of pixels. `layers` are as in
+    `encode_images`."""
     from transformers.models.qwen3_vl.modeling_qwen3_vl import BaseModelOutputWithDeepstackFeatures
 
     merged, *deepstack = layers

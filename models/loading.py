@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -21,6 +21,7 @@ from transformers import (
     BitsAndBytesConfig,
     PreTrainedModel,
     ProcessorMixin,
+    Qwen2VLProcessor,
     Qwen3VLVideoProcessor,
 )
 from transformers.utils import logging as transformers_logging
@@ -39,20 +40,17 @@ from models.checks import (
     first_line,
 )
 from models.compat import keep_differentiable, write_clips_as_released
+from models.student.chat_format import TIMED_PROCESSORS
 from models.tiny_qwen3_vl import build_model, build_processor
+from models.towers import choose_lora_targets, find_unquantized
 from models.trained_runs import EXPORT
 
-UNQUANTIZED = [
-    "model.visual", "visual", "vision_tower", "vision_model", "multi_modal_projector", "connector",
-    "visual_projection", "text_projection", "lm_head",
-]  # fmt: skip
-"""Prefixes of the names of modules that are not quantised. The vision tower of Qwen is model.visual
-in a generative model, and visual in a model without a language head; other names are those of
-retrievers of other families."""
 DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
-LOAD_ERRORS = (OSError, ValueError, KeyError, TypeError, ImportError, SafetensorError)
+CROPS = ("do_image_splitting", "crop_to_patches", "do_pan_and_scan")
+"""Options of image processors that divide an image into crops."""
+LOAD_ERRORS = (ImportError, OSError, ValueError, KeyError, TypeError, SafetensorError)
 """Errors that libraries raise for files that are missing, truncated or of another kind, and for
-packages that a model's own code needs."""
+processors that need a library which is not installed."""
 
 Corpus = Callable[[], Iterable[str]]
 """Returns the texts on which the tokenizer of a built model is trained."""
@@ -72,8 +70,7 @@ def load_base(
 
     Raises:
         UserError: The model is neither a local folder nor in the hub's cache and cannot be
-            downloaded, it is no vision-language model of Qwen, or its processor belongs to another
-            model.
+            downloaded, it is no vision-language model, or its processor belongs to another model.
     """
     if cfg.architecture is not None:
         sizes = cfg.architecture
@@ -88,8 +85,10 @@ def load_base(
         check_family(cfg.model, config)
         processor = AutoProcessor.from_pretrained(cfg.model, **origin)
         check_processor("student", cfg.model, config, processor)
+        code = {"trust_remote_code": cfg.trust_remote_code}
+        kept = find_unquantized(AutoModelForImageTextToText, config, **code)
         model, info = AutoModelForImageTextToText.from_pretrained(
-            cfg.model, **weight_options(cfg, precision), **origin, output_loading_info=True
+            cfg.model, **weight_options(cfg, precision, kept), **origin, output_loading_info=True
         )
         check_complete(cfg.model, info["missing_keys"])
     write_clips_as_released(processor)
@@ -99,48 +98,62 @@ def load_base(
     return model, processor
 
 
-def weight_options(cfg: StudentConfig | RetrieverConfig, precision: str) -> dict[str, Any]:
+def weight_options(
+    cfg: StudentConfig | RetrieverConfig, precision: str, unquantized: Sequence[str]
+) -> dict[str, Any]:
     """Return the arguments of `from_pretrained` for the weights of a preset.
 
     If the whole model is trained, its weights are fp32; in bf16, autocast casts them for each
     operation. Otherwise the base's weights are 4-bit or, if the preset does not quantise them, in
     the given precision.
+
+    Args:
+        unquantized: Names of modules that are not quantised (see `models.towers`).
     """
     trains_all = cfg.quantization == "none" and cfg.lora.rank == 0
     dtype = torch.float32 if trains_all else DTYPES[precision]
     options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}
     if cfg.quantization == "nf4":
-        options["quantization_config"] = nf4_config(dtype)
+        options["quantization_config"] = nf4_config(dtype, unquantized)
     return options
 
 
-def nf4_config(compute: torch.dtype) -> BitsAndBytesConfig:
-    """Return a configuration that quantises the language tower, but not its head, to 4-bit NF4.
-    Computations dequantise the weights to the type `compute`."""
+def nf4_config(compute: torch.dtype, unquantized: Sequence[str]) -> BitsAndBytesConfig:
+    """Return a configuration that quantises a model to 4-bit NF4, except the modules in
+    `unquantized`. Computations dequantise the weights to the type `compute`."""
     return BitsAndBytesConfig(
         load_in_4bit=True,
         bnb_4bit_quant_type="nf4",
         bnb_4bit_compute_dtype=compute,
-        llm_int8_skip_modules=UNQUANTIZED,
+        llm_int8_skip_modules=list(unquantized),
     )
 
 
 def pin_sizes(processor: ProcessorMixin, image_size: int, frames: int) -> None:
     """Make a processor resize a frame to one size in images and in clips of up to 2 x `frames`.
 
-    A square frame of `image_size` px gets the edge that is the nearest multiple of the edge of a
-    visual token (patch size x merge size). Larger frames are shrunk to about this area. By default,
-    a video has another pixel budget than an image, and one frame could get two sizes. In clips of
-    an odd number of frames, processors count a frame too many or too few, and frames whose area is
-    near the limit can differ.
+    Qwen's processors take frames of any size. A square frame of `image_size` px gets the edge that
+    is the nearest multiple of the edge of a visual token (patch size x merge size), and larger
+    frames are shrunk to about this area. By default, a video has another pixel budget than an
+    image, and one frame could get two sizes. In clips of an odd number of frames, processors count
+    a frame too many or too few, and frames whose area is near the limit can differ.
+
+    The processors of other families resize all frames to the size of the vision tower. They do not
+    divide them into crops, of which the number would depend on their size.
     """
-    step = processor.image_processor.patch_size * processor.image_processor.merge_size
+    image_processor = processor.image_processor
+    for option in CROPS:
+        if hasattr(image_processor, option):
+            setattr(image_processor, option, False)
+    if not isinstance(processor, (*TIMED_PROCESSORS, Qwen2VLProcessor)):
+        return
+    step = image_processor.patch_size * image_processor.merge_size
     # An eighth more than the tokens of a square frame: then this frame is not shrunk in an odd
     # clip, of which a processor counts at most 8 frames for 7.
     tokens = -(-(round(image_size / step) ** 2) * 8 // 7)
     limit = {"shortest_edge": step * step, "longest_edge": tokens * step * step}
     video = processor.video_processor
-    processor.image_processor.size, video.size = limit, dict(limit)
+    image_processor.size, video.size = limit, dict(limit)
     if isinstance(video, Qwen3VLVideoProcessor):
         # Its budget is that of a whole clip, which it divides by the number of frames.
         video.size["longest_edge"] *= 2 * frames
@@ -180,13 +193,15 @@ def add_adapters(model: PreTrainedModel, lora: LoraConfig) -> nn.Module:
     import peft
 
     model.requires_grad_(False)
-    with lora_config("student", lora, task_type="CAUSAL_LM") as config:
+    with lora_config("student", lora, model, task_type="CAUSAL_LM") as config:
         return without_embeddings(peft.get_peft_model(model, config))
 
 
 @contextmanager
-def lora_config(group: str, lora: LoraConfig, task_type: str | None = None) -> Iterator[Any]:
-    """Yield peft's configuration of adapters, for adding them to a model in the block.
+def lora_config(
+    group: str, lora: LoraConfig, model: PreTrainedModel, task_type: str | None = None
+) -> Iterator[Any]:
+    """Yield peft's configuration of adapters, for adding them to `model` in the block.
 
     Raises:
         UserError: In the block, `lora.targets` is an invalid pattern or matches no module that can
@@ -199,7 +214,7 @@ def lora_config(group: str, lora: LoraConfig, task_type: str | None = None) -> I
             r=lora.rank,
             lora_alpha=lora.alpha,
             lora_dropout=lora.dropout,
-            target_modules=lora.targets,
+            target_modules=lora.targets or choose_lora_targets(model),
             task_type=task_type,
         )
     except (ValueError, re.error) as error:

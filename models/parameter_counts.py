@@ -8,10 +8,13 @@ import pandas as pd
 from torch import nn
 
 from conf.errors import UserError
-from conf.schema import LoraConfig
 from models.compat import four_bit_entries
 
 TOWERS = ["vision", "language", "embeddings and head"]
+VISION = re.compile(
+    r"(^|\.)(visual|vision_\w+|image_tower|connector|aligner|(multi_modal|mm)_projector)\."
+)
+"""Names of vision towers, and of what projects their outputs to the language tower."""
 PROJECTION = "projection"
 """The projection of a multi-vector retriever's token states, all of whose weights are trained."""
 
@@ -33,23 +36,11 @@ def count_parameters(model: nn.Module) -> pd.DataFrame:
 
 
 def _tower_of(name: str) -> str:
-    if re.search(r"(^|\.)(visual|vision|image)\w*\.", name):
+    if VISION.search(name):
         return "vision"
     if re.fullmatch(r"\d+\.linear\.weight", name):
         return PROJECTION
     return "language" if re.search(r"(^|\.)layers\.\d+\.", name) else "embeddings and head"
-
-
-def language_targets(model: nn.Module, targets: str) -> str:
-    """Return the pattern `targets` of the modules to adapt. If it is the default and matches no
-    module of the model, return one of the linear layers in the layers of its language tower."""
-    names = [name for name, module in model.named_modules() if isinstance(module, nn.Linear)]
-    if targets != LoraConfig().targets or any(re.fullmatch(targets, name) for name in names):
-        return targets
-    towers = (name for name in names if _tower_of(f"{name}.weight") == "language")
-    found = [m for name in towers if (m := re.fullmatch(r"(.*\blayers)\.\d+\.(.+)", name))]
-    stacks, layers = ("|".join(sorted({re.escape(m[k]) for m in found})) for k in (1, 2))
-    return rf"({stacks})\.\d+\.({layers})"
 
 
 def check_parameter_counts(towers: pd.DataFrame, preset: str, quantization: str, rank: int) -> None:

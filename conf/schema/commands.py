@@ -155,6 +155,14 @@ class SftCommand(CommandConfig):
     seed: int = setting(0, least=0)
     """Seed of the order of the samples and of the initial adapter weights."""
 
+    def find_problems(self, group: str) -> Iterator[str]:
+        if self.student.thinking:
+            yield (
+                "student.thinking=true: students are trained to respond without thinking; set "
+                "student.thinking=false, so that the prompts of a thinking model end with an empty "
+                "thought"
+            )
+
 
 @dataclass
 class ContinuationCommand(CommandConfig):

@@ -52,11 +52,8 @@ class LoraConfig(Settings):
     """Numerator of the adapters' scale: their output is multiplied by alpha / rank."""
     dropout: float = setting(0.0, least=0, below=1)
     """Dropout probability of the adapters' inputs."""
-    targets: str = (
-        r"(model\.)*language_model\.layers\.\d+\."
-        r"(self_attn\.[qkvo]_proj|mlp\.(gate|up|down)_proj)"
-    )
-    """Regular expression that matches the full names of the modules to adapt; by default the
+    targets: str | None = None
+    """Regular expression that matches the full names of the modules to adapt; null adapts the
     attention and feed-forward projections of the language tower."""
 
 
@@ -79,7 +76,8 @@ class ModelConfig(Settings):
     """Quantisation of the base's weights: nf4 (4 bits) or none."""
     lora: LoraConfig = field(default_factory=LoraConfig)
     image_size: int = setting(336, least=32)
-    """Width and height (px) to which frames are resized before the model's image processor."""
+    """Width and height (px) to which frames are resized before the model's image processor. Qwen's
+    processors keep this size; those of other families resize to the size of their vision tower."""
     frames: int = setting(12, least=2)
     """Number of evenly spaced frames of a prefix that the model sees."""
     max_length: int = setting(3072, least=1)

@@ -24,7 +24,7 @@ from models.fingerprints import model_id, pin_revisions, processor_digest, weigh
 from models.memory import explain_out_of_memory
 from models.resolved_settings import check_base
 from models.student.collator import Collator
-from models.student.generation import generate, sampling_processors
+from models.student.generation import end_tokens, generate, sampling_processors
 from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.trained_runs import product_folder, run_title
 
@@ -114,8 +114,8 @@ def compile_record_grammar(model: nn.Module, processor: ProcessorMixin) -> xgram
     tokens = xgrammar.TokenizerInfo.from_huggingface(
         tokenizer,
         vocab_size=model.config.get_text_config().vocab_size,
-        # Both tokens end a response, so the grammar must not allow them inside a string.
-        stop_token_ids=[tokenizer.eos_token_id, tokenizer.pad_token_id],
+        # These tokens end a response, so the grammar must not allow them inside a string.
+        stop_token_ids=end_tokens(processor),
     )
     # With arbitrary white space, a model could write spaces until the token limit.
     return xgrammar.GrammarCompiler(tokens).compile_json_schema(

@@ -11,7 +11,6 @@ one vector per token (`models.retriever.multi_vector`). Trained retrievers are s
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from safetensors.torch import load_file
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 from sentence_transformers.util import is_sentence_transformer_model
-from transformers import AutoProcessor
+from transformers import AutoConfig, AutoModel, AutoProcessor
 
 from conf.errors import UserError
 from conf.runs import rank
@@ -44,11 +43,11 @@ from models.loading import (
     pin_sizes,
     weight_options,
 )
-from models.parameter_counts import language_targets
 from models.retriever.inputs import Retriever, query_form
 from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
 from models.student.prompts import list_timestamps
 from models.tiny_qwen3_vl import build_model, build_processor
+from models.towers import find_unquantized
 from models.trained_runs import EXPORT
 
 PROCESSING = {
@@ -90,7 +89,7 @@ def load_retriever(
                 build_model(cfg.architecture, len(processor.tokenizer)).save_pretrained(folder)
                 processor.save_pretrained(folder)
     with explain_unloadable("retriever", source):
-        model = _load_base(cfg, source, weight_options(cfg, precision))
+        model = _load_base(cfg, source, precision)
     backbone = model[0]
     if len(model) == 1 and backbone.module_output_name != "sentence_embedding":
         raise UserError(
@@ -108,8 +107,7 @@ def load_retriever(
     if cfg.lora.rank:
         query_form(model, cfg)
         (model if cfg.late is None else backbone).requires_grad_(False)
-        targets = language_targets(backbone.model, cfg.lora.targets)
-        with lora_config("retriever", replace(cfg.lora, targets=targets)) as config:
+        with lora_config("retriever", cfg.lora, backbone.model) as config:
             model.add_adapter(config)
         name_base(backbone.model, cfg)
         for weight in backbone.parameters():
@@ -119,10 +117,15 @@ def load_retriever(
     return model
 
 
-def _load_base(cfg: RetrieverConfig, source: str, weights: dict[str, Any]) -> Retriever:
+def _load_base(cfg: RetrieverConfig, source: str, precision: str) -> Retriever:
     """Load a saved retriever with its own modules, or a model with those of this project."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
+    kept: list[str] = []
+    if cfg.quantization == "nf4":
+        config = AutoConfig.from_pretrained(source, **origin)
+        kept = find_unquantized(AutoModel, config, trust_remote_code=cfg.trust_remote_code)
+    weights = weight_options(cfg, precision, kept)
     if cfg.late is None and is_sentence_transformer_model(source, revision=cfg.revision):
         return SentenceTransformer(source, device=device, model_kwargs=weights, **origin)
     backbone = Transformer(
@@ -153,8 +156,8 @@ def prepare_processor(backbone: Transformer, cfg: RetrieverConfig, source: str) 
         check_processor("retriever", source, backbone.config, processor)
         write_clips_as_released(processor)
         pin_sizes(processor, cfg.image_size, cfg.frames)
-    elif hasattr(getattr(processor, "image_processor", None), "do_image_splitting"):
-        processor.image_processor.do_image_splitting = False
+    elif hasattr(processor, "image_processor"):
+        pin_sizes(processor, cfg.image_size, cfg.frames)
     if "message" in backbone.modality_config:
         own = {key: PROCESSING[key] for key in ("text", "video")}
     elif text_tower := getattr(backbone.config, "text_config", None):
@@ -208,7 +211,7 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
         return model.eval()
     if (folder / EXPORT).exists():
         return load_merged(folder, cfg)
-    weights = weight_options(cfg, precision)
+    weights = weight_options(cfg, precision, ())
     model = _load_saved(folder, cfg, model_kwargs=weights, trust_remote_code=cfg.trust_remote_code)
     if cfg.late is not None:
         keep_head_fp32(model)

@@ -1,4 +1,4 @@
-"""Turn conversations into tensors.
+"""Turn conversations into tensors, for any family of models.
 
 The token ids of a prompt are the same in training and inference. The response is encoded separately
 and appended, so that it consists of the tokens that the model has to generate. Batches are padded
@@ -20,7 +20,8 @@ from transformers.video_utils import VideoMetadata
 
 from conf.errors import UserError
 from data.records import LETTERS
-from models.student.prompts import Sample, answer_line
+from models.student.chat_format import find_end_token, takes_clips, write_prompt
+from models.student.prompts import Clip, Sample, answer_line, show_frames_as_images
 
 IGNORED = -100
 """Label of a token that is not in the loss: the default `ignore_index` of torch's cross-entropy."""
@@ -28,17 +29,22 @@ MEDIA = {
     "image": ("pixel_values", "image_grid_thw"),
     "video": ("pixel_values_videos", "video_grid_thw"),
 }
-"""The processor's outputs for each kind of media: pixels and their grid."""
-MEDIA_INPUTS = tuple(name for names in MEDIA.values() for name in names)
+"""The outputs of Qwen's processors for each kind of media: pixels and their grid."""
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """Token ids, labels and media tensors of one conversation, without padding."""
+    """Token ids, labels and media tensors of one conversation, without padding.
+
+    Attributes:
+        token_types: The processor's other outputs with one value per token, such as Qwen's
+            `mm_token_type_ids`. They are 0 in the response.
+        media: The processor's outputs for images and clips.
+    """
 
     input_ids: list[int]
     labels: list[int]
-    mm_token_type_ids: list[int]
+    token_types: dict[str, list[int]]
     media: dict[str, torch.Tensor]
 
 
@@ -49,31 +55,29 @@ def encode(
 
     Args:
         max_length: Maximum number of tokens; None sets no limit.
-        thinking: Value of the variable `enable_thinking` of chat templates that have it.
+        thinking: Whether the model may think before its response.
 
     Raises:
         UserError: The conversation has more than `max_length` tokens. It is not truncated, because
             an image could be cut.
     """
-    # A variable that the template does not use would be passed on to the processor.
-    options = {"enable_thinking": thinking}
-    text = processor.apply_chat_template(
-        [{"role": "user", "content": sample.content}],
-        tokenize=False,
-        add_generation_prompt=True,
-        **(options if "enable_thinking" in str(processor.chat_template) else {}),
-    )
+    if not takes_clips(processor):
+        sample = show_frames_as_images(sample)
     prompt = processor(
-        text=[text],
-        images=sample.images or None,
-        videos=[sample.clip.pixels] if sample.clip else None,
-        video_metadata=[VideoMetadata(**sample.clip.metadata)] if sample.clip else None,
-        do_sample_frames=False,
+        text=[write_prompt(sample, processor, thinking)],
+        images=[sample.images] if sample.images else None,
+        # The chat template has written the special tokens.
+        add_special_tokens=False,
         return_tensors="pt",
+        **(clip_inputs(sample.clip) if sample.clip else {}),
     )
     ids = prompt.pop("input_ids")[0].tolist()
-    types = prompt.pop("mm_token_type_ids")[0].tolist()
     prompt.pop("attention_mask")
+    if "second_per_grid_ts" in prompt:
+        prompt["second_per_grid_ts"] = torch.tensor([pair_seconds(sample.clip)])
+    types = {
+        name: prompt.pop(name)[0].tolist() for name in list(prompt) if name.endswith("type_ids")
+    }
     response, trained = [], []
     if sample.response_ids is not None:
         response = trained = list(sample.response_ids)
@@ -81,7 +85,7 @@ def encode(
         encoded = processor.tokenizer(
             sample.response, add_special_tokens=False, return_offsets_mapping=True
         )
-        response = [*encoded["input_ids"], processor.tokenizer.eos_token_id]
+        response = [*encoded["input_ids"], find_end_token(processor)]
         trained = response.copy()
         stops = [stop for _, stop in encoded["offset_mapping"]]
         for first, stop in sample.false_spans:
@@ -96,9 +100,27 @@ def encode(
             "settings from the run that model names",
             code="sample-too-long",
         )
-    media = {name: prompt[name] for name in MEDIA_INPUTS if name in prompt}
     labels = [IGNORED] * len(ids) + trained
-    return Encoded(ids + response, labels, types + [0] * len(response), media)
+    types = {name: values + [0] * len(response) for name, values in types.items()}
+    return Encoded(ids + response, labels, types, dict(prompt))
+
+
+def clip_inputs(clip: Clip) -> dict[str, Any]:
+    """Return a processor's arguments for a clip with its true times."""
+    return {
+        "videos": [clip.pixels],
+        "video_metadata": [VideoMetadata(**clip.metadata)],
+        "do_sample_frames": False,
+    }
+
+
+def pair_seconds(clip: Clip) -> float:
+    """Return the mean time (s) from a pair of a clip's frames to the next pair.
+
+    Qwen2.5-VL's processor takes the clip for evenly spaced frames of the whole scene.
+    """
+    steps = max(1, len(clip.indices) - 1)
+    return 2 * (clip.indices[-1] - clip.indices[0]) / steps / clip.fps
 
 
 class Collator:
@@ -139,13 +161,25 @@ def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:
     batch: dict[str, Any] = {
         "input_ids": stack((e.input_ids for e in encoded), pad_id),
         "attention_mask": stack(([1] * len(e.input_ids) for e in encoded), 0),
-        "mm_token_type_ids": stack((e.mm_token_type_ids for e in encoded), 0),
         "labels": stack((e.labels for e in encoded), IGNORED),
     }
-    for name in MEDIA_INPUTS:
-        if tensors := [e.media[name] for e in encoded if name in e.media]:
-            batch[name] = torch.cat(tensors)
+    for name in encoded[0].token_types:
+        batch[name] = stack((e.token_types[name] for e in encoded), 0)
+    for name in {name: None for e in encoded for name in e.media}:
+        batch[name] = concatenate([e.media[name] for e in encoded if name in e.media])
     return batch
+
+
+def concatenate(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Concatenate tensors along the first dimension; smaller ones are padded with zeros."""
+    largest = [max(sizes) for sizes in zip(*(t.shape[1:] for t in tensors), strict=True)]
+
+    def enlarge(tensor: torch.Tensor) -> torch.Tensor:
+        missing = [m - n for m, n in zip(largest, tensor.shape[1:], strict=True)]
+        # Padding is given from the last dimension on, before and after the entries.
+        return torch.nn.functional.pad(tensor, [k for m in reversed(missing) for k in (0, m)])
+
+    return torch.cat([enlarge(tensor) for tensor in tensors])
 
 
 def letter_ids(processor: ProcessorMixin) -> list[int]:

@@ -6,11 +6,14 @@ batch nor on the response at which a killed command resumes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
+from peft import PeftModel
 from torch import nn
 from transformers import (
+    GenerationConfig,
     LogitsProcessor,
     LogitsProcessorList,
     ProcessorMixin,
@@ -21,6 +24,7 @@ from transformers import (
 
 from conf.schema import StudentConfig
 from models.loading import DTYPES
+from models.student.chat_format import find_end_token
 from models.student.kv_cache import create_cache
 from models.student.responses import THOUGHT_TAG, GeneratedText
 
@@ -53,11 +57,9 @@ def generate(
     inputs = {name: value.to(device) for name, value in inputs.items() if name != "labels"}
     autocast = torch.autocast(device.type, DTYPES[precision], enabled=precision == "bf16")
     # Tensors that the model stores under torch.inference_mode could not be used in later training.
-    with torch.no_grad(), autocast:
+    with torch.no_grad(), autocast, plain_decoding(model, processor, limit):
         ids = model.generate(
             **inputs,
-            max_new_tokens=limit,
-            do_sample=False,
             past_key_values=create_cache(model),
             logits_processor=logits_processors,
         )
@@ -66,7 +68,7 @@ def generate(
     prompt_end = tokenizer.decode(prompt[0, -TAG_SEARCH_TOKENS:]).rstrip()
     start = THOUGHT_TAG if prompt_end.endswith(THOUGHT_TAG) else ""
     texts = tokenizer.batch_decode(new, skip_special_tokens=True)
-    ends = torch.tensor([tokenizer.eos_token_id, tokenizer.pad_token_id], device=new.device)
+    ends = torch.tensor(end_tokens(processor), device=new.device)
     is_end = torch.isin(new, ends)
     ended = is_end.any(dim=1) | (new.shape[1] < limit)
     # The tokens after the first end are padding.
@@ -77,6 +79,37 @@ def generate(
             texts, ended.tolist(), new.tolist(), lengths.tolist(), strict=True
         )
     ]
+
+
+def end_tokens(processor: ProcessorMixin) -> list[int]:
+    """Return the ids of the tokens that end a response: the end of a turn, of a text, padding."""
+    tokenizer = processor.tokenizer
+    ends = [find_end_token(processor), tokenizer.eos_token_id, tokenizer.pad_token_id]
+    return list(dict.fromkeys(ends))
+
+
+@contextmanager
+def plain_decoding(model: nn.Module, processor: ProcessorMixin, limit: int) -> Iterator[None]:
+    """Replace a model's generation config, with its sampling and its penalties, by greedy decoding.
+
+    A config that is given to `generate` would be filled up with the values of the model's own.
+    """
+    plain = GenerationConfig(
+        max_new_tokens=limit,
+        do_sample=False,
+        eos_token_id=end_tokens(processor),
+        pad_token_id=processor.tokenizer.pad_token_id,
+    )
+    # With adapters, peft copies the config of the whole model to its base.
+    models = [model, model.get_base_model()] if isinstance(model, PeftModel) else [model]
+    own = [part.generation_config for part in models]
+    for part in models:
+        part.generation_config = plain
+    try:
+        yield
+    finally:
+        for part, config in zip(models, own, strict=True):
+            part.generation_config = config
 
 
 def sampling_processors(cfg: StudentConfig, seeds: Sequence[int]) -> LogitsProcessorList:

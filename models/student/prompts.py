@@ -12,7 +12,7 @@ the query's future frame or of a single frame.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -177,6 +177,22 @@ def selection_sample(
     parts.append(f"\n{text or choose_instruction(mode, regime)}")
     clip = load_clip(item.scene_id, visible, frames) if visible else None
     return build_sample(f"{item.item_id} ({mode})", parts, response, clip)
+
+
+def show_frames_as_images(sample: Sample) -> Sample:
+    """Return a sample whose clip, if any, is replaced by its frames, each after its time.
+
+    This is for models that are not told the times of a clip's frames.
+    """
+    if sample.clip is None:
+        return sample
+    frames: list[dict[str, Any]] = []
+    for index in sample.clip.indices:
+        frames.append({"type": "text", "text": f"At {index / sample.clip.fps:.2f} s: "})
+        frames += [{"type": "image"}, {"type": "text", "text": "\n"}]
+    parts = (frames if part["type"] == "video" else [part] for part in sample.content)
+    content = [part for several in parts for part in several]
+    return replace(sample, content=content, clip=None, images=[*sample.clip.pixels, *sample.images])
 
 
 def facts_sample(

@@ -334,8 +334,8 @@ def test_messages_show_the_item_in_the_order_of_the_prompt(bench) -> None:
     assert all(map(np.array_equal, map(np.asarray, images), expected))
     assert len(images) == len(expected)
     texts = [part["text"] for part in parts if part["type"] == "text"]
-    times = [f"Frame at {time:.2f} seconds:" for time in item.times]
-    letters = [f"Candidate {letter}:" for letter in "ABCD"]
+    times = [text for time in item.times for text in (f"At {time:.2f} s: ", "\n")]
+    letters = [f"\nCandidate {letter}: " for letter in "ABCD"]
     assert texts[:-1] == [*times, item.question, *letters]
     assert "step by step" in texts[-1]
     assert "step by step" not in item.messages("answer")[0]["content"][-1]["text"]

@@ -80,7 +80,7 @@ def base_of(
 
 
 def nf4() -> BitsAndBytesConfig:
-    return loading.nf4_config(torch.bfloat16)
+    return loading.nf4_config(torch.bfloat16, ["model.visual", "visual", "lm_head"])
 
 
 @cache

@@ -90,3 +90,19 @@ def test_a_think_tag_that_the_prompt_opens_begins_the_text(
     )
     assert response.text.startswith("<think>") == thinking
     assert response.truncated
+
+
+def test_the_generation_config_of_a_model_has_no_effect(
+    micro_store, frames, student_cfg, model, processor
+) -> None:
+    item = micro_store.selection("train")[0]
+    batch = Collator(processor, 1500)([selection_sample(item, "answer", "cot", frames, 4)])
+    [plain] = generate(model, processor, batch, 12, "fp32")
+    own = model.generation_config = deepcopy(model.generation_config)
+    own.update(
+        repetition_penalty=5.0, no_repeat_ngram_size=1, do_sample=True, temperature=9.0, top_k=3,
+        suppress_tokens=[plain.ids[0]],
+    )  # fmt: skip
+    assert generate(model, processor, batch, 12, "fp32") == [plain]
+    assert model.generation_config is own
+    assert model.generate(**batch, max_new_tokens=12)[0, -12:].tolist() != list(plain.ids)

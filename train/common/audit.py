@@ -96,12 +96,14 @@ def describe_model(
     inputs: Mapping[str, Any],
 ) -> list[str]:
     """Compare the parameter counts with the preset, and return lines with the counts and the grids
-    of vision tokens in `inputs` (time x rows x columns; a step of time is a pair of frames)."""
+    of vision tokens in a Qwen's `inputs` (time x rows x columns; a step of time is a pair of
+    frames)."""
     towers = count_parameters(model)
     check_parameter_counts(towers, cfg.name, cfg.quantization, cfg.lora.rank)
     grids = []
     for name, medium in (("video_grid_thw", "a video"), ("image_grid_thw", "an image")):
         if name in inputs:
+            merge = processor.image_processor.merge_size
             time, height, width = inputs[name][0].tolist()
             merge = processor.image_processor.merge_size
             grids.append(f"{medium} of {time} x {height // merge} x {width // merge} tokens")
@@ -130,5 +132,5 @@ def describe_input(
         text += f">>>{decoded}<<<" if is_marked else decoded
     return [
         f"{name} has {len(ids)} tokens, {sum(marked)} of them {meaning}:",
-        re.sub(r"(<\|(image|video)_pad\|>)+", r"\1...", text),
+        re.sub(r"(<[^<>]+>)\1+", r"\1...", text),
     ]

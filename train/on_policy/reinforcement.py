@@ -32,7 +32,7 @@ from data.frames.frame_cache import FrameReader
 from data.records import SelectionItem
 from data.store import Store
 from models.distributed import split_batch
-from models.student.collator import MEDIA_INPUTS, Collator
+from models.student.collator import Collator
 from models.student.prompts import Sample, selection_sample
 from teacher.predicates.facts import RelationalPredicates
 from teacher.vocabulary import describe_item
@@ -242,18 +242,20 @@ class MediaGRPOTrainer(GRPOTrainer):
         batch = self._collator(self._inputs)
         length = input_ids.shape[1] - logits_to_keep
         # TRL pads prompts on the left, as the collator does, and responses on the right.
-        types = torch.zeros_like(input_ids)
-        prompt_types = batch["mm_token_type_ids"].to(types.device)
-        types[:, length - prompt_types.shape[1] : length] = prompt_types
-        media = {k: batch[k].to(input_ids.device) for k in MEDIA_INPUTS if k in batch}
+        inputs = {}
+        for name, value in batch.items():
+            if name.endswith("type_ids"):
+                inputs[name] = torch.zeros_like(input_ids)
+                inputs[name][:, length - value.shape[1] : length] = value.to(input_ids.device)
+            elif name not in ("input_ids", "attention_mask"):
+                inputs[name] = value.to(input_ids.device)
         with self.accelerator.autocast():
             logits = model(
                 input_ids=input_ids,
                 attention_mask=attention_mask,
-                mm_token_type_ids=types,
                 logits_to_keep=logits_to_keep + 1,
                 use_cache=False,
-                **media,
+                **inputs,
             ).logits
         logs = torch.log_softmax(logits[:, :-1].float() / self.temperature, dim=-1)
         chosen = logs.gather(-1, input_ids[:, -logits_to_keep:, None])[..., 0]

@@ -10,10 +10,8 @@ import numpy as np
 from torch.utils.data import Dataset
 from transformers import ProcessorMixin
 
-from models.student.prompts import Sample
-
-EXTRA_TOKENS = 8
-"""Number of text tokens around each image or pair of video frames."""
+from models.student.collator import encode
+from models.student.prompts import Sample, build_sample
 
 
 @dataclass(frozen=True)
@@ -67,12 +65,18 @@ class StudentDataset(Dataset):
     def lengths(self, processor: ProcessorMixin, image_size: int) -> list[int]:
         """Estimate each sample's number of tokens, with frames of `image_size` px, not rendered."""
         ids = processor.tokenizer(self.texts, add_special_tokens=False).input_ids
-        # A visual token covers a square of several patches.
-        side = processor.image_processor.patch_size * processor.image_processor.merge_size
-        per_picture = round(image_size / side) ** 2 + EXTRA_TOKENS
+        per_picture = count_picture_tokens(processor, image_size)
         return [
             len(i) + s.picture_count * per_picture for i, s in zip(ids, self.samples, strict=True)
         ]
+
+
+def count_picture_tokens(processor: ProcessorMixin, image_size: int) -> int:
+    """Return the number of tokens of an image of `image_size` px in a prompt."""
+    image = np.zeros((image_size, image_size, 3), np.uint8)
+    prompts = [build_sample("", ["text", *images], None) for images in ([], [image])]
+    without, with_image = (len(encode(p, processor, None).input_ids) for p in prompts)
+    return with_image - without
 
 
 def seeded_rng(*keys: int | str) -> np.random.Generator:

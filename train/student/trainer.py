@@ -109,8 +109,12 @@ class StudentTrainer(Trainer):
     def _get_train_sampler(self, *_: Any) -> Sampler[int]:
         return self._sampler
 
-    def _reduce(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+    def _reduce(
+        self, outputs: torch.Tensor | tuple[torch.Tensor, ...], labels: torch.Tensor
+    ) -> torch.Tensor:
         """Return (B, 2 + columns of the accuracy), which the evaluation keeps instead of logits."""
+        # Some families also return the hidden states of images.
+        logits = outputs[0] if isinstance(outputs, tuple) else outputs
         reduced = self._accuracy.reduce(logits, labels)
         return torch.cat([token_losses(logits, labels), reduced], dim=-1)
 

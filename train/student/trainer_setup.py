@@ -13,6 +13,7 @@ from conf.runs import Run, local_world_size, world_size
 from conf.schema import SftCommand, StudentTrainConfig
 from models.distributed import split_batch
 from models.memory import available_cpu_bytes
+from models.student.chat_format import takes_clips
 from models.student.collator import Collator, letter_ids
 from train.common.arguments import common_arguments
 from train.common.audit import audit_student
@@ -86,7 +87,9 @@ def build_trainer(
     log.info(audit_student(model, processor, student, longest, collator))
     sampler = LengthSampler(lengths, train.batch, cfg.seed, train.micro_batch, world_size())
     cache = answers = None
-    if train.reuse_features:
+    if train.reuse_features and not takes_clips(processor):
+        log.info("train.reuse_features has no effect: only features of Qwen models are reused")
+    elif train.reuse_features:
         # The ranks of this machine together cache up to half of its free memory.
         limit = available_cpu_bytes() // 2 // local_world_size()
         cache = VisionCache(model, train.precision, limit)
