@@ -7,6 +7,7 @@ from pathlib import Path
 
 import yaml
 from huggingface_hub import ModelCard, ModelCardData, try_to_load_from_cache
+from transformers import Qwen3VLProcessor
 
 from conf.files import read_json, read_json_if_valid
 from conf.multirun.table import AT_START_SUFFIX
@@ -15,19 +16,18 @@ from conf.schema import ContrastiveCommand, SftCommand
 from models.checks import ADAPTER_CONFIG
 from models.fingerprints import is_hub_model
 from models.resolved_settings import read_resolved
+from models.student.chat_format import TIMED_PROCESSORS
 from models.student.prompts import choose_instruction
 from models.trained_runs import modes_of_regime
 from train.common.journal import BEST_STEP
 
 CARD = "README.md"
-QWEN3_VL = "Qwen3VLProcessor"
-"""The processor that writes the times of a clip into the prompt."""
 TIMES = {
     "video": (
         "true times, from the frame rate and the indices of the frames; a processor of Qwen3-VL "
         "writes them in seconds before each pair of frames (`<0.5 seconds>`)"
     ),
-    "images": "a text before each frame, in seconds (`<0.5 seconds>`)",
+    "images": "a text before each frame, in seconds (`{}`)",
     "separate": "none: a clip is the mean of its frames",
 }
 """Times of a clip, by the form of the input (`models.retriever.inputs`)."""
@@ -86,8 +86,11 @@ def build_model_card(
         prompts = {f"prompt of a {kind}": text or "none" for kind, text in own.items()}
     processor = read_json_if_valid(saved / "processor_config.json")
     modalities = read_json_if_valid(saved / "sentence_bert_config.json").get("modality_config", {})
-    form = "images" if "message" in modalities else "separate"
-    form = "video" if student or processor.get("processor_class") == QWEN3_VL else form
+    form = "images" if student or "message" in modalities else "separate"
+    timed = TIMED_PROCESSORS if student else (Qwen3VLProcessor,)
+    if processor.get("processor_class") in [kind.__name__ for kind in timed]:
+        form = "video"
+    time = "At 0.50 s: " if student else "<0.5 seconds>"
     merged_library = "transformers" if student else "sentence-transformers"
     return ModelCard.from_template(
         ModelCardData(
@@ -110,7 +113,7 @@ def build_model_card(
         base=base,
         prompts=prompts,
         form=form,
-        times=TIMES[form],
+        times=TIMES[form].format(time),
         licence=licence,
         digest=None if on_hub else read_resolved(run).get("base"),
         benchmark=settings.benchmark,
