@@ -29,7 +29,7 @@ from conf.runs import world_size
 from conf.schema import RetrieverConfig
 from data.frames.frame_cache import FrameReader
 from data.records import FrameRef, RetrievalQuery, SelectionItem, sample_prefix_frames
-from models.student.prompts import load_clip
+from models.student.prompts import load_clip, write_time
 
 Retriever = SentenceTransformer | MultiVectorEncoder
 """A single-vector or a multi-vector retriever."""
@@ -83,7 +83,7 @@ def query_input(
         return SeparateQuery(images, query.question)
     fps, content = frames.scene(query.scene_id).fps, []
     for index, image in zip(indices, images, strict=True):
-        content.append({"type": "text", "text": f"<{index / fps:.1f} seconds>"})
+        content.append({"type": "text", "text": write_time(index / fps)})
         content.append({"type": "image", "image": image})
     content.append({"type": "text", "text": query.question})
     return [{"role": "user", "content": content}]

@@ -179,6 +179,11 @@ def selection_sample(
     return build_sample(f"{item.item_id} ({mode})", parts, response, clip)
 
 
+def write_time(seconds: float) -> str:
+    """Return the text before a frame that is shown as an image."""
+    return f"At {seconds:.2f} s: "
+
+
 def show_frames_as_images(sample: Sample) -> Sample:
     """Return a sample whose clip, if any, is replaced by its frames, each after its time.
 
@@ -188,7 +193,7 @@ def show_frames_as_images(sample: Sample) -> Sample:
         return sample
     frames: list[dict[str, Any]] = []
     for index in sample.clip.indices:
-        frames.append({"type": "text", "text": f"At {index / sample.clip.fps:.2f} s: "})
+        frames.append({"type": "text", "text": write_time(index / sample.clip.fps)})
         frames += [{"type": "image"}, {"type": "text", "text": "\n"}]
     parts = (frames if part["type"] == "video" else [part] for part in sample.content)
     content = [part for several in parts for part in several]

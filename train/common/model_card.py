@@ -17,7 +17,7 @@ from models.checks import ADAPTER_CONFIG
 from models.fingerprints import is_hub_model
 from models.resolved_settings import read_resolved
 from models.student.chat_format import TIMED_PROCESSORS
-from models.student.prompts import choose_instruction
+from models.student.prompts import choose_instruction, write_time
 from models.trained_runs import modes_of_regime
 from train.common.journal import BEST_STEP
 
@@ -27,7 +27,7 @@ TIMES = {
         "true times, from the frame rate and the indices of the frames; a processor of Qwen3-VL "
         "writes them in seconds before each pair of frames (`<0.5 seconds>`)"
     ),
-    "images": "a text before each frame, in seconds (`{}`)",
+    "images": f"a text before each frame, in seconds (`{write_time(0.5)}`)",
     "separate": "none: a clip is the mean of its frames",
 }
 """Times of a clip, by the form of the input (`models.retriever.inputs`)."""
@@ -90,7 +90,6 @@ def build_model_card(
     timed = TIMED_PROCESSORS if student else (Qwen3VLProcessor,)
     if processor.get("processor_class") in [kind.__name__ for kind in timed]:
         form = "video"
-    time = "At 0.50 s: " if student else "<0.5 seconds>"
     merged_library = "transformers" if student else "sentence-transformers"
     return ModelCard.from_template(
         ModelCardData(
@@ -113,7 +112,7 @@ def build_model_card(
         base=base,
         prompts=prompts,
         form=form,
-        times=TIMES[form].format(time),
+        times=TIMES[form],
         licence=licence,
         digest=None if on_hub else read_resolved(run).get("base"),
         benchmark=settings.benchmark,
