@@ -86,7 +86,7 @@ def summarize(
         "unanswered": len(unanswered),
         "set_aside": len(open_items),
         "too_short": len(items) - len(narrated.union(unanswered)),
-        "constraints": dict(Counter(r.grammar or "none" for r in every if not r.fallback)),
+        "constraints": dict(Counter(name_constraint(r) for r in every if not r.fallback)),
         "responses": [by_attempt[k] for k in sorted(by_attempt)],
         "accepted_responses": [accepted_by_attempt[k] for k in sorted(by_attempt)],
         "rejected": {kind: len(details) for kind, details in rejections.items()},
@@ -186,8 +186,7 @@ def format_figures(figures: Figures) -> str:
     ]
     constraints = ", ".join(f"{name} ({n:,} responses)" for name, n in f["constraints"].items())
     parts = [
-        f"sample: {f['sample'] or 'none, all training items'}",
-        f"constraint: {constraints or 'none'}",
+        f"sample: {f['sample'] or 'none, all training items'}\nconstraint: {constraints or 'none'}",
         pd.Series(counts).to_string(),
         *(_format_table(table) for table in (attempts, rejected)),
         "\n".join(examples),
@@ -257,6 +256,7 @@ def write_report(
     template = (files("teacher") / "templates" / "report.html").read_text()
     page = jinja2.Template(template, autoescape=True).render(
         teacher=teacher,
+        name_constraint=name_constraint,
         text=text,
         narrated=sum(map(bool, responses.values())),
         benchmark=store.name,
@@ -264,6 +264,12 @@ def write_report(
     )
     write_text(folder / "report.html", page)
     return folder / "report.html"
+
+
+def name_constraint(rationale: Rationale) -> str:
+    """Return what constrained the server: "grammar VERSION", "cited VERSION" or "none"."""
+    version = rationale.grammar or "none"
+    return f"grammar {version}" if version.isdecimal() else version
 
 
 def name_teacher(cfg: TeacherConfig) -> str:

@@ -168,7 +168,10 @@ class ServerPool:
                 await asyncio.sleep(random_pause(failures))
 
     async def _send(
-        self, server: ServerClient, send: Callable[[ServerClient], Awaitable[Reply]]
+        self,
+        server: ServerClient,
+        send: Callable[[ServerClient], Awaitable[Reply]],
+        is_canary: bool = False,
     ) -> Reply:
         server.in_flight += 1
         sent, answered = time.monotonic(), server.answered
@@ -177,17 +180,19 @@ class ServerPool:
         except RequestError as error:
             # A server that has not answered yet may be loading its model.
             is_full = error.status == 503 and server.answered and server.problem is None
-            self.timeouts += isinstance(error, NoReplyInTimeError)
-            # Requests that were in flight together are too many only once.
-            if sent > server.lowered_at and (is_full or isinstance(error, OVERLOAD_ERRORS)):
-                self._lower_limit(server, server.answered - answered, error)
-            if self.timeouts:
+            if not is_canary and (is_full or isinstance(error, OVERLOAD_ERRORS)):
+                self.timeouts += isinstance(error, NoReplyInTimeError)
+                # Requests that were in flight together are too many only once.
+                if sent > server.lowered_at:
+                    self._lower_limit(server, server.answered - answered, error)
                 self._show_limits()
             raise
         finally:
             server.in_flight -= 1
         server.answered += 1
-        server.limit = min(self.cfg.concurrency, server.limit + RAISE)
+        before, server.limit = server.limit, min(self.cfg.concurrency, server.limit + RAISE)
+        if int(server.limit) > int(before):
+            self._show_limits()
         server.problem, server.pauses, self.failing_since = None, 0, None
         return reply
 
@@ -206,7 +211,6 @@ class ServerPool:
                 f"{server.url} does not keep up with {before} requests at a time ({error}): it now "
                 f"gets at most {int(server.limit)}, and more as it answers"
             )
-        self._show_limits()
 
     def _show_limits(self) -> None:
         limit = min(self.cfg.concurrency, sum(int(server.limit) for server in self.servers))
@@ -296,7 +300,7 @@ class ServerPool:
                     if server.found is None:
                         fields = without_optional(fields)
                     canary = self.canary, 1, fields, self.constraint
-                    await self._send(server, lambda s: s.complete(*canary))
+                    await self._send(server, lambda s: s.complete(*canary), is_canary=True)
                 except RefusedError as error:
                     raise UserError(
                         f"{url} refuses every request ({error}): check the server's log and the "

@@ -59,7 +59,7 @@ def test_llama_cpp_applies_the_grammar_and_gives_as_many_responses_as_it_has_slo
     assert {r.grammar for r in rationales} == {GRAMMAR_VERSION}
     form = re.compile(r"Scene parse:[A-Za-z' ,.;:\n-]*")
     assert [r.text for r in rationales if not form.fullmatch(r.text)] == []
-    assert narration.figures["constraints"] == {GRAMMAR_VERSION: 16}
+    assert narration.figures["constraints"] == {f"grammar {GRAMMAR_VERSION}": 16}
 
 
 def test_llama_cpp_applies_json_schemas_and_explains_its_refusals(llama) -> None:

@@ -170,8 +170,8 @@ def test_page_names_the_model_and_the_servers_of_a_teacher():
 def test_figures_name_constraints_samples_and_unanswered_items():
     responses = {f"item-{k}": [response(k, 0, grammar="2" if k else None)] for k in range(3)}
     figures = summarize(ITEMS, responses, {"item-3": "refused"}, "4 of 9 items, seed 0")
-    assert figures["constraints"] == {"none": 1, "2": 2}
+    assert figures["constraints"] == {"none": 1, "grammar 2": 2}
     assert (figures["unanswered"], figures["set_aside"], figures["too_short"]) == (1, 0, 1)
     text = format_figures(figures)
     assert "sample: 4 of 9 items, seed 0" in text
-    assert "constraint: none (1 responses), 2 (2 responses)" in text
+    assert "constraint: none (1 responses), grammar 2 (2 responses)" in text
