@@ -119,23 +119,21 @@ def find_model(cfg: ServeCommand) -> str:
 
 
 def write_chat_template(model: str, path: Path) -> bool:
-    """Write the chat template with which prompts have the same tokens as those of a local model.
-    Return whether it differs from the model's own; otherwise nothing is written."""
+    """Write the chat template with which the prompts of a Qwen3-VL have the same tokens as those of
+    a local model (see `models.compat.write_clips_as_released`). Return whether it differs from the
+    model's own; otherwise nothing is written."""
     try:
-        from transformers import AutoProcessor
-
-        from models.compat import write_clips_as_released
+        from transformers import AutoProcessor, Qwen3VLProcessor
 
         processor = AutoProcessor.from_pretrained(model)
     except (ImportError, OSError, ValueError, KeyError) as error:
         reason = str(error).partition("\n")[0]
         log.warning("the chat template of %s is not checked (%s)", model, reason)
         return False
-    own = processor.chat_template
-    write_clips_as_released(processor)
-    if processor.chat_template == own:
+    marked = "<|vision_start|><|video_pad|><|vision_end|>"
+    if not isinstance(processor, Qwen3VLProcessor) or marked not in str(processor.chat_template):
         return False
-    write_text(path, processor.chat_template)
+    write_text(path, processor.chat_template.replace(marked, "<|video_pad|>"))
     return True
 
 
