@@ -34,8 +34,9 @@ UNLIKELY_SCHEMA = {
     "required": ["word"], "additionalProperties": False,
 }  # fmt: skip
 """Constraints that only a text with `UNLIKELY` meets."""
-PROBE_TOKENS = 48
-"""Maximum length of a constrained response to the probe; `UNLIKELY` may need a token per letter."""
+PROBE_TOKENS = 128
+"""Maximum length of a constrained response to the probe. `UNLIKELY` may need a token per letter,
+and a schema admits white space."""
 
 
 @dataclass(frozen=True)
