@@ -331,7 +331,8 @@ class Rationale:
     completion_tokens: int | None = None
     """Number of generated tokens, as an equal share of the request's total."""
     grammar: str | None = None
-    """Version of the grammar that constrained the server; None without a grammar."""
+    """Version of the grammar, or of the schema of cited rationales, that constrained the server;
+    None if nothing did, whatever was asked for."""
     finished: float | None = None
     """Time of the server's response, seconds since 1970; None without a server."""
     fallback: bool = False
@@ -346,6 +347,8 @@ class Rationale:
     undecided: bool = False
     """Whether there is a distractor of which all statements about the target's frame are true
     (`teacher.statement_choice`)."""
+    sample: str | None = None
+    """The random sample of items that was narrated when the text was written; None for all."""
 
     @classmethod
     def from_row(cls, row: dict[str, Any]) -> Self:

@@ -111,13 +111,14 @@ def save_accepted(rationales: list[Rationale], path: Path) -> None:
     import pyarrow as pa
 
     # All columns but these are text. The counts of claims have no column: a struct needs the same
-    # fields in every file, but some kinds of claims may not occur.
+    # fields in every file, but some kinds of claims may not occur. Nor has the sample, so that the
+    # table is the same whether or not a sample was narrated first.
     types = dict.fromkeys(("attempt", "seed", "prompt_tokens", "completion_tokens"), pa.int64())
     types |= dict.fromkeys(("accepted", "fallback", "undecided"), pa.bool_())
     types |= dict.fromkeys(("finished", "sufficiency"), pa.float64())
     types["reasons"] = pa.list_(pa.string())
     types["sections"] = pa.struct([(name, pa.string()) for name in SECTIONS])
-    names = [f.name for f in fields(Rationale) if f.name != "claims"]
+    names = [f.name for f in fields(Rationale) if f.name not in ("claims", "sample")]
     schema = pa.schema([(name, types.get(name, pa.string())) for name in names])
     save_rows([vars(r) for r in rationales], path, schema)
 

@@ -11,7 +11,7 @@ import asyncio
 import logging
 import time
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ from conf.entry import Run, command
 from conf.errors import UserError
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
+from data.seeded_order import interleave
 from teacher.journal import ACCEPTED, Journal, save_accepted
 from teacher.narrator import write_rationale
 from teacher.report import (
@@ -51,19 +52,22 @@ class Narration:
     """The result of `narrate_store`.
 
     Attributes:
-        rationales: One accepted rationale of each training item that has any, in item order.
+        rationales: One accepted rationale of each narrated item that has any, in item order.
+        responses: All responses to each narrated item, in the order of their attempts.
         figures: Statistics of all responses; see `teacher.report.summarize`.
     """
 
     rationales: list[Rationale]
+    responses: dict[str, list[Rationale]]
     figures: Figures
 
     def __str__(self) -> str:
         f = self.figures
         fallback = f" ({f['fallback']} by the built-in narrator)" if f["fallback"] else ""
         rejections = ", ".join(f"{n} {kind}" for kind, n in f["rejected"].items())
+        unanswered = f"{f['unanswered']} items without a response, " if f["unanswered"] else ""
         return (
-            f"rationales: {f['accepted']} accepted{fallback}, "
+            f"rationales: {f['accepted']} accepted{fallback}, {unanswered}"
             f"{f['set_aside']} items set aside, {f['too_short']} items with too short a prefix; "
             f"rejections: {rejections or 'none'}; {describe_sufficiency(f)}"
         )
@@ -74,19 +78,21 @@ def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-    narration = narrate_store(store, cfg.teacher)
+    narration = narrate_store(store, cfg.teacher, cfg.limit)
     log.info(narration)
     figures = narration.figures
-    page = write_report(store, narration.rationales, figures, cfg.examples, cfg.teacher, run.folder)
+    page = write_report(store, narration.responses, figures, cfg.examples, cfg.teacher, run.folder)
     log.info("report: %s", page)
-    return {
+    metrics = {
         "accepted": float(figures["accepted"]),
         "responses": float(sum(figures["responses"])),
         "set_aside": float(figures["set_aside"]),
         "too_short": float(figures["too_short"]),
         "mean_words": float(np.mean(figures["lengths"] or [0])),
-        "sufficiency": figures["sufficiency"].get("all", [0.0])[0],
     }
+    if "all" in figures["sufficiency"]:
+        metrics["sufficiency"] = figures["sufficiency"]["all"][0]
+    return metrics
 
 
 def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
@@ -100,17 +106,26 @@ def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
     return narration.rationales
 
 
-def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
+def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) -> Narration:
     """Write the missing rationales of training items, and save the accepted ones as parquet too.
+
+    Args:
+        limit: Number of items to narrate, a random sample; None narrates all.
 
     Raises:
         UserError: rationales.jsonl is damaged or belongs to another benchmark, or the servers
             cannot be used.
     """
-    items = store.training_items()
+    every = store.training_items()
+    items = sample_items(every, limit, cfg.seed)
+    sample = None
+    if len(items) < len(every):
+        sample = f"{len(items)} of {len(every)} items, seed {cfg.seed}"
+        log.info("narrating a sample: %s", sample)
+    unanswered: dict[str, str] = {}
     grader = RationaleGrader(cfg)
     with Journal(store.folder / JOURNAL_FILE) as journal:
-        check_items(journal, items)
+        check_items(journal, every)
         report_other_vocabularies(journal, cfg)
         responses: dict[str, list[Rationale]] = defaultdict(list)
         for rationale in journal.rationales:
@@ -134,6 +149,7 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
         progress = Progress(len(items), len(items) - len(jobs))
 
         def record(new: list[Rationale]) -> None:
+            new = [replace(rationale, sample=sample) for rationale in new]
             journal.append(new)
             for rationale in new:
                 responses[rationale.item_id].append(rationale)
@@ -147,7 +163,8 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
             elif jobs:
                 from teacher.server_narrator import request_rationales
 
-                asyncio.run(request_rationales(jobs, store, grader, record, progress.bar.update))
+                options = jobs, store, grader, record, progress.bar.update, progress.show_servers
+                unanswered = asyncio.run(request_rationales(*options))
         if cfg.fallback:
             for item in items:
                 if not is_settled(item) and len(responses[item.item_id]) >= cfg.attempts:
@@ -155,9 +172,26 @@ def narrate_store(store: Store, cfg: TeacherConfig) -> Narration:
                     if last.accepted:
                         attempt = cfg.attempts + last.attempt
                         record([grader.mark_fallback(last, attempt)])
-        rationales = select_accepted(items, responses)
-        save_accepted(rationales, store.folder / ACCEPTED)
-    return Narration(rationales, summarize(items, responses))
+        save_accepted(select_accepted(every, responses), store.folder / ACCEPTED)
+    if unanswered:
+        name, reason = next(iter(unanswered.items()))
+        log.warning(
+            "%d items got no response, which spends no attempt: correct the cause and run the same "
+            "command again. The server's answer for %s: %s",
+            *(len(unanswered), name, reason),
+        )
+    narrated = {item.item_id: responses[item.item_id] for item in items}
+    figures = summarize(items, narrated, unanswered, sample)
+    return Narration(select_accepted(items, responses), narrated, figures)
+
+
+def sample_items(items: list[SelectionItem], limit: int | None, seed: int) -> list[SelectionItem]:
+    """Return a random sample of `limit` items in their order, spread evenly over the families; all
+    items if `limit` is None. A smaller sample with the same seed is a part of it."""
+    order = np.random.default_rng(seed).permutation(len(items))
+    shuffled = interleave((items[k] for k in order), lambda item: item.family)
+    chosen = {item.item_id for item in shuffled[:limit]}
+    return [item for item in items if item.item_id in chosen]
 
 
 class Progress:
@@ -167,17 +201,27 @@ class Progress:
         self.bar = tqdm(total=total, initial=done, desc="narrating", unit="item", mininterval=1.0)
         self.accepted = self.tokens = 0
         self.rejected: Counter[str] = Counter()
+        self.servers = ""
         self.started = time.monotonic()
 
     def add_responses(self, responses: list[Rationale]) -> None:
         self.accepted += sum(r.accepted for r in responses)
         self.tokens += sum(r.completion_tokens or 0 for r in responses)
         self.rejected.update(kind for r in responses for kind in rejection_reasons(r))
+        self._show()
+
+    def show_servers(self, state: str) -> None:
+        """Show a text about the servers, such as the number of timeouts, at once."""
+        self.servers = state
+        self._show()
+        self.bar.refresh()
+
+    def _show(self) -> None:
         words = [f"{self.accepted} accepted"]
         words += [f"{n} {kind}" for kind, n in self.rejected.most_common(LISTED_REASONS)]
         if self.tokens:
             words.append(f"{self.tokens / (time.monotonic() - self.started):,.0f} tokens/s")
-        self.bar.set_postfix_str(", ".join(words), refresh=False)
+        self.bar.set_postfix_str(", ".join(filter(None, [*words, self.servers])), refresh=False)
 
 
 def check_items(journal: Journal, items: list[SelectionItem]) -> None:

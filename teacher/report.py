@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,13 +36,19 @@ OBJECT_NAME = re.compile(rf"\b(?:{'|'.join(COLORS)}) (?:{'|'.join(MATERIALS)}) \
 
 
 def summarize(
-    items: Sequence[SelectionItem], responses: Mapping[str, Sequence[Rationale]]
+    items: Sequence[SelectionItem],
+    responses: Mapping[str, Sequence[Rationale]],
+    unanswered: Collection[str] = (),
+    sample: str | None = None,
 ) -> Figures:
     """Return statistics of the responses to each item, which are in the order of their attempts.
 
+    - `sample`: the sample that the items are; None if they are all training items.
     - Numbers of items: `accepted`; `fallback`, the accepted ones whose rationale the built-in
-      narrator wrote instead of the teacher; `set_aside`, without an accepted response; `too_short`,
-      without any response because the prefix is too short.
+      narrator wrote instead of the teacher; `unanswered`, whose last request the servers did not
+      answer; `set_aside`, others without an accepted response; `too_short`, without any response
+      because the prefix is too short.
+    - `constraints`: numbers of responses by the grammar or schema that constrained them.
     - `responses` and `accepted_responses`: numbers of the teacher's responses, by attempt.
     - `rejected`: number of responses by kind of reason; `examples`: items and details of some.
     - `lengths`: number of words of each accepted rationale; `words`: the most frequent words.
@@ -57,7 +63,8 @@ def summarize(
     every = [r for item in items for r in responses.get(item.item_id, ())]
     accepted = select_accepted(items, responses)
     without_names = {OBJECT_NAME.sub("object", r.text) for r in accepted}
-    narrated = len({r.item_id for r in every})
+    narrated = {r.item_id for r in every}
+    open_items = narrated - {r.item_id for r in accepted} - set(unanswered)
     by_attempt = Counter(r.attempt for r in every if not r.fallback)
     accepted_by_attempt = Counter(r.attempt for r in every if r.accepted and not r.fallback)
     rejections: dict[str, list[tuple[str, str]]] = defaultdict(list)
@@ -72,11 +79,14 @@ def summarize(
             claims[kind] += counts
     gaps = np.diff(np.sort([r.finished for r in every if r.finished is not None]))
     return {
+        "sample": sample,
         "items": len(items),
         "accepted": len(accepted),
         "fallback": sum(r.fallback for r in accepted),
-        "set_aside": narrated - len(accepted),
-        "too_short": len(items) - narrated,
+        "unanswered": len(unanswered),
+        "set_aside": len(open_items),
+        "too_short": len(items) - len(narrated.union(unanswered)),
+        "constraints": dict(Counter(name_constraint(r) for r in every if not r.fallback)),
         "responses": [by_attempt[k] for k in sorted(by_attempt)],
         "accepted_responses": [accepted_by_attempt[k] for k in sorted(by_attempt)],
         "rejected": {kind: len(details) for kind, details in rejections.items()},
@@ -117,11 +127,11 @@ def _summarize_sufficiency(
 
 def describe_sufficiency(figures: Figures) -> str:
     """Return the sufficiency of the accepted rationales, and the undecided items, in words."""
-    mean, ones, _ = figures["sufficiency"].get("all", (float("nan"),) * 3)
-    return (
-        f"sufficiency {mean:.3f} ({ones:.1%} decide their item; {figures['undecided']} items that "
-        "no statement decides)"
-    )
+    undecided = f"{figures['undecided']} items that no statement decides"
+    if "all" not in figures["sufficiency"]:
+        return f"sufficiency none ({undecided})"
+    mean, ones, _ = figures["sufficiency"]["all"]
+    return f"sufficiency {mean:.3f} ({ones:.1%} decide their item; {undecided})"
 
 
 def select_accepted(
@@ -153,6 +163,7 @@ def format_figures(figures: Figures) -> str:
         "training items": f["items"],
         "accepted": f["accepted"],
         "of them by the built-in narrator": f["fallback"],
+        "unanswered": f["unanswered"],
         "set aside": f["set_aside"],
         "prefix too short": f["too_short"],
         "undecided items": f["undecided"],
@@ -173,7 +184,9 @@ def format_figures(figures: Figures) -> str:
         for item, detail in details
         if detail
     ]
+    constraints = ", ".join(f"{name} ({n:,} responses)" for name, n in f["constraints"].items())
     parts = [
+        f"sample: {f['sample'] or 'none, all training items'}\nconstraint: {constraints or 'none'}",
         pd.Series(counts).to_string(),
         *(_format_table(table) for table in (attempts, rejected)),
         "\n".join(examples),
@@ -186,7 +199,7 @@ def format_figures(figures: Figures) -> str:
 
 
 def _format_table(table: pd.DataFrame) -> str:
-    return "" if table.empty else table.to_string(float_format="{:.1%}".format)
+    return "" if table.empty else table.to_string(float_format="{:.1%}".format, na_rep="none")
 
 
 def _format_words(figures: Figures) -> str:
@@ -216,37 +229,66 @@ def _format_cost(figures: Figures) -> str:
 
 def write_report(
     store: Store,
-    accepted: Sequence[Rationale],
+    responses: Mapping[str, Sequence[Rationale]],
     figures: Figures,
     count: int,
     cfg: TeacherConfig,
     folder: Path,
 ) -> Path:
-    """Write report.json, report.txt and report.html, which shows `count` accepted rationales,
-    sampled with `cfg.seed`. Return the path of report.html."""
+    """Write report.json, report.txt and report.html, which shows the accepted and the rejected
+    responses to `count` items. Return the path of report.html."""
     import jinja2
 
     from conf.files import write_bytes
     from data.publish.contact_sheets import SheetRows, draw_sheet
 
-    text = f"predicates: {name_vocabulary(cfg)}\n\n{format_figures(figures)}"
-    write_json(folder / "report.json", figures)
+    teacher = name_teacher(cfg)
+    text = f"teacher: {teacher}\npredicates: {name_vocabulary(cfg)}\n{format_figures(figures)}"
+    write_json(folder / "report.json", {"teacher": teacher, **figures})
     write_text(folder / "report.txt", text + "\n")
-    items = {item.item_id: item for item in store.training_items()}
     rows, examples = SheetRows(store), []
-    for k in sorted(np.random.default_rng(cfg.seed).permutation(len(accepted))[:count].tolist()):
-        item = items[accepted[k].item_id]
+    for item in choose_examples(store.training_items(), responses, count, cfg.seed):
         write_bytes(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.make(item)]))
         predicates = describe_item(item, store, cfg)
         facts = predicates and choose_vocabulary(predicates, cfg)
-        examples.append((accepted[k], json.dumps(facts and format_facts(facts), indent=1)))
+        shown = sorted(responses[item.item_id], key=lambda r: not r.accepted)
+        examples.append((item, shown, json.dumps(facts and format_facts(facts), indent=1)))
     template = (files("teacher") / "templates" / "report.html").read_text()
     page = jinja2.Template(template, autoescape=True).render(
-        teacher=accepted[0].teacher if accepted else "an unnamed teacher",
+        teacher=teacher,
+        name_constraint=name_constraint,
         text=text,
-        accepted=len(accepted),
+        narrated=sum(map(bool, responses.values())),
         benchmark=store.name,
         examples=examples,
     )
     write_text(folder / "report.html", page)
     return folder / "report.html"
+
+
+def name_constraint(rationale: Rationale) -> str:
+    """Return what constrained the server: "grammar VERSION", "cited VERSION" or "none"."""
+    version = rationale.grammar or "none"
+    return f"grammar {version}" if version.isdecimal() else version
+
+
+def name_teacher(cfg: TeacherConfig) -> str:
+    """Return the name of a teacher with its model and its servers."""
+    if cfg.url is None:
+        return f"{cfg.name} (the built-in narrator)"
+    return f"{cfg.name} ({cfg.model} at {', '.join(cfg.urls)})"
+
+
+def choose_examples(
+    items: Sequence[SelectionItem],
+    responses: Mapping[str, Sequence[Rationale]],
+    count: int,
+    seed: int,
+) -> list[SelectionItem]:
+    """Return a random sample of `count` items with responses, in their order. Up to half of them
+    have a rejected response, if there are any, so that rejected texts are shown too."""
+    narrated = [item for item in items if responses.get(item.item_id)]
+    order = np.random.default_rng(seed).permutation(len(narrated)).tolist()
+    rejected = [k for k in order if not all(r.accepted for r in responses[narrated[k].item_id])]
+    chosen = dict.fromkeys([*rejected[: count // 2], *order])
+    return [narrated[k] for k in sorted([*chosen][:count])]

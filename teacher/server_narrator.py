@@ -11,9 +11,9 @@ from data.records import Rationale, SelectionItem
 from teacher.cited_rationales import CitationError, cited_schema, compose_rationale, list_facts
 from teacher.prompts import build_messages
 from teacher.sections import GRAMMAR
+from teacher.servers.capabilities import Constraint, RequestFields
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import Response
-from teacher.servers.server import RequestFields
 from teacher.validation.grader import RationaleGrader
 from teacher.vocabulary import choose_vocabulary, describe_item
 
@@ -30,13 +30,20 @@ async def request_rationales(
     grader: RationaleGrader,
     record: Callable[[list[Rationale]], None],
     finish_item: Callable[[], None],
-) -> None:
+    show: Callable[[str], object],
+) -> dict[str, str]:
     """Request rationales until every item has an accepted one or no attempt is left.
 
     `cfg.concurrency` items are in progress at a time. `record` saves the graded responses to a
-    request; `finish_item` is called after the last request for each item.
+    request; `finish_item` is called after the last request for each item, and `show` with a text
+    about timeouts.
+
+    Returns:
+        Why the servers did not answer the last request for an item, by its id. Such a request is no
+        attempt.
     """
     cfg = grader.cfg
+    unanswered: dict[str, str] = {}
 
     async def narrate(job: Job) -> None:
         item, attempt = job
@@ -52,7 +59,8 @@ async def request_rationales(
                     facts = list_facts(vocabulary, item)
                     responses = [fill_slots(r, facts, item.letter) for r in responses]
             except NoResponseError as error:
-                responses = [Response("", f"unanswered: {error}")]
+                unanswered[item.item_id] = str(error)
+                break
             rationales = [
                 grader.grade(response, predicates, item, attempt + k)
                 for k, response in enumerate(responses)
@@ -63,8 +71,11 @@ async def request_rationales(
             attempt += len(rationales)
         finish_item()
 
-    async with ServerPool(cfg, request_fields(cfg)) as pool:
+    samples = min(cfg.samples, max(cfg.attempts - 1, 1))
+    options = {"constraint": constraint(cfg), "samples": samples, "show": show}
+    async with ServerPool(cfg, request_fields(cfg), **options) as pool:
         await run_limited(jobs, cfg.concurrency, narrate)
+    return unanswered
 
 
 def fill_slots(response: Response, facts: Mapping[str, str], answer: str) -> Response:
@@ -82,13 +93,16 @@ def request_fields(cfg: TeacherConfig) -> RequestFields:
     """Return the fields of every request for a rationale."""
     # There is no seed: with seeds, vLLM on a CPU crashed when 32 requests were in flight.
     extra = {"top_k": cfg.top_k, "chat_template_kwargs": {"enable_thinking": False}}
-    if cfg.grammar:
-        extra["structured_outputs"] = {"grammar": GRAMMAR}
-    elif cfg.form == "cited":
-        extra["structured_outputs"] = {"json": cited_schema()}
     return {
         "temperature": cfg.temperature,
         "top_p": cfg.top_p,
         "max_tokens": cfg.max_tokens,
         "extra_body": extra,
     }
+
+
+def constraint(cfg: TeacherConfig) -> Constraint | None:
+    """Return what the settings constrain a rationale to."""
+    if cfg.form == "cited":
+        return cited_schema()
+    return GRAMMAR if cfg.grammar else None

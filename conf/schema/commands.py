@@ -106,7 +106,10 @@ class NarrateCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     teacher: TeacherConfig = MISSING
     examples: int = setting(20, least=0)
-    """Rationales shown with their frames on the report's page; sampled with `teacher.seed`."""
+    """Items shown with their frames and texts on the report's page; sampled with `teacher.seed`."""
+    limit: int | None = setting(None, least=1)
+    """Number of items to narrate, sampled with `teacher.seed` evenly over the families; null
+    narrates all. A later narration of more items goes on from this one."""
 
 
 @dataclass

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +20,16 @@ from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageComm
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import build_record_schema
 from models.fingerprints import processor_digest, weights_digest
-from models.student.chat_requests import build_messages, sampling_fields
+from models.student.chat_requests import build_messages, find_difference, sampling_fields
 from models.student.prompts import Clip, Sample
 from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.trained_runs import product_folder, run_title
+from teacher.servers.capabilities import Messages, RequestFields
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import TRUNCATED, Response
 from teacher.servers.server import (
     API_KEY_VARIABLE,
     MALFORMED_REPLY_ERRORS,
-    Messages,
-    RequestFields,
     authentication_error,
     open_client,
 )
@@ -70,6 +71,9 @@ class ServedModel:
                 folder,
             )
         weights = product_folder(folder, "student") if folder else None
+        self._processor_source = str(weights or student.model)
+        # Of the servers that report where weights come from, vLLM reports token ids too.
+        self._compares = origin["root"] is not None
         source = origin["parent"] or origin["root"]
         if source is None or not Path(source).is_dir():
             log.info(
@@ -105,18 +109,26 @@ class ServedModel:
 
             def prepare(subject: Subject) -> tuple[Messages, RequestFields]:
                 sample = sample_of(subject)
-                return build_messages(sample), request_fields(student, mode, sample.clip)
+                return build_messages(sample), sampling(sample.clip)
+
+            def sampling(clip: Clip | None) -> RequestFields:
+                limit = response_token_limit(mode, student.max_new_tokens, student.thinking)
+                return sampling_fields(student, limit, clip)
 
             first = await loop.run_in_executor(preparer, sample_of, subjects[0])
             canary = build_messages(blank_sample(first))
-            shared_fields = request_fields(student, mode, first.clip)
-            async with ServerPool(server, shared_fields, canary) as pool:
+            schema = build_record_schema() if mode == "constrained" else None
+            show = partial(save, [])
+            async with ServerPool(server, sampling(first.clip), canary, schema, show=show) as pool:
                 thoughts: list[Subject] = []
 
                 async def respond(subject: Subject) -> None:
                     messages, fields = await loop.run_in_executor(preparer, prepare, subject)
                     if student.temperature:
                         fields["seed"] = response_seed(self._seed, subject, mode)
+                    compares, self._compares = self._compares, False
+                    if compares:
+                        fields["extra_body"]["return_token_ids"] = True
                     try:
                         [response] = await pool.complete(messages, **fields)
                     except NoResponseError as error:
@@ -125,6 +137,16 @@ class ServedModel:
                             "the cause and run the same command again, which resumes",
                             code="no-response",
                         ) from error
+                    if schema is not None and not response.constrained:
+                        raise UserError(
+                            f"{server.model}: the server does not apply the JSON schema of "
+                            "constrained mode: leave out the mode, or use a server with JSON "
+                            "schemas (response_format), such as vLLM",
+                            code="no-constraint",
+                        )
+                    if compares and response.prompt_ids:
+                        ids = subject, response.prompt_ids
+                        await loop.run_in_executor(preparer, self._compare, sample_of, *ids)
                     if response.reasoning and not response.text and response.flaw != TRUNCATED:
                         thoughts.append(subject)
                     save([(subject, restore_thought(response, starts_in_thought))])
@@ -138,23 +160,40 @@ class ServedModel:
                 len(thoughts), len(subjects), mode,
             )  # fmt: skip
 
+    def _compare(self, sample_of: SampleOf, subject: Subject, served: Sequence[int]) -> None:
+        """Warn if the server reads a prompt as other tokens than a local model."""
+        student, source = self._student, self._processor_source
+        try:
+            from transformers import AutoProcessor
+
+            from models.compat import write_clips_as_released
+            from models.loading import pin_sizes
+            from models.student.collator import encode
+
+            origin = {"revision": student.revision, "trust_remote_code": student.trust_remote_code}
+            processor = AutoProcessor.from_pretrained(
+                source, **({} if Path(source).is_dir() else origin)
+            )
+        except (ImportError, OSError, ValueError, KeyError) as error:
+            reason = str(error).partition("\n")[0]
+            log.info("prompts are not compared with a local model's, which is missing: %s", reason)
+            return
+        write_clips_as_released(processor)
+        pin_sizes(processor, student.image_size, student.frames)
+        own = encode(sample_of(subject), processor, None, student.thinking).input_ids
+        if difference := find_difference(own, served, processor.tokenizer):
+            log.warning(
+                "the server reads prompts differently from a local model: %s. Start it with python "
+                "-m teacher.serve frames=true, or expect other results",
+                difference,
+            )
+
 
 def blank_sample(sample: Sample) -> Sample:
     """Return a sample with the same text and number of frames, but with small blank frames."""
     blank = np.zeros((CANARY_SIZE, CANARY_SIZE, 3), np.uint8)
     clip = sample.clip and replace(sample.clip, pixels=np.stack([blank] * len(sample.clip.indices)))
     return replace(sample, clip=clip, images=[blank] * len(sample.images))
-
-
-def request_fields(student: StudentConfig, mode: str, clip: Clip | None) -> RequestFields:
-    """Return the fields of a request besides its messages: those of `sampling_fields` and, in
-    constrained mode, the JSON schema of the response."""
-    limit = response_token_limit(mode, student.max_new_tokens, student.thinking)
-    request = sampling_fields(student, limit, clip)
-    if mode == "constrained":
-        record = {"name": "record", "strict": True, "schema": build_record_schema()}
-        request["response_format"] = {"type": "json_schema", "json_schema": record}
-    return request
 
 
 def restore_thought(response: Response, starts_in_thought: bool) -> GeneratedText:

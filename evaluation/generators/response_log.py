@@ -26,8 +26,9 @@ Subject = SelectionItem | RetrievalQuery | FrameRef
 """The item, query or frame that a prompt is about."""
 SampleOf = Callable[[Subject], Sample]
 """Returns the prompt for a subject."""
-SaveResponses = Callable[[list[tuple[Subject, GeneratedText]]], None]
-"""Saves finished responses: all responses of a local batch, or one response of a server."""
+SaveResponses = Callable[..., None]
+"""Saves a list of subjects with their finished responses: all responses of a local batch, or one
+response of a server. With `servers`, shows a text about the servers in the progress bar."""
 Respond = Callable[[list[Subject], SaveResponses], None]
 """Generates the responses to subjects and saves them."""
 
@@ -165,7 +166,9 @@ def collect_responses(
     is_main = rank() == 0
     with tqdm(total=len(subjects), initial=done, desc=mode, unit=unit, disable=not is_main) as bar:
 
-        def save(generated: list[tuple[Subject, GeneratedText]]) -> None:
+        def save(generated: list[tuple[Subject, GeneratedText]], servers: str = "") -> None:
+            if servers:
+                bar.set_postfix_str(servers)
             log.append([score_response(subject, mode, text) for subject, text in generated])
             bar.update(len(generated))
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from models.student.prompts import Clip, Sample
 
 if TYPE_CHECKING:
     from conf.schema import StudentConfig
-    from teacher.servers.server import Messages, RequestFields
+    from teacher.servers.capabilities import Messages, RequestFields
 
 
 def build_messages(sample: Sample) -> Messages:
@@ -47,8 +49,25 @@ def _encode_png(pixels: np.ndarray) -> str:
     return base64.b64encode(buffer.getvalue()).decode()
 
 
+def find_difference(own: Sequence[int], served: Sequence[int], tokenizer: Any) -> str | None:
+    """Return in words where a server's token ids of a prompt differ from ours; None if nowhere."""
+    pairs = enumerate(zip_longest(own, served))
+    position = next((k for k, (one, other) in pairs if one != other), None)
+    if position is None:
+        return None
+    names = [
+        repr(tokenizer.convert_ids_to_tokens(ids[position])) if position < len(ids) else "no token"
+        for ids in (own, served)
+    ]
+    return (
+        f"at token {position} of the first prompt, this process has {names[0]} and the server "
+        f"{names[1]} ({len(own)} and {len(served)} tokens)"
+    )
+
+
 def sampling_fields(student: StudentConfig, limit: int, clip: Clip | None) -> RequestFields:
-    """Return the fields of a request besides its messages: sampling and preprocessing.
+    """Return the fields of a request besides its messages: sampling, without any penalty, and
+    preprocessing.
 
     The server keeps all frames of a clip, and resizes a frame only to the nearest size on the grid
     of the vision tower, as a local model does (see `models.loading.pin_sizes`).
@@ -69,12 +88,16 @@ def sampling_fields(student: StudentConfig, limit: int, clip: Clip | None) -> Re
     }
     if clip:
         extra["media_io_kwargs"] = {"video": {"num_frames": -1, **clip.metadata}}
+    # Fields that are left out would have the values of the model's generation_config.json.
+    extra |= {"min_p": 0.0, "repetition_penalty": 1.0}
     if student.temperature:
-        # -1 sets no limit. Without this field, the model's generation_config.json sets the limit.
+        # -1 sets no limit.
         extra["top_k"] = student.top_k or -1
     return {
         "temperature": student.temperature,
         "top_p": student.top_p,
+        "presence_penalty": 0.0,
+        "frequency_penalty": 0.0,
         "max_tokens": limit,
         "extra_body": extra,
     }

@@ -25,6 +25,8 @@ class Response:
         reasoning: The text that the server's reasoning parser separated from the response.
         token_ids: The token ids of the response, if the request asks for them with vLLM's
             `return_token_ids`; otherwise empty.
+        prompt_ids: The same for the prompt.
+        constrained: Whether the server constrained the response to a grammar or a schema.
     """
 
     text: str
@@ -34,6 +36,8 @@ class Response:
     finished: float | None = None
     reasoning: str = ""
     token_ids: tuple[int, ...] = ()
+    prompt_ids: tuple[int, ...] = ()
+    constrained: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,8 @@ def parse_completion(completion: Any, n: int, is_constrained: bool = False) -> l
                 finished=time.time(),
                 reasoning=reasoning,
                 token_ids=tuple(getattr(choice, "token_ids", None) or ()),
+                prompt_ids=tuple(getattr(completion, "prompt_token_ids", None) or ()),
+                constrained=is_constrained,
             )
         )
     return responses

@@ -7,19 +7,16 @@ import math
 import os
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import openai
 
 from conf.errors import UserError
 from conf.proxies import proxy_hint
 from conf.schema import ServersConfig
+from teacher.servers.capabilities import Capabilities, Constraint, Messages, RequestFields
 from teacher.servers.responses import Response, ScoredPrompt, parse_completion
 
-Messages = list[dict[str, Any]]
-"""A prompt in the chat format."""
-RequestFields = dict[str, Any]
-"""Fields of a chat completion request; those outside OpenAI's API are in `extra_body`."""
 Reply = TypeVar("Reply")
 Client = TypeVar("Client", openai.OpenAI, openai.AsyncOpenAI)
 
@@ -28,6 +25,8 @@ MALFORMED_REPLY_ERRORS = (AttributeError, IndexError, TypeError, ValueError)
 API."""
 RETRYABLE_STATUSES = (408, 409)
 """HTTP status codes below 500 after which a retry may succeed: request timeout and conflict."""
+LONGEST_REASON = 400
+"""Maximum number of characters of a server's error that messages show."""
 API_KEY_VARIABLE = "OPENAI_API_KEY"
 """The API key is in an environment variable because settings are saved with the run."""
 
@@ -77,11 +76,12 @@ def authentication_error(url: str, error: openai.APIStatusError) -> UserError:
 
 
 class RequestError(Exception):
-    """A request failed. `pause` is the time (s) to wait that the server gives, if any."""
+    """A request failed. `pause` is the time (s) to wait that the server gives, `status` its HTTP
+    status, if any."""
 
-    def __init__(self, problem: str, pause: float | None = None) -> None:
+    def __init__(self, problem: str, pause: float | None = None, status: int | None = None) -> None:
         super().__init__(problem)
-        self.pause = pause
+        self.pause, self.status = pause, status
 
 
 class MalformedReplyError(RequestError):
@@ -96,11 +96,20 @@ class RateLimitedError(RequestError):
     """The server limits the request rate."""
 
 
+class NoReplyInTimeError(RequestError):
+    """The server sent no response within the timeout."""
+
+
 class ServerClient:
     """Sends requests to `cfg.model` at `url`. Use it inside one event loop.
 
     Attributes:
+        found: What the server takes; None as long as it was not probed.
+        probe: The probe that sets `found`, if it has begun.
         in_flight: Number of requests that have no response yet.
+        limit: Maximum of `in_flight`; lowered when the server is too slow.
+        answered: Number of responses so far.
+        lowered_at: Time of the last lowering, on the clock of time.monotonic().
         problem: Why `ServerPool` paused the server; None if the server has responded since.
         pauses: Number of consecutive pauses.
         available_at: Earliest time of the next request, on the clock of time.monotonic().
@@ -112,24 +121,39 @@ class ServerClient:
         self.url = url
         self.cfg = cfg
         self.client = open_client(openai.AsyncOpenAI, url, cfg.timeout)
-        self.in_flight = self.pauses = 0
+        self.found: Capabilities | None = None
+        self.probe: asyncio.Task[None] | None = None
+        self.in_flight = self.pauses = self.answered = 0
+        self.limit = float(cfg.concurrency)
         self.problem: str | None = None
-        self.available_at = self.checked_at = -math.inf
+        self.available_at = self.checked_at = self.lowered_at = -math.inf
         self.lock = asyncio.Lock()
 
-    async def complete(self, messages: Messages, n: int, fields: RequestFields) -> list[Response]:
-        """Send a request, and return up to `n` responses.
+    async def complete(
+        self,
+        messages: Messages,
+        n: int,
+        fields: RequestFields,
+        constraint: Constraint | None = None,
+    ) -> list[Response]:
+        """Send a request in the form that the server takes, and return up to `n` responses.
 
         Raises:
             RequestError: The request failed.
             UserError: The server does not serve the model, or rejects the API key.
         """
+        found = self.found or Capabilities()
+        count = min(n, found.most or n)
+        is_constrained = constraint is not None and found.form is not None
 
         async def request() -> list[Response]:
             completion = await self.client.chat.completions.create(
-                model=self.cfg.model, messages=messages, n=n, **fields
+                model=self.cfg.model,
+                messages=messages,
+                n=count,
+                **found.adapt(fields, constraint),
             )
-            return parse_completion(completion, n, is_constrained(fields))
+            return parse_completion(completion, count, is_constrained)
 
         return await self._translate_errors(request)
 
@@ -205,18 +229,20 @@ class ServerClient:
             async with asyncio.timeout(cfg.timeout):
                 return await request()
         except openai.NotFoundError as error:
-            raise await self._unknown_model_error() from error
+            raise await self._unknown_model_error(_reason(error)) from error
         except openai.AuthenticationError as error:
             raise authentication_error(self.url, error) from error
         except openai.RateLimitError as error:
-            raise RateLimitedError("rate-limited (HTTP 429)", _retry_after(error)) from error
+            raise RateLimitedError(
+                f"rate-limited ({_reason(error)})", _retry_after(error)
+            ) from error
         except openai.APIStatusError as error:
             if error.status_code >= 500 or error.status_code in RETRYABLE_STATUSES:
-                hint = proxy_hint(self.url)
-                raise RequestError(f"HTTP {error.status_code}{hint}") from error
-            raise RefusedError(error.message) from error
+                reason = f"{_reason(error)}{proxy_hint(self.url)}"
+                raise RequestError(reason, status=error.status_code) from error
+            raise RefusedError(_reason(error)) from error
         except (openai.APITimeoutError, TimeoutError) as error:
-            raise RequestError(
+            raise NoReplyInTimeError(
                 f"no response within {cfg.GROUP}.timeout={cfg.timeout:g} seconds"
                 f"{proxy_hint(self.url)}"
             ) from error
@@ -226,21 +252,24 @@ class ServerClient:
         except (openai.APIResponseValidationError, *MALFORMED_REPLY_ERRORS) as error:
             raise MalformedReplyError(f"{type(error).__name__}: {error}") from error
 
-    async def _unknown_model_error(self) -> UserError:
+    async def _unknown_model_error(self, reason: str) -> UserError:
         try:
             served = ", ".join([m.id async for m in self.client.models.list()])
         except (openai.OpenAIError, *MALFORMED_REPLY_ERRORS):
             served = "an unknown set of models"
         return UserError(
-            f"{self.url} does not serve {self.cfg.GROUP}.model={self.cfg.model}; it serves "
-            f"{served}. Check that the URL belongs to an OpenAI-compatible server and ends in /v1",
+            f"{self.url} does not serve {self.cfg.GROUP}.model={self.cfg.model} ({reason}); it "
+            f"serves {served}. Check that the URL belongs to an OpenAI-compatible server and ends "
+            "in /v1",
             code="unknown-model",
         )
 
 
-def is_constrained(fields: RequestFields) -> bool:
-    """Return whether the fields of a request constrain its response to a grammar or a schema."""
-    return "response_format" in fields or "structured_outputs" in fields.get("extra_body", {})
+def _reason(error: openai.APIStatusError) -> str:
+    """Return a server's error on one line, with its body."""
+    # The openai client includes the body only if it has the form of OpenAI's errors.
+    text = error.message if " - " in error.message else f"{error.message} - {error.body or ''}"
+    return " ".join(text.split())[:LONGEST_REASON]
 
 
 def _retry_after(error: openai.APIStatusError) -> float | None:

@@ -32,7 +32,9 @@ class RationaleGrader:
 
     def __init__(self, cfg: TeacherConfig) -> None:
         self.cfg = cfg
-        self.grammar_version = GRAMMAR_VERSION if cfg.grammar else None
+        self.constraint = GRAMMAR_VERSION if cfg.grammar else None
+        if cfg.form == "cited":
+            self.constraint = f"cited {CITED_VERSION}"
         self.origin = {
             "teacher": cfg.name,
             "prompt_version": PROMPT_VERSION,
@@ -84,7 +86,7 @@ class RationaleGrader:
             sections=result.sections,
             prompt_tokens=response.prompt_tokens,
             completion_tokens=response.completion_tokens,
-            grammar=self.grammar_version,
+            grammar=self.constraint if response.constrained else None,
             finished=response.finished,
             claims={
                 kind: [counts[kind, name] for name in VERDICTS]
@@ -112,8 +114,8 @@ class RationaleGrader:
             settings += [cfg.sufficient, *astuple(cfg.bounds)]
         if cfg.url is not None:
             settings += [cfg.model, cfg.temperature, cfg.top_p, cfg.top_k, cfg.max_tokens]
-        if self.grammar_version is not None:
-            settings.append(self.grammar_version)
+        if cfg.grammar:
+            settings.append(GRAMMAR_VERSION)
         if cfg.form == "cited":
             settings += ["cited", CITED_VERSION]
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:8]

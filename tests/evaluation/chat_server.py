@@ -5,23 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from teacher.servers.capabilities import CANARY, UNLIKELY
 from tests.local import JsonHandler, LocalServer
 
 Reply = str | int | dict[str, Any]
 """The text of a response; an HTTP status; or a dictionary with some of the keys `status`, `message`
-(of an error), `content`, `reasoning` and `finish_reason`."""
+(of an error), `content`, `reasoning`, `finish_reason` and `prompt_ids`."""
 
 
 class ChatServer(LocalServer):
     """Responds to each request with `reply(request)`, and records it in `requests`.
 
-    If `key` is set, requests without this API key are refused.
+    If `key` is set, requests without this API key are refused. The canary that probes servers is
+    answered without `reply`, and is not recorded; `constrains` says whether JSON schemas apply.
     """
 
     def __init__(self, reply: Callable[[dict[str, Any]], Reply], port: int = 0) -> None:
         self.reply = reply
         self.key: str | None = None
         self.root = "weights"
+        self.constrains = True
         self.requests: list[dict[str, Any]] = []
         super().__init__(Handler, port)
 
@@ -39,8 +42,12 @@ class Handler(JsonHandler):
     def post(self, request: dict[str, Any]) -> None:
         if self.refused():
             return
-        self.server.requests.append(request)
-        reply = self.server.reply(request)
+        if request["messages"] == CANARY:
+            is_constrained = UNLIKELY in str(request.get("response_format"))
+            reply: Reply = UNLIKELY if is_constrained and self.server.constrains else "Hello."
+        else:
+            self.server.requests.append(request)
+            reply = self.server.reply(request)
         if isinstance(reply, int):
             reply = {"status": reply}
         elif isinstance(reply, str):
@@ -54,6 +61,8 @@ class Handler(JsonHandler):
         finish = reply.get("finish_reason", "stop")
         choice = {"index": 0, "finish_reason": finish, "message": message}
         body = {"id": "x", "object": "chat.completion", "created": 0, "model": "served"}
+        if "prompt_ids" in reply:
+            body["prompt_token_ids"] = reply["prompt_ids"]
         self.respond(200, {**body, "choices": [choice]})
 
     def refused(self) -> bool:

@@ -10,7 +10,7 @@ from socket import SO_LINGER, SOL_SOCKET
 from typing import Any
 
 from conf.schema import TeacherConfig
-from teacher.servers.pool import CANARY
+from teacher.servers.capabilities import CANARY, UNLIKELY
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.memory_store import MemoryStore, prompts_and_rationales
 
@@ -40,7 +40,8 @@ def spoil_text(fault: str, text: str) -> tuple[str, str]:
 
 class FaultyServer(LocalServer):
     """A server whose first responses have one of `faults` each, in order. Responses to the canary,
-    the prompt with which a pool tests servers, do not count and have none of these faults.
+    the prompt with which a pool tests and probes servers, do not count and have none of these
+    faults. The server applies constraints to the canary under vLLM's names.
 
     Attributes:
         always: The fault of every response to a prompt; the prompt "*" stands for all prompts,
@@ -48,6 +49,9 @@ class FaultyServer(LocalServer):
         requests: The requests so far, without canaries.
         request_times: When each of these requests arrived.
         delay: Seconds before a response.
+        slots: Limits how many requests are answered at the same time; others wait.
+        refused: Fields of a request that are refused, and the status of the refusal.
+        constrains: Whether constraints apply.
         max_in_flight: Maximum number of requests that were answered at the same time.
         rationales: The rationale for each prompt.
     """
@@ -58,9 +62,18 @@ class FaultyServer(LocalServer):
         self.request_times: list[float] = []
         self.lock = threading.Lock()
         self.in_flight = self.max_in_flight = 0
-        self.delay = 0.0
+        self.delay, self.slots = 0.0, threading.Semaphore(1000)
+        self.refused: dict[str, int] = {}
+        self.constrains = True
         self.rationales = {prompt: text for _, prompt, text in prompts_and_rationales(store)}
         super().__init__(Handler, port)
+
+    def find_text(self, request: dict[str, Any]) -> str:
+        """Return the text of a response without faults."""
+        constraint = str({k: request.get(k) for k in ("structured_outputs", "response_format")})
+        if UNLIKELY in constraint and self.constrains:
+            return UNLIKELY
+        return self.rationales.get(request["messages"][-1]["content"], "Hello.")
 
 
 class Handler(JsonHandler):
@@ -80,15 +93,18 @@ class Handler(JsonHandler):
                     fault = server.faults.pop(0)
             server.in_flight += 1
             server.max_in_flight = max(server.max_in_flight, server.in_flight)
-        time.sleep(server.delay)
+        with server.slots:
+            time.sleep(server.delay)
         try:
-            self.respond_to_prompt(request, server.rationales.get(prompt, "Hello."), fault)
+            self.respond_to_prompt(request, server.find_text(request), fault)
         finally:
             with server.lock:
                 server.in_flight -= 1
 
     def respond_to_prompt(self, request: dict[str, Any], text: str, fault: Fault | None) -> None:
-        if isinstance(fault, int):
+        if refused := next(filter(request.get, self.server.refused), None):
+            self.respond(self.server.refused[refused], {"detail": f"unexpected: {refused}"})
+        elif isinstance(fault, int):
             self.respond(fault, {"error": {"message": "fault", "type": "t", "code": fault}})
         elif isinstance(fault, dict):
             self.respond(429, {"error": {"message": "slow down"}}, fault)

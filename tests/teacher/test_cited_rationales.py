@@ -11,6 +11,7 @@ import pytest
 from conf.schema import RelationBounds, TeacherConfig
 from data.records import LETTERS
 from teacher.cited_rationales import (
+    CITED_VERSION,
     PREFIXES,
     CitationError,
     cited_schema,
@@ -133,8 +134,8 @@ def test_server_is_asked_for_cited_rationales(
     assert narration.figures["accepted"] == 12
     assert all(r.predicates == name_vocabulary(cfg) for r in narration.rationales)
     assert all("{" not in r.text for r in narration.rationales)
-    fields = server.requests[0]["structured_outputs"]
-    assert fields == {"json": cited_schema()}
+    assert server.requests[0]["response_format"]["json_schema"]["schema"] == cited_schema()
+    assert {r.grammar for r in narration.rationales} == {f"cited {CITED_VERSION}"}
 
 
 def test_response_that_is_not_cited_is_rejected_with_the_reason(

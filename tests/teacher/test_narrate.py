@@ -186,18 +186,25 @@ def test_failed_request_is_repeated(store, start_server, fault):
 
 
 @pytest.mark.parametrize("status", [500, 400])
-def test_item_without_response_is_set_aside(store, start_server, status):
+def test_item_without_response_spends_no_attempt(store, start_server, caplog, status):
     server = start_server()
     prompt = next(iter(server.rationales))
     server.always[prompt] = status
-    narration = narrate_store(store, teacher_at(server, concurrency=1, attempts=2))
+    cfg = teacher_at(server, concurrency=1, attempts=1)
+    narration = narrate_store(store, cfg)
+    figures = narration.figures
     assert len(narration.rationales) == 11
-    assert narration.figures["rejected"] == {"unanswered": 2}
-    assert narration.figures["set_aside"] == 1
-    if status == 400:
-        # A refused request is not repeated within an attempt.
-        prompts = [request["messages"][-1]["content"] for request in server.requests]
-        assert prompts.count(prompt) == 2
+    assert (figures["rejected"], figures["unanswered"], figures["set_aside"]) == ({}, 1, 0)
+    assert figures["too_short"] == 1
+    assert "1 items without a response" in str(narration)
+    assert "item-0" in caplog.text
+    assert f"Error code: {status} - fault" in caplog.text
+    # A request is repeated if it failed, but not if it was refused.
+    prompts = [request["messages"][-1]["content"] for request in server.requests]
+    assert prompts.count(prompt) == (1 if status == 400 else 4)
+    assert len(read_rationales(journal_path(store))) == 11
+    server.always.clear()
+    assert len(narrate_store(store, cfg).rationales) == 12
 
 
 def test_resumed_run_requests_only_missing_items_and_finished_run_none(store, start_server):
@@ -331,3 +338,42 @@ def test_bounds_of_relations_belong_to_the_settings_of_a_rationale(tmp_path):
     assert {r.settings for r in narrate_store(store, wide).rationales} != {
         r.settings for r in first
     }
+
+
+@pytest.mark.parametrize("served", [False, True])
+def test_sample_is_narrated_and_the_full_narration_goes_on_from_it(
+    tmp_path, start_server, caplog, served
+):
+    caplog.set_level("INFO")
+    stores = [make_store(tmp_path / name, 14) for name in ("sampled", "whole")]
+    server = start_server()
+    cfg = teacher_at(server) if served else TEMPLATE
+    for store in stores:
+        store.folder.mkdir()
+    sampled, whole = stores
+    narration = narrate_store(sampled, cfg, limit=5)
+    assert "narrating a sample: 5 of 13 items, seed 0" in caplog.text
+    assert narration.figures["items"] == 5 == len(narration.responses)
+    assert narration.figures["accepted"] + narration.figures["too_short"] == 5
+    assert {r.sample for r in narration.rationales} == {"5 of 13 items, seed 0"}
+    before = journal_path(sampled).read_bytes()
+    assert narrate_store(sampled, cfg, limit=5).rationales == narration.rationales
+    assert journal_path(sampled).read_bytes() == before
+    # A larger sample contains a smaller one.
+    larger = narrate_store(sampled, cfg, limit=8)
+    assert set(narration.responses) < set(larger.responses)
+    requests = len(server.requests)
+
+    full, expected = narrate_store(sampled, cfg), narrate_store(whole, cfg)
+    assert journal_path(sampled).read_bytes().startswith(before)
+    texts = [[(r.item_id, r.attempt, r.text) for r in n.rationales] for n in (full, expected)]
+    assert texts[0] == texts[1]
+    if served:
+        assert len(server.requests) == 12 + 12
+        assert requests < 9
+    else:
+        tables = [(store.folder / "rationales.parquet").read_bytes() for store in stores]
+        assert tables[0] == tables[1]
+    # A sample does not take rationales out of the table.
+    narrate_store(sampled, cfg, limit=2)
+    assert pq.read_table(sampled.folder / "rationales.parquet").num_rows == 12

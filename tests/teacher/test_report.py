@@ -9,7 +9,13 @@ import pytest
 from conf.schema import TeacherConfig
 from data.records import Rationale
 from teacher.narrate import narrate_store
-from teacher.report import format_figures, summarize, write_report
+from teacher.report import (
+    describe_sufficiency,
+    format_figures,
+    name_teacher,
+    summarize,
+    write_report,
+)
 from teacher.vocabulary import name_vocabulary
 from tests.teacher import synthetic
 
@@ -111,27 +117,61 @@ def test_long_pauses_between_responses_are_not_counted_as_hours():
 def test_figures_without_responses():
     figures = figures_of()
     assert figures["accepted"] == 0
-    assert format_figures(figures)
+    assert describe_sufficiency(figures).startswith("sufficiency none (0 items")
+    rejected = figures_of(response(0, 0, reasons=["empty"], claims={"speed": [0, 0, 0]}))
+    for text in (format_figures(figures), format_figures(rejected)):
+        assert not re.search(r"\bnan\b", text, re.IGNORECASE)
 
 
-def test_page_shows_random_rationales_beside_their_frames(micro_store, tmp_path):
+def test_page_shows_accepted_and_rejected_texts_beside_their_frames(micro_store, tmp_path):
     cfg = TeacherConfig(name="template & co")
     narration = narrate_store(micro_store, cfg)
     figures = narration.figures
-
-    def write(rationales, seed):
-        shown = replace(cfg, seed=seed)
-        return write_report(micro_store, rationales, figures, 4, shown, tmp_path).read_text()
-
-    page = write(narration.rationales, 0)
-    written = (tmp_path / "report.txt").read_text()
-    assert written == f"predicates: {name_vocabulary(cfg)}\n\n{format_figures(figures)}\n"
-    assert json.loads((tmp_path / "report.json").read_text())["accepted"] == len(
-        narration.rationales
+    accepted = {r.item_id for r in narration.rationales}
+    item_id = min(accepted)
+    text = "The <b>cube</b> is first."
+    failed = replace(
+        narration.responses[item_id][0], accepted=False, text=text, reasons=("number: 'first'",)
     )
-    assert "template &amp; co" in page
+    responses = {**narration.responses, item_id: [failed, *narration.responses[item_id]]}
+
+    def write(responses, seed):
+        shown = replace(cfg, seed=seed)
+        return write_report(micro_store, responses, figures, 4, shown, tmp_path).read_text()
+
+    page = write(responses, 0)
+    written = (tmp_path / "report.txt").read_text()
+    teacher = "template & co (the built-in narrator)"
+    head = f"teacher: {teacher}\npredicates: {name_vocabulary(cfg)}\n"
+    assert written == f"{head}{format_figures(figures)}\n"
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["accepted"], report["teacher"]) == (len(accepted), teacher)
+    assert "template &amp; co (the built-in narrator)" in page
     images = re.findall(r'src="(images/[^"]+\.png)"', page)
     assert len(set(images)) == 4
     assert all((tmp_path / image).read_bytes().startswith(b"\x89PNG") for image in images)
-    assert write(narration.rationales, 1) != page
-    assert "0 of" in write([], 0)
+    # The only item with a rejected response is shown, after its accepted response.
+    assert page.count('class="rejected"') == 1
+    article = page[page.index(f'id="{item_id}"') :]
+    shown = ['class="accepted"', 'class="rejected"', "number: &#39;first&#39;", "The &lt;b&gt;cube"]
+    places = [article.index(part) for part in shown]
+    assert places == sorted(places)
+    assert places[-1] < article.index("</article>")
+    assert write(responses, 1) != page
+    assert "0 of" in write({}, 0)
+
+
+def test_page_names_the_model_and_the_servers_of_a_teacher():
+    url = ["http://a/v1", "http://b/v1"]
+    cfg = TeacherConfig(name="mine", model="Qwen/Qwen3-32B", url=url)
+    assert name_teacher(cfg) == "mine (Qwen/Qwen3-32B at http://a/v1, http://b/v1)"
+
+
+def test_figures_name_constraints_samples_and_unanswered_items():
+    responses = {f"item-{k}": [response(k, 0, grammar="2" if k else None)] for k in range(3)}
+    figures = summarize(ITEMS, responses, {"item-3": "refused"}, "4 of 9 items, seed 0")
+    assert figures["constraints"] == {"none": 1, "grammar 2": 2}
+    assert (figures["unanswered"], figures["set_aside"], figures["too_short"]) == (1, 0, 1)
+    text = format_figures(figures)
+    assert "sample: 4 of 9 items, seed 0" in text
+    assert "constraint: none (1 responses), grammar 2 (2 responses)" in text

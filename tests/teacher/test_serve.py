@@ -23,8 +23,8 @@ from teacher.sections import GRAMMAR_VERSION
 from teacher.server_narrator import request_fields
 from teacher.servers.pool import ServerPool
 from tests.teacher.memory_store import make_store, prompts_and_rationales
+from tests.teacher.server_process import ROOT, vllm_server
 from tests.teacher.tiny_qwen3 import save_tiny_qwen3
-from tests.teacher.vllm_server import ROOT, VllmServer
 from tests.user_errors import raises_user_error
 
 URL = "http://127.0.0.1:8000/v1"
@@ -50,7 +50,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def server(model, tmp_path_factory):
-    server = VllmServer(model, tmp_path_factory.mktemp("serve"))
+    server = vllm_server(model, tmp_path_factory.mktemp("serve"))
     server.start()
     yield server
     server.stop()
@@ -176,11 +176,13 @@ def test_vllm_answers_chats(server):
 
 
 @pytest.mark.slow
-def test_vllm_enforces_the_grammar_of_rationales(server, tmp_path):
+def test_vllm_enforces_the_grammar_of_rationales(server, tmp_path, caplog):
+    caplog.set_level("INFO")
     cfg = TeacherConfig(
         name="tiny", url=server.url, model="tiny", attempts=1, max_tokens=32, grammar=True
     )
     narrate_store(make_store(tmp_path, 5), cfg)
+    assert "takes top_k, chat_template_kwargs; applies the grammar as structured" in caplog.text
     rationales = read_rationales(tmp_path / "rationales.jsonl")
     assert [r.grammar for r in rationales] == [GRAMMAR_VERSION] * 4
     form = re.compile(r"Scene parse:[A-Za-z' ,.;:\n-]*")

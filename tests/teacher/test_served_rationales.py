@@ -16,9 +16,9 @@ from teacher.narrator import write_rationale
 from teacher.prompts import build_messages
 from teacher.vocabulary import choose_vocabulary, describe_item
 from tests.teacher.memory_store import make_store
+from tests.teacher.server_process import ServerProcess, vllm_server
 from tests.teacher.test_cited_rationales import cite_all
 from tests.teacher.tiny_qwen3 import save_tiny_qwen3, teach
-from tests.teacher.vllm_server import VllmServer
 
 pytestmark = pytest.mark.slow
 FORMS = ("free", "cited")
@@ -49,14 +49,14 @@ def respond(form: str, folder: Path) -> tuple[list[dict[str, str]], str, str]:
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory) -> Iterator[VllmServer]:
+def server(tmp_path_factory) -> Iterator[ServerProcess]:
     """A server of a model that has learnt a response in each form."""
     folder = tmp_path_factory.mktemp("qwen3")
     dialogues = [respond(form, folder) for form in FORMS]
     texts = [text for messages, response, _ in dialogues
              for text in (*(m["content"] for m in messages), response)]  # fmt: skip
     teach(save_tiny_qwen3(folder, texts), [dialogue[:2] for dialogue in dialogues])
-    server = VllmServer(folder, tmp_path_factory.mktemp("serve"))
+    server = vllm_server(folder, tmp_path_factory.mktemp("serve"))
     server.start()
     yield server
     server.stop()

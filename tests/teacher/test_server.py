@@ -2,16 +2,17 @@
 
 import asyncio
 import json
+import re
 import threading
 from types import SimpleNamespace
 
 import pytest
 
+from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
 from teacher.server_narrator import request_fields
 from teacher.servers.pool import ServerPool
 from teacher.servers.responses import parse_completion
-from teacher.servers.server import is_constrained
 from tests.teacher.faulty_server import FaultyServer, completion, teacher_at
 from tests.user_errors import raises_user_error
 from tests.waiting import wait_until
@@ -133,17 +134,60 @@ def test_repeated_url_counts_once(start_server):
 
 
 @pytest.mark.parametrize(
-    ("fields", "finish", "text", "reasoning"),
-    [
-        ({"response_format": {}}, "stop", "{}", ""),
-        ({"extra_body": {"structured_outputs": {}}}, "stop", "{}", ""),
-        ({"response_format": {}}, "length", "", "{}"),
-        ({"extra_body": {"top_k": 1}}, "stop", "", "{}"),
-    ],
+    ("is_constrained", "finish", "text", "reasoning"),
+    [(True, "stop", "{}", ""), (True, "length", "", "{}"), (False, "stop", "", "{}")],
 )
-def test_a_constrained_response_has_no_thought(fields, finish, text, reasoning):
+def test_a_constrained_response_has_no_thought(is_constrained, finish, text, reasoning):
     message = SimpleNamespace(content=None, reasoning="{}")
     choices = [SimpleNamespace(message=message, finish_reason=finish)]
     completion = SimpleNamespace(choices=choices, usage=None)
-    [response] = parse_completion(completion, 1, is_constrained(fields))
+    [response] = parse_completion(completion, 1, is_constrained)
     assert (response.text, response.reasoning) == (text, reasoning)
+    assert response.constrained == is_constrained
+
+
+@pytest.mark.parametrize("status", [422, 500])
+def test_refused_fields_are_left_out_and_named(store, start_server, caplog, status):
+    caplog.set_level("INFO")
+    server = start_server()
+    server.refused = {"top_k": status}
+    narration = narrate_store(store, teacher_at(server))
+    assert len(narration.rationales) == 12
+    assert not any("top_k" in request for request in server.requests)
+    assert all("chat_template_kwargs" in request for request in server.requests)
+    assert "takes chat_template_kwargs; refuses top_k, which requests leave out" in caplog.text
+
+
+def test_refusal_of_every_request_shows_its_body(store, start_server):
+    server = start_server()
+    server.refused = {"temperature": 422}
+    with raises_user_error("server-refuses", contains=(server.url, "422", "unexpected: temp")):
+        narrate_store(store, teacher_at(server))
+
+
+@pytest.mark.parametrize("refused", [{}, {"structured_outputs": 422}, {"response_format": 500}])
+@pytest.mark.parametrize("form", ["free", "cited"])
+def test_constraint_that_is_not_applied_is_named_and_not_recorded(
+    store, start_server, caplog, form, refused
+):
+    server = start_server()
+    server.constrains, server.refused = False, refused
+    narrate_store(store, teacher_at(server, form=form, grammar=form == "free", attempts=1))
+    assert f"{server.url} does not apply the constraint" in caplog.text
+    rationales = read_rationales(store.folder / "rationales.jsonl")
+    assert len(rationales) == 12
+    assert {r.grammar for r in rationales} == {None}
+    names = {"structured_outputs", "grammar", "guided_grammar", "response_format", "guided_json"}
+    assert not any(names & set(request) for request in server.requests)
+
+
+def test_slow_server_gets_fewer_requests_at_a_time(store, start_server, caplog, capsys):
+    """It answers five requests a second, so the last of twelve would wait for more than two."""
+    caplog.set_level("INFO")
+    server = start_server()
+    server.delay, server.slots = 0.4, threading.Semaphore(2)
+    narration = narrate_store(store, teacher_at(server, concurrency=12))
+    assert len(narration.rationales) == 12
+    assert (narration.figures["rejected"], narration.figures["unanswered"]) == ({}, 0)
+    assert "does not keep up with 12 requests at a time (no response within" in caplog.text
+    assert re.search(r"[1-9]\d* timeouts, [1-6] at a time", capsys.readouterr().err)

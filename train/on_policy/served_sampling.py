@@ -23,7 +23,8 @@ from conf.schema import (
     StudentConfig,
 )
 from models.distributed import main_first
-from models.student.chat_requests import build_messages, sampling_fields
+from models.student.chat_requests import build_messages, find_difference, sampling_fields
+from models.student.collator import encode
 from models.student.prompts import Sample
 from models.student.responses import GeneratedText
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
@@ -62,6 +63,7 @@ class ServedSampler(ResponseSampler):
             )
         self._servers = servers
         self._folder = folder.absolute() / ADAPTER_FOLDER
+        self._compared = False
 
     def sample(
         self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]
@@ -69,7 +71,8 @@ class ServedSampler(ResponseSampler):
         """Return a response to each prompt.
 
         Raises:
-            UserError: The servers do not respond, load no adapters, or return no token ids.
+            UserError: The servers do not respond, load no adapters, return no token ids, or read
+                the first prompt as other tokens than this process.
         """
         return asyncio.run(self._sample(model, prompts, seeds))
 
@@ -142,7 +145,22 @@ class ServedSampler(ResponseSampler):
         [response] = await pool.complete(
             build_messages(prompt), **fields, seed=seed, logit_bias=never
         )
-        return self._read(response)
+        text = self._read(response)
+        if response.prompt_ids and not self._compared:
+            self._compared = True
+            self._compare(prompt, response.prompt_ids)
+        return text
+
+    def _compare(self, prompt: Sample, served: Sequence[int]) -> None:
+        """Raise UserError if a server read a prompt as other tokens: the gradients would be those
+        of responses to another prompt."""
+        own = encode(prompt, self._processor, None).input_ids
+        if difference := find_difference(own, served, self._processor.tokenizer):
+            raise UserError(
+                f"the servers of sampling_server.url read prompts differently: {difference}. Start "
+                "them with python -m teacher.serve frames=true and the student's base",
+                code="other-prompts",
+            )
 
     def _read(self, response: Response) -> GeneratedText:
         ids = response.token_ids

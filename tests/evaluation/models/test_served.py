@@ -22,9 +22,13 @@ from evaluation.generators.generator import item_sample, response_settings
 from evaluation.generators.openai_server import ServedModel, restore_thought, served_origin
 from evaluation.generators.response_log import ResponseLog, collect_responses, score_response
 from evaluation.generators.response_schema import build_record_schema, write_record_instruction
+from models import loading
+from models.student.collator import encode
 from teacher.servers.responses import TRUNCATED, Response
 from tests.evaluation.generators.test_response_schema import FULL
+from tests.tiny_models import SMALL
 from tests.user_errors import raises_user_error
+from train.student import dataset
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
 THINKING = replace(STUDENT, thinking=True, temperature=0.6, top_p=0.95, top_k=20)
@@ -209,6 +213,59 @@ def test_a_server_that_refuses_an_item_is_reported(items, frames, start_server) 
     server = start_server(refuse)
     with raises_user_error("no-response", contains="prompt is too long"):
         responder(config_of(server, concurrency=1), frames)(items, lambda _: None)
+
+
+def test_a_server_that_ignores_the_schema_is_not_measured_in_constrained_mode(
+    items, frames, start_server
+) -> None:
+    server = start_server(lambda _: FULL)
+    server.constrains = False
+    with raises_user_error("no-constraint", contains="does not apply the JSON schema"):
+        responder(config_of(server), frames, mode="constrained")(items, lambda _: None)
+
+
+def test_requests_ask_for_no_penalty(items, frames, start_server) -> None:
+    server = start_server(lambda _: FULL)
+    for student in (STUDENT, THINKING):
+        responder(config_of(server), frames, student)(items[:1], lambda _: None)
+        request = server.requests[-1]
+        assert (request["repetition_penalty"], request["min_p"]) == (1.0, 0.0)
+        assert (request["presence_penalty"], request["frequency_penalty"]) == (0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def tiny_student(micro_store, tmp_path_factory) -> StudentConfig:
+    """A student whose base is in a folder."""
+    folder = tmp_path_factory.mktemp("base")
+    built = replace(STUDENT, architecture=SMALL, model=None)
+    corpus = partial(dataset.tokenizer_corpus, micro_store, [])
+    loading.save_student(*loading.load_base(built, "fp32", corpus), folder, "fp32")
+    return replace(STUDENT, model=str(folder))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_same", [True, False])
+def test_prompts_that_a_server_reads_differently_are_named_once(
+    items, frames, start_server, caplog, tiny_student, is_same
+) -> None:
+    _, processor = loading.load_base(tiny_student, "fp32", list)
+    sample = item_sample("cot", frames, tiny_student, None, "record", items[0])
+    ids = encode(sample, processor, None).input_ids
+    served = ids if is_same else [*ids[:3], 7, *ids[3:]]
+
+    def reply(request):
+        return {"content": FULL, "prompt_ids": served if "return_token_ids" in request else []}
+
+    server = start_server(reply)
+    responder(config_of(server, concurrency=1), frames, tiny_student)(items[:4], lambda *_, **__: 0)
+    assert sum("return_token_ids" in request for request in server.requests) == 1
+    assert caplog.text.count("reads prompts differently") == (not is_same)
+    words = (
+        f"at token 3 of the first prompt, this process has {processor.tokenizer.decode(ids[3])!r}"
+    )
+    assert is_same or (
+        words in caplog.text and f"({len(ids)} and {len(ids) + 1} tok" in caplog.text
+    )
 
 
 def test_a_server_reports_the_origin_of_its_models(start_server) -> None:

@@ -16,13 +16,13 @@ from conf.schema import LoraConfig, SelectCommand, ServerConfig, StudentConfig
 from data.frames.frame_cache import FrameReader
 from evaluation import select
 from evaluation.generators.generator import item_sample
-from evaluation.generators.openai_server import request_fields
 from evaluation.generators.response_schema import build_record_schema
 from models import loading
+from models.compat import write_clips_as_released
 from models.student.answer_parser import Reason, parse_choice
-from models.student.chat_requests import build_messages
+from models.student.chat_requests import build_messages, sampling_fields
 from models.student.collator import Collator, encode
-from tests.teacher.vllm_server import VllmServer
+from tests.teacher.server_process import vllm_server
 from tests.tiny_models import SMALL, randomize_adapters
 from train.student import dataset
 
@@ -36,15 +36,26 @@ STUDENT = StudentConfig(
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory, micro_store):
-    """A base on disk. Its processor has other image sizes than the preset, like a released one, and
-    normalises images differently from clips, like that of the tiny base."""
+    """A base on disk. Its processor has other image sizes than the preset and a chat template with
+    vision tokens around a clip, like a released one, and normalises images differently from clips,
+    like that of the tiny base."""
     folder = tmp_path_factory.mktemp("base")
     model, processor = loading.load_base(
         STUDENT, "fp32", lambda: dataset.tokenizer_corpus(micro_store, [])
     )
     processor.image_processor.image_mean = [0.4, 0.45, 0.5]
+    marked = "<|vision_start|><|video_pad|><|vision_end|>"
+    processor.chat_template = processor.chat_template.replace("<|video_pad|>", marked)
     loading.save_student(model, processor, folder, "fp32")
+    assert marked in AutoProcessor.from_pretrained(folder).chat_template
     return folder
+
+
+def load_processor(folder, cfg):
+    processor = AutoProcessor.from_pretrained(folder)
+    write_clips_as_released(processor)
+    loading.pin_sizes(processor, cfg.image_size, cfg.frames)
+    return processor
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +87,7 @@ def merged(cfg, adapters, tmp_path_factory):
 @pytest.fixture(scope="module")
 def server(base, adapters, tmp_path_factory):
     folder = tmp_path_factory.mktemp("serve")
-    serving = VllmServer(base, folder, "frames=true", "dtype=float32", f"adapter={adapters}")
+    serving = vllm_server(base, folder, "frames=true", "dtype=float32", f"adapter={adapters}")
     serving.start()
     yield serving
     serving.stop()
@@ -86,15 +97,11 @@ def server(base, adapters, tmp_path_factory):
 def test_requests_become_the_token_ids_of_a_local_model(
     server, cfg, base, micro_store, control
 ) -> None:
-    frames, processor = (
-        FrameReader(micro_store, cfg.image_size),
-        AutoProcessor.from_pretrained(base),
-    )
-    loading.pin_sizes(processor, cfg.image_size, cfg.frames)
+    frames, processor = FrameReader(micro_store, cfg.image_size), load_processor(base, cfg)
     client = openai.OpenAI(base_url=server.url, api_key="none")
     for mode, item in zip(("record", "answer"), micro_store.selection("test"), strict=False):
         sample = item_sample("cot", frames, cfg, control, mode, item)
-        request = request_fields(cfg, mode, sample.clip) | {"max_tokens": 1}
+        request = sampling_fields(cfg, 1, sample.clip)
         request["extra_body"]["return_token_ids"] = True
         response = client.chat.completions.create(
             model="tiny", messages=build_messages(sample), **request
@@ -104,13 +111,18 @@ def test_requests_become_the_token_ids_of_a_local_model(
 
 
 def test_constrained_responses_of_a_served_model_are_records(
-    server, cfg, micro, micro_store, tmp_path
+    server, cfg, micro, micro_store, tmp_path, caplog
 ) -> None:
+    caplog.set_level("INFO")
     settings = SelectCommand(
         benchmark=micro, student=cfg, store=str(micro_store.folder.parent), limit=4,
         modes=["answer", "constrained"], server=ServerConfig(url=server.url, model="tiny"),
     )  # fmt: skip
     metrics = select.main.__wrapped__(settings, Run("served", tmp_path))
+    assert "applies the JSON schema as response_format" in caplog.text
+    # The server has the same tokens as a local model.
+    assert "prompts are not compared" not in caplog.text
+    assert "reads prompts differently" not in caplog.text
     rows = list(read_json_lines(tmp_path / "answers.jsonl"))
     assert rows[0]["asked"]["model"]["root"] == cfg.model
     # A model with random weights may write texts up to the token limit. The choice precedes them.
@@ -164,8 +176,8 @@ def test_a_server_with_adapters_responds_as_the_student(
 def served_scores(server, model, cfg, store, item) -> tuple[list[int], list[float]]:
     """The most likely first tokens of an answer, and their log-probabilities."""
     sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
-    request = request_fields(cfg, "answer", sample.clip)
-    request |= {"max_tokens": 1, "logprobs": True, "top_logprobs": 10}
+    request = sampling_fields(cfg, 1, sample.clip)
+    request |= {"logprobs": True, "top_logprobs": 10}
     request["extra_body"]["return_tokens_as_token_ids"] = True
     client = openai.OpenAI(base_url=server.url, api_key="none")
     response = client.chat.completions.create(
@@ -179,8 +191,7 @@ def served_scores(server, model, cfg, store, item) -> tuple[list[int], list[floa
 def local_scores(folder, cfg, store, item) -> np.ndarray:
     """The log-probability of every first token, computed with transformers alone."""
     sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
-    processor = AutoProcessor.from_pretrained(folder)
-    loading.pin_sizes(processor, cfg.image_size, cfg.frames)
+    processor = load_processor(folder, cfg)
     model = AutoModelForImageTextToText.from_pretrained(folder, dtype="auto").eval()
     with torch.no_grad():
         logits = model(**Collator(processor, cfg.max_length)([sample])).logits

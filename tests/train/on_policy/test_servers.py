@@ -29,7 +29,7 @@ from models.student.prompts import Sample
 from models.trained_runs import read_trained_settings
 from teacher.narrate import ensure_rationales
 from tests.local import JsonHandler, LocalServer
-from tests.teacher.vllm_server import VllmServer
+from tests.teacher.server_process import ServerProcess, vllm_server
 from tests.tiny_models import randomize_adapters
 from tests.train.on_policy.test_distillation import finish_run
 from tests.user_errors import raises_user_error
@@ -42,14 +42,14 @@ from train.on_policy.teachers import ServerTeacher
 pytestmark = pytest.mark.slow
 
 
-def start(model: str, folder: Path, *settings: str) -> VllmServer:
-    server = VllmServer(Path(model), folder, "dtype=float32", *settings)
+def start(model: str, folder: Path, *settings: str) -> ServerProcess:
+    server = vllm_server(Path(model), folder, "dtype=float32", *settings)
     server.start()
     return server
 
 
 @pytest.fixture(scope="module")
-def teacher(saved_base: str, tmp_path_factory) -> Iterator[VllmServer]:
+def teacher(saved_base: str, tmp_path_factory) -> Iterator[ServerProcess]:
     """The untrained base as a teacher."""
     server = start(saved_base, tmp_path_factory.mktemp("serve"))
     yield server
@@ -57,7 +57,7 @@ def teacher(saved_base: str, tmp_path_factory) -> Iterator[VllmServer]:
 
 
 @pytest.fixture(scope="module")
-def vllm(saved_base: str, tmp_path_factory) -> Iterator[VllmServer]:
+def vllm(saved_base: str, tmp_path_factory) -> Iterator[ServerProcess]:
     """The untrained base as that of a student. With adapters enabled, vLLM 0.32 on CPUs crashes
     when it computes the log-probabilities of prompts, so it cannot be the teacher too."""
     folder = tmp_path_factory.mktemp("serve")
@@ -97,7 +97,7 @@ def serve(url: str) -> TeacherServerConfig:
 
 
 def test_vllm_gives_the_log_probabilities_of_the_same_model(
-    teacher: VllmServer, saved_base: str, processor: ProcessorMixin, samples: list[Sample]
+    teacher: ServerProcess, saved_base: str, processor: ProcessorMixin, samples: list[Sample]
 ) -> None:
     read = ServerTeacher(serve(teacher.url), processor).prepare([samples[:3], samples[3:]])
     batch = Collator(processor, None)(samples)
@@ -213,29 +213,35 @@ def test_unsuitable_servers_are_named(processor, samples, texts, code, message) 
 
 
 class FixedHandler(JsonHandler):
-    """A server that loads no adapters (404), or whose responses have no token ids."""
+    """A server that loads no adapters (404), whose responses have no token ids, or that has other
+    token ids of the prompt."""
 
-    loads = True
+    loads, ids = True, None
 
     def post(self, body: dict) -> None:
         if self.path.endswith("/load_lora_adapter"):
             self.respond(200 if self.loads else 404, {})
             return
         message = {"role": "assistant", "content": "Answer: A"}
-        choice = {"index": 0, "message": message, "finish_reason": "stop"}
-        self.respond(200, {"id": "0", "object": "chat.completion", "choices": [choice]})
+        choice = {"index": 0, "message": message, "finish_reason": "stop", "token_ids": self.ids}
+        body = {"id": "0", "object": "chat.completion", "choices": [choice]}
+        self.respond(200, {**body, "prompt_token_ids": self.ids})
 
 
 @pytest.mark.parametrize(
-    ("loads", "code", "message"),
-    [(False, "no-adapters", "adapter_rank=RANK"), (True, "no-token-ids", "return no token ids")],
+    ("loads", "ids", "code", "message"),
+    [
+        (False, None, "no-adapters", "adapter_rank=RANK"),
+        (True, None, "no-token-ids", "return no token ids"),
+        (True, [5, 6], "other-prompts", "at token 0 of the first prompt, this process has"),
+    ],
 )
 def test_servers_that_cannot_sample_are_named(
-    settings, student, samples, loads, code, message, tmp_path
+    settings, student, samples, loads, ids, code, message, tmp_path
 ) -> None:
     trained = read_trained_settings(student, SftCommand, "student")
     model, processor = loading.load_student(trained.student, "fp32", list)
-    server = LocalServer(type("Handler", (FixedHandler,), {"loads": loads}))
+    server = LocalServer(type("Handler", (FixedHandler,), {"loads": loads, "ids": ids}))
     servers = SamplingServerConfig(url=server.url, unreachable_timeout=5)
     sampler = build_sampler(processor, trained.student, settings.train, servers, tmp_path)
     with raises_user_error(code, contains=message):
