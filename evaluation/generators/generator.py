@@ -16,7 +16,7 @@ from models.precision import resolve_precision
 from models.student.prompts import Sample, choose_instruction, selection_sample
 from models.student.responses import response_token_limit
 
-PROMPT_VERSION = 1
+PROMPT_VERSION = 2
 """Version of the prompt layout. Increment it when the layout changes, so that earlier responses are
 not reused."""
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,13 @@ from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageComm
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import build_record_schema
 from models.fingerprints import processor_digest, weights_digest
-from models.student.chat_requests import build_messages, find_difference, sampling_fields
-from models.student.prompts import Clip, Sample
+from models.student.chat_requests import (
+    build_messages,
+    find_difference,
+    qwen_fields,
+    sampling_fields,
+)
+from models.student.prompts import Sample, show_frames_as_images
 from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
 from models.trained_runs import product_folder, run_title
 from teacher.servers.capabilities import Messages, RequestFields
@@ -36,6 +41,8 @@ from teacher.servers.server import (
 
 log = logging.getLogger(__name__)
 
+WritePrompt = Callable[[Sample], tuple[Messages, RequestFields]]
+"""Writes a sample as messages, and the fields in `extra_body` that go with them."""
 CANARY_SIZE = 64
 """Width and height (px) of the blank frames of a canary: a request that any working server answers,
 sent after a failure to find out whether the server or the failed request is at fault."""
@@ -106,20 +113,21 @@ class ServedModel:
         starts_in_thought = student.thinking and mode != "constrained"
         # The frame cache is not thread-safe, so one thread prepares all samples.
         with ThreadPoolExecutor(1) as preparer:
-
-            def prepare(subject: Subject) -> tuple[Messages, RequestFields]:
-                sample = sample_of(subject)
-                return build_messages(sample), sampling(sample.clip)
-
-            def sampling(clip: Clip | None) -> RequestFields:
-                limit = response_token_limit(mode, student.max_new_tokens, student.thinking)
-                return sampling_fields(student, limit, clip)
-
-            first = await loop.run_in_executor(preparer, sample_of, subjects[0])
-            canary = build_messages(blank_sample(first))
+            limit = response_token_limit(mode, student.max_new_tokens, student.thinking)
+            shared = sampling_fields(student, limit)
             schema = build_record_schema() if mode == "constrained" else None
+            first = await loop.run_in_executor(preparer, sample_of, subjects[0])
+            blank = blank_sample(first)
+            canary = build_messages(show_frames_as_images(blank))
             show = partial(save, [])
-            async with ServerPool(server, sampling(first.clip), canary, schema, show=show) as pool:
+            async with ServerPool(server, shared, canary, schema, show=show) as pool:
+                write = await self._choose_form(pool, blank)
+                pool.canary = write(blank)[0]
+
+                def prepare(subject: Subject) -> tuple[Messages, RequestFields]:
+                    messages, extra = write(sample_of(subject))
+                    return messages, {"extra_body": shared["extra_body"] | extra}
+
                 thoughts: list[Subject] = []
 
                 async def respond(subject: Subject) -> None:
@@ -144,7 +152,7 @@ class ServedModel:
                             "schemas (response_format), such as vLLM",
                             code="no-constraint",
                         )
-                    if compares and response.prompt_ids:
+                    if compares and response.prompt_ids and self._processor:
                         ids = subject, response.prompt_ids
                         await loop.run_in_executor(preparer, self._compare, sample_of, *ids)
                     if response.reasoning and not response.text and response.flaw != TRUNCATED:
@@ -160,15 +168,42 @@ class ServedModel:
                 len(thoughts), len(subjects), mode,
             )  # fmt: skip
 
-    def _compare(self, sample_of: SampleOf, subject: Subject, served: Sequence[int]) -> None:
-        """Warn if the server reads a prompt as other tokens than a local model."""
+    async def _choose_form(self, pool: ServerPool, blank: Sample) -> WritePrompt:
+        """Return the function that writes a sample as messages and the fields that go with them.
+
+        Clips are sent as videos in vLLM's format if the model is told their times and the server
+        takes them, otherwise as images with their times.
+        """
+        student, processor = self._student, self._processor
+
+        def with_video(sample: Sample) -> tuple[Messages, RequestFields]:
+            return build_messages(sample), qwen_fields(student, sample.clip)
+
+        def with_images(sample: Sample) -> tuple[Messages, RequestFields]:
+            return build_messages(show_frames_as_images(sample)), {}
+
+        from models.student.chat_format import takes_clips
+
+        if processor is not None and not takes_clips(processor):
+            return with_images
+        messages, extra = with_video(blank)
+        if blank.clip and not await pool.takes(messages, max_tokens=1, extra_body=extra):
+            log.warning(
+                "the server takes no videos in vLLM's format: the frames of a prefix are sent as "
+                "images, each after its time, which is another prompt than that of a local model"
+            )
+            return with_images
+        return with_video
+
+    @cached_property
+    def _processor(self) -> Any:
+        """The processor of the student, or None if it is not on this machine."""
         student, source = self._student, self._processor_source
         try:
             from transformers import AutoProcessor
 
             from models.compat import write_clips_as_released
             from models.loading import pin_sizes
-            from models.student.collator import encode
 
             origin = {"revision": student.revision, "trust_remote_code": student.trust_remote_code}
             processor = AutoProcessor.from_pretrained(
@@ -177,11 +212,17 @@ class ServedModel:
         except (ImportError, OSError, ValueError, KeyError) as error:
             reason = str(error).partition("\n")[0]
             log.info("prompts are not compared with a local model's, which is missing: %s", reason)
-            return
+            return None
         write_clips_as_released(processor)
         pin_sizes(processor, student.image_size, student.frames)
-        own = encode(sample_of(subject), processor, None, student.thinking).input_ids
-        if difference := find_difference(own, served, processor.tokenizer):
+        return processor
+
+    def _compare(self, sample_of: SampleOf, subject: Subject, served: Sequence[int]) -> None:
+        """Warn if the server reads a prompt as other tokens than a local model."""
+        from models.student.collator import encode
+
+        own = encode(sample_of(subject), self._processor, None, self._student.thinking).input_ids
+        if difference := find_difference(own, served, self._processor.tokenizer):
             log.warning(
                 "the server reads prompts differently from a local model: %s. Start it with python "
                 "-m teacher.serve frames=true, or expect other results",

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def build_messages(sample: Sample) -> Messages:
     """Return a sample as the messages of a chat request, with its frames as PNGs in base64.
 
-    A clip becomes a video in vLLM's format, whose times `sampling_fields` contains.
+    A clip becomes a video in vLLM's format, whose times `qwen_fields` contains.
     """
     images = iter(sample.images)
     parts: list[dict[str, Any]] = []
@@ -65,31 +65,18 @@ def find_difference(own: Sequence[int], served: Sequence[int], tokenizer: Any) -
     )
 
 
-def sampling_fields(student: StudentConfig, limit: int, clip: Clip | None) -> RequestFields:
-    """Return the fields of a request besides its messages: sampling, without any penalty, and
-    preprocessing.
-
-    The server keeps all frames of a clip, and resizes a frame only to the nearest size on the grid
-    of the vision tower, as a local model does (see `models.loading.pin_sizes`).
+def sampling_fields(student: StudentConfig, limit: int) -> RequestFields:
+    """Return the fields of a request for sampling, without any penalty.
 
     Args:
         limit: Maximum number of new tokens.
     """
-    # Both edges are numbers of pixels.
-    max_pixels = 2 * student.image_size**2
-    images = {"size": {"shortest_edge": 1, "longest_edge": max_pixels}}
-    videos = {"size": {"shortest_edge": 1, "longest_edge": max_pixels * student.frames}}
+    # Fields that are left out would have the values of the model's generation_config.json.
     extra: dict[str, Any] = {
         "chat_template_kwargs": {"enable_thinking": student.thinking},
-        "mm_processor_kwargs": {
-            "images_kwargs": images,
-            "videos_kwargs": {**videos, "do_sample_frames": False},
-        },
+        "min_p": 0.0,
+        "repetition_penalty": 1.0,
     }
-    if clip:
-        extra["media_io_kwargs"] = {"video": {"num_frames": -1, **clip.metadata}}
-    # Fields that are left out would have the values of the model's generation_config.json.
-    extra |= {"min_p": 0.0, "repetition_penalty": 1.0}
     if student.temperature:
         # -1 sets no limit.
         extra["top_k"] = student.top_k or -1
@@ -101,3 +88,25 @@ def sampling_fields(student: StudentConfig, limit: int, clip: Clip | None) -> Re
         "max_tokens": limit,
         "extra_body": extra,
     }
+
+
+def qwen_fields(student: StudentConfig, clip: Clip | None) -> RequestFields:
+    """Return the fields in `extra_body` for a Qwen model on vLLM.
+
+    The server keeps all frames of a clip, with their true times. It resizes a frame only to the
+    nearest size on the grid of the vision tower, as a local model does (see
+    `models.loading.pin_sizes`).
+    """
+    # Both edges are numbers of pixels.
+    max_pixels = 2 * student.image_size**2
+    images = {"size": {"shortest_edge": 1, "longest_edge": max_pixels}}
+    videos = {"size": {"shortest_edge": 1, "longest_edge": max_pixels * student.frames}}
+    fields: RequestFields = {
+        "mm_processor_kwargs": {
+            "images_kwargs": images,
+            "videos_kwargs": {**videos, "do_sample_frames": False},
+        }
+    }
+    if clip:
+        fields["media_io_kwargs"] = {"video": {"num_frames": -1, **clip.metadata}}
+    return fields

@@ -25,7 +25,7 @@ the responses, or None if the server refuses this request but not the bare canar
 
 CANARY: Messages = [{"role": "user", "content": "Say hello."}]
 """A prompt that any working server answers."""
-OPTIONAL = ("top_k", "min_p", "repetition_penalty", "chat_template_kwargs")
+OPTIONAL = ("top_k", "min_p", "repetition_penalty", "chat_template_kwargs", "mm_processor_kwargs")
 """Fields in `extra_body` without which a request still has a meaning."""
 UNLIKELY = "xyzzy plugh"
 UNLIKELY_GRAMMAR = f'root ::= "{UNLIKELY}"\n'

@@ -117,6 +117,18 @@ class ServerPool:
         fields = self.fields | fields
         return await self._request(lambda s: s.complete(messages, n, fields, self.constraint))
 
+    async def takes(self, messages: Messages, **fields: object) -> bool:
+        """Return whether a server that answers the canary answers a prompt, too.
+
+        Raises:
+            UserError: As in `complete`.
+        """
+        try:
+            await self.complete(messages, **fields)
+        except NoResponseError:
+            return False
+        return True
+
     async def score(self, token_ids: Sequence[int]) -> ScoredPrompt:
         """Return the log-probabilities of a prompt's tokens, after waiting for a server if
         necessary. It raises the errors of `complete`, and those of `ServerClient.score`."""

@@ -23,9 +23,15 @@ from conf.schema import (
     StudentConfig,
 )
 from models.distributed import main_first
-from models.student.chat_requests import build_messages, find_difference, sampling_fields
+from models.student.chat_format import takes_clips
+from models.student.chat_requests import (
+    build_messages,
+    find_difference,
+    qwen_fields,
+    sampling_fields,
+)
 from models.student.collator import encode
-from models.student.prompts import Sample
+from models.student.prompts import Sample, show_frames_as_images
 from models.student.responses import GeneratedText
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import TRUNCATED, Response
@@ -139,11 +145,16 @@ class ServedSampler(ResponseSampler):
             shutil.rmtree(folder)
 
     async def _request(self, pool: ServerPool, prompt: Sample, seed: int) -> GeneratedText:
-        fields = sampling_fields(self._sampling, self._sampling.max_new_tokens, prompt.clip)
+        fields = sampling_fields(self._sampling, self._sampling.max_new_tokens)
         fields["extra_body"]["return_token_ids"] = True
+        shown = prompt
+        if takes_clips(self._processor):
+            fields["extra_body"] |= qwen_fields(self._sampling, prompt.clip)
+        else:
+            shown = show_frames_as_images(prompt)
         never = {str(token): -100 for token in self._never}
         [response] = await pool.complete(
-            build_messages(prompt), **fields, seed=seed, logit_bias=never
+            build_messages(shown), **fields, seed=seed, logit_bias=never
         )
         text = self._read(response)
         if response.prompt_ids and not self._compared:

@@ -192,12 +192,39 @@ def test_responses_before_a_server_fails_are_kept(items, frames, start_server, t
     assert (tmp_path / "answers.jsonl").read_text().startswith(before)
 
 
-def test_a_server_that_refuses_clips_is_named(items, frames, start_server) -> None:
-    reason = "served is not a multimodal model"
+def test_a_server_that_refuses_clips_gets_their_frames_as_images(
+    items, frames, start_server, caplog
+) -> None:
+    """So does llama.cpp's server, which takes images only."""
 
     def refuse(request):
         clip = any(p["type"] == "video_url" for p in request["messages"][0]["content"])
-        return {"status": 400, "message": reason} if clip else "Hello."
+        return {"status": 400, "message": "video input is not supported"} if clip else FULL
+
+    server = start_server(refuse)
+    responder(config_of(server, concurrency=1), frames)(items, lambda _: None)
+    assert "the server takes no videos" in caplog.text
+    requests = server.requests[-len(items) :]
+    for item, request in zip(items, requests, strict=True):
+        parts = request["messages"][0]["content"]
+        texts = [p["text"] for p in parts if p["type"] == "text"]
+        sample = item_sample("cot", frames, STUDENT, None, "record", item)
+        times = [f"At {k / sample.clip.fps:.2f} s: " for k in sample.clip.indices]
+        assert texts[: 2 * len(times) : 2] == times
+        images = [p["image_url"]["url"].partition(",")[2] for p in parts if "image_url" in p]
+        expected = [*sample.clip.pixels, *sample.images]
+        assert all(map(np.array_equal, map(pixels, images), expected))
+        assert len(images) == len(expected)
+        assert "media_io_kwargs" not in request
+
+
+def test_a_server_that_refuses_images_is_named(items, frames, start_server) -> None:
+    reason = "served is not a multimodal model"
+
+    def refuse(request):
+        content = request["messages"][0]["content"]
+        texts = isinstance(content, str) or all(p["type"] == "text" for p in content)
+        return "Hello." if texts else {"status": 400, "message": reason}
 
     server = start_server(refuse)
     with raises_user_error("server-refuses", contains=(server.url, reason)):

@@ -20,7 +20,7 @@ from evaluation.generators.response_schema import build_record_schema
 from models import loading
 from models.compat import write_clips_as_released
 from models.student.answer_parser import Reason, parse_choice
-from models.student.chat_requests import build_messages, sampling_fields
+from models.student.chat_requests import build_messages, qwen_fields, sampling_fields
 from models.student.collator import Collator, encode
 from tests.teacher.server_process import vllm_server
 from tests.tiny_models import SMALL, randomize_adapters
@@ -101,7 +101,8 @@ def test_requests_become_the_token_ids_of_a_local_model(
     client = openai.OpenAI(base_url=server.url, api_key="none")
     for mode, item in zip(("record", "answer"), micro_store.selection("test"), strict=False):
         sample = item_sample("cot", frames, cfg, control, mode, item)
-        request = sampling_fields(cfg, 1, sample.clip)
+        request = sampling_fields(cfg, 1)
+        request["extra_body"] |= qwen_fields(cfg, sample.clip)
         request["extra_body"]["return_token_ids"] = True
         response = client.chat.completions.create(
             model="tiny", messages=build_messages(sample), **request
@@ -176,7 +177,8 @@ def test_a_server_with_adapters_responds_as_the_student(
 def served_scores(server, model, cfg, store, item) -> tuple[list[int], list[float]]:
     """The most likely first tokens of an answer, and their log-probabilities."""
     sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
-    request = sampling_fields(cfg, 1, sample.clip)
+    request = sampling_fields(cfg, 1)
+    request["extra_body"] |= qwen_fields(cfg, sample.clip)
     request |= {"logprobs": True, "top_logprobs": 10}
     request["extra_body"]["return_tokens_as_token_ids"] = True
     client = openai.OpenAI(base_url=server.url, api_key="none")
