@@ -17,7 +17,9 @@ from teacher.validation.claim_extraction import extract_claims
 if TYPE_CHECKING:
     from conf.schema import TeacherConfig
 
-VALIDATOR_VERSION = "8"
+VALIDATOR_VERSION = "9"
+MAX_QUOTED = 80
+"""Maximum number of characters of a sentence in a reason."""
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
 WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")
 """A word; hyphens and apostrophes join words, so "top-left" counts as one."""
@@ -65,6 +67,9 @@ def validate_rationale(
         reasons.append(f"wrong answer: {answer}")
     claims = extract_claims(text, predicates)
     reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
+    if cfg.strict:
+        unreadable = (text[slice(*c.span)] for c in claims if c.kind == "unreadable")
+        reasons += [f"unreadable: {sentence[:MAX_QUOTED]!r}" for sentence in unreadable]
     return Validation(tuple(reasons), sections, answer, claims)
 
 
