@@ -24,8 +24,8 @@ class CandidateReader(Reader):
     """Records claims about candidates and their objects. In the candidate analysis, the topic stays
     until another candidate is named."""
 
-    def __init__(self, predicates: IndexedPredicates, keeps_topic: bool) -> None:
-        super().__init__(predicates, TARGET if not keeps_topic else EITHER)
+    def __init__(self, predicates: IndexedPredicates, keeps_topic: bool, known: list[str]) -> None:
+        super().__init__(predicates, TARGET if not keeps_topic else EITHER, known)
         self.extras = predicates.extras
         self.keeps_topic = keeps_topic
         self.letters: list[str] = []
@@ -123,7 +123,9 @@ class CandidateReader(Reader):
         ends = [k for k in range(self.at, min(named, default=0)) if self.tags[k].name in SEPARATORS]
         if self.keeps_topic or not ends:
             raise UnreadableError
-        claims = SceneReader(self.predicates, TARGET).read(self.tags[self.at : ends[-1]])
+        claims = SceneReader(self.predicates, TARGET, self.known).read(
+            self.tags[self.at : ends[-1]]
+        )
         if any(claim.kind == "unreadable" for claim in claims):
             raise UnreadableError
         self.claims += [claim for claim in claims if claim.kind != "mention"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
+from itertools import product
 from typing import NamedTuple
 
 from conf.schema import RelationBounds
@@ -29,6 +30,8 @@ from teacher.reading.phrases import COARSE
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
 """The moment of a claim: the cut (the last frame that the predicates treat as observed), the time
 from the cut to the target, the target, or, if the text leaves it open, the cut or the target."""
+JOINT = " or "
+"""Between the names of the objects of which the text may mean any."""
 VERDICTS = ("supported", "contradicted", "unknown")
 
 
@@ -103,9 +106,19 @@ class IndexedPredicates:
         found = self.observed or ()
         return len(objects) > 1 and normalize_relation(Relation(kind, objects, value)) in found
 
+    def judge(self, claim: Claim) -> Claim:
+        """Return a claim with its verdict. If the text leaves open which object is meant, the claim
+        is contradicted if it is false of each that may be, otherwise unknown."""
+        options = [*product(*(name.split(JOINT) for name in claim.subjects))]
+        verdicts = {self.verdict(claim._replace(subjects=names)) for names in options}
+        if len(options) == 1:
+            return claim._replace(verdict=verdicts.pop())
+        false = verdicts == {"contradicted"}
+        return claim._replace(subjects=(), verdict="contradicted" if false else "unknown")
+
     def verdict(self, claim: Claim) -> str:
-        """Return one of `VERDICTS`; "unknown" if the predicates do not tell, if they contradict a
-        claim that is not certain, or if several objects have the name that the claim uses."""
+        """Return one of `VERDICTS`; "unknown" if the predicates do not tell, or if several objects
+        have the name that the claim uses."""
         if claim.kind != "mention" and self.look_alikes.intersection(claim.subjects):
             return "unknown"
         truth = self.truth(claim)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Container, Sequence
 
-from teacher.reading.claims import CUT, EITHER, Claim, IndexedPredicates
+from teacher.reading.claims import CUT, EITHER, JOINT, Claim, IndexedPredicates
 from teacher.reading.tagging import END, Noun, RelationPhrase, Tag
 
 SEPARATORS = {"comma", "semicolon", "and", "break", "moment"}
@@ -33,10 +33,14 @@ class Reader:
     extras: Collection[str] = ()
     """Objects that the text may name although the scene does not have them."""
 
-    def __init__(self, predicates: IndexedPredicates, moment: str) -> None:
-        """`moment`: the moment that the present tense of the section refers to."""
+    def __init__(self, predicates: IndexedPredicates, moment: str, known: list[str]) -> None:
+        """Args:
+        moment: The moment that the present tense of the section refers to.
+        known: The objects that the text has named; the reader adds those of its section.
+        """
         self.predicates = predicates
         self.moment = moment
+        self.known = known
         self.named: list[str] = []
         """The objects that the section has named."""
         self.last_nouns: list[str] = []
@@ -131,6 +135,7 @@ class Reader:
             if not isinstance(noun := tag.value, Noun):
                 continue
             fitting, span = self.find_fitting(noun), (tag.start, tag.stop)
+            self.named += fitting
             if len(fitting) == 1 and not noun.plural:
                 found.append(Claim("mention", (*fitting,), "", True, EITHER, None, span))
             elif noun.plural and (previous.name == "and" or " " not in tag.words):
@@ -142,21 +147,24 @@ class Reader:
         return found
 
     def find_objects(self, noun: Noun) -> list[str]:
-        """Return the objects that a noun phrase names.
+        """Return the objects that a noun phrase names. If it leaves open which one it means, and
+        the text has not named just one of them, the names are joined by `JOINT`.
 
         Raises:
-            UnreadableError: There is none, or the phrase leaves open which one is meant.
+            UnreadableError: There is none, or the plural leaves open which ones are meant.
         """
         fitting = self.find_fitting(noun)
-        named = [name for name in fitting if name in self.named]
+        named = [name for name in fitting if name in self.known]
         if noun.plural and named not in ([], fitting):
             # "The cubes": all, or those that the text has named.
             raise UnreadableError
-        if len(fitting) > 1 and not noun.plural:
-            fitting = named
-        if (len(fitting) < 2 or noun.still) if noun.plural else len(fitting) != 1:
+        if (len(fitting) < 2 or noun.still) if noun.plural else not fitting:
             raise UnreadableError
-        self.named += fitting
+        if len(fitting) > 1 and not noun.plural:
+            if len({*named}) != 1:
+                return [JOINT.join(fitting)]
+            fitting = named
+        self.known += fitting
         return fitting
 
     def read_noun(self) -> list[str]:

@@ -132,8 +132,8 @@ class SceneReader(Reader):
     # Subjects.
 
     def read_clause(self, separators: Sequence[str] = ()) -> None:
-        moments = ("future", "time", "past")
-        if self.near(1).name in NOUN_STARTS | {"comma"} and (tag := self.take(*moments)):
+        moments = ("future", "time", "past", "expected")
+        if self.near(1).name in NOUN_STARTS | {"comma", "contact"} and (tag := self.take(*moments)):
             # "At the target moment, the cube is near the top." "Soon, they will meet."
             self.take("comma")
             self.opening = tag
@@ -156,7 +156,7 @@ class SceneReader(Reader):
         elif self.near().words == "with":
             self.at += 1
             self.begin(self.read_subject())
-        elif self._is_fronted(separators):
+        elif self._is_fronted(separators, nominal=opening is not None):
             self._read_fronted()
         elif self.near().name in NOUN_STARTS or self.near().words == "neither":
             if self.clause is None and self.near().name == "pronoun" and "break" in separators:
@@ -228,11 +228,15 @@ class SceneReader(Reader):
             raise UnreadableError
         return last.subjects
 
-    def _is_fronted(self, separators: Sequence[str]) -> bool:
-        """Return whether the next words precede their subject."""
+    def _is_fronted(self, separators: Sequence[str], nominal: bool) -> bool:
+        """Return whether the next words precede their subject, also as in "there is a slight shift
+        of the cube" if `nominal` is true."""
         end = self.at
-        while end < self.stop and self.tags[end].name in FRONTED:
+        while end < self.stop and self.tags[end].name in FRONTED | (
+            {"moves"} if nominal else set()
+        ):
             end += 1
+        end += nominal and end < self.stop and self.tags[end].words == "of"
         direct = end < self.stop and self.tags[end].name in NOUN_STARTS
         comma = self.tags[end : end + 1] and self.tags[end].name == "comma"
         late = comma and self.tags[end + 1 : end + 2] and self.tags[end + 1].name in NOUN_STARTS
@@ -241,9 +245,9 @@ class SceneReader(Reader):
 
     def _read_fronted(self) -> None:
         start = self.at
-        self.skip(FRONTED)
+        self.skip(FRONTED | {"moves"})
         end = self.at
-        self.take("comma")
+        self.take("comma", "with")
         self.begin(self.read_subject())
         resume, last = self.at, self.stop
         self.at, self.stop = start, end
@@ -299,7 +303,7 @@ class SceneReader(Reader):
     def verb(self, tag: Tag) -> None:
         """Note the verb of the clause. A plural verb is also that of earlier subjects."""
         clause = self.clause
-        clause.has_complement = False
+        clause.has_complement &= tag.name not in FINITE | {"meet"}
         first = tag.words.split()[0]
         if clause.kind == "contact" and tag.name not in OF_CONTACT:
             raise UnreadableError
@@ -419,6 +423,9 @@ class SceneReader(Reader):
     def on_with(self, tag: Tag) -> None:
         if tag.words in OF_MATERIAL and self.near().name == "word":
             return
+        if tag.words in ("toward", "towards") and self.near().name == "object":
+            self.on_approach(tag)
+            return
         if tag.words == "to" and self.near().name in ("moves", "be", "meet", "still", "stays"):
             return
         if tag.words != "with" or self.clause.negated:
@@ -445,9 +452,8 @@ class SceneReader(Reader):
         outer, names = self.clause, self.last_nouns
         if len(names) > 1 and self.near().words not in ("are", "both"):
             names = []
-        if not names or self.tags[max(0, self.at - 3) : self.at - 1][-1].name not in (
-            *("object", "comma", "relation"),
-        ):
+        before = self.tags[self.at - 2].name if self.at > 1 else ""
+        if outer is None or not names or before not in ("object", "comma", "relation"):
             raise UnreadableError
         self.clause = Clause([*names])
         start, count = self.at, len(self.claims)
@@ -565,7 +571,9 @@ class SceneReader(Reader):
         self.verb(tag)
         has_partners = self.take("with") or self.near().name == "object"
         partners = self.read_list(True) if has_partners else []
-        self._add_event("course", tag, self.clause.subjects, partners, value=str(tag.value))
+        alone = len(self.clause.subjects) == 1 and not partners
+        value = str(tag.value)
+        self._add_event("course", tag, self.clause.subjects, partners, value=value, alone=alone)
 
     def on_approach(self, tag: Tag) -> None:
         self.verb(tag._replace(name="moves"))

@@ -27,13 +27,14 @@ def extract_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
     """Return the claims of a rationale in text order, each with its verdict; never raises."""
     indexed = IndexedPredicates(predicates)
     names = [*indexed.objects, *indexed.extras]
+    known: list[str] = []
     claims: list[Claim] = []
     for name, start, stop in split_sections(text):
         if name == "Answer":
             claims += read_answer(text, start, stop)
             continue
-        scene = SceneReader(indexed, MOMENTS.get(name, EITHER))
-        candidates = CandidateReader(indexed, keeps_topic=name == "Candidate analysis")
+        scene = SceneReader(indexed, MOMENTS.get(name, EITHER), known)
+        candidates = CandidateReader(indexed, name == "Candidate analysis", known)
         for tags in _split_sentences(find_tags(text, start, stop, names)):
             names_candidate = any(tag.name == "candidate" for tag in tags)
             if name == "Candidate analysis" or (name == "Outcome" and names_candidate):
@@ -41,7 +42,7 @@ def extract_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
             else:
                 claims += scene.read(tags)
     claims.sort(key=lambda claim: claim.span)
-    return tuple(claim._replace(verdict=indexed.verdict(claim)) for claim in claims)
+    return tuple(map(indexed.judge, claims))
 
 
 def _split_sentences(section: list[Tag]) -> list[list[Tag]]:

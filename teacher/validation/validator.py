@@ -54,7 +54,8 @@ def validate_rationale(
     text: str, predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
 ) -> Validation:
     """Check a rationale against its item, and collect every reason to reject it."""
-    reasons = [f"number: {text[start:stop]!r}" for start, stop in find_numbers(text)]
+    numbers = [*find_numbers(text)]
+    reasons = [f"number: {text[start:stop]!r}" for start, stop in numbers]
     words = len(WORD.findall(text))
     if words < cfg.min_words:
         reasons.append("too short")
@@ -68,8 +69,10 @@ def validate_rationale(
     claims = extract_claims(text, predicates)
     reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
     if cfg.strict:
-        unreadable = (text[slice(*c.span)] for c in claims if c.kind == "unreadable")
-        reasons += [f"unreadable: {sentence[:MAX_QUOTED]!r}" for sentence in unreadable]
+        for start, stop in (c.span for c in claims if c.kind == "unreadable"):
+            # A number has a reason of its own.
+            if not any(start <= number < stop for number, _ in numbers):
+                reasons.append(f"unreadable: {text[start : min(stop, start + MAX_QUOTED)]!r}")
     return Validation(tuple(reasons), sections, answer, claims)
 
 
