@@ -12,7 +12,18 @@ from teacher.reading.reader import SEPARATORS, VERBS, Reader, UnreadableError
 from teacher.reading.scenes import SceneReader
 from teacher.reading.tagging import RelationPhrase, Tag
 
-CHOOSING = {"agree", "be", "which", "with", "expected", "future", "show", "break", "comma"}
+CHOOSING = {
+    "agree",
+    "be",
+    "visible",
+    "which",
+    "with",
+    "expected",
+    "future",
+    "show",
+    "break",
+    "comma",
+}
 """Tags between "this layout" or "the answer" and the candidate."""
 TOUCHING = {"touching", "touches", "touch", "in contact"}
 """Words for a contact that a frame shows."""
@@ -100,7 +111,7 @@ class CandidateReader(Reader):
     def _find_trailing(self) -> list[str] | None:
         """Return the candidate of a clause such as "the red cube is missing from candidate A"."""
         for index in range(self.at, self.stop):
-            if self.tags[index].name in ("stop", "semicolon", "break", "comma"):
+            if self.tags[index].name in ("stop", "semicolon", "break", "comma", "agree"):
                 break
             if self.tags[index].name == "candidate":
                 placing = index > self.at and self.tags[index - 1].words in PLACING

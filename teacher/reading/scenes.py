@@ -141,6 +141,8 @@ class SceneReader(Reader):
         if opening:
             self.take("future", "expected")
             self.skip({"be"})
+            if self.near(1).name == "contact":
+                self.opening = self.take("time") or self.opening
         struck = self.near() if self.near().words.startswith(OPENING) else None
         if struck is not None:
             # "Once struck, the cube moves west."
@@ -600,6 +602,12 @@ class SceneReader(Reader):
     def on_close(self, tag: Tag) -> None:
         partners = self.read_list(True) if self.near().name == "object" else []
         self._add_event("close", tag, self.clause.subjects, partners, value=str(tag.value))
+
+    def on_contact(self, tag: Tag) -> None:
+        """Read "on the verge of contact"."""
+        if self.clause.time is None:
+            raise UnreadableError
+        self._add_event("meeting", tag, self.clause.subjects, [])
 
     def on_occurs(self, tag: Tag) -> None:
         if self.clause.kind == "objects" and self.near().name in (

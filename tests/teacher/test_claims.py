@@ -6,7 +6,7 @@ claims.txt: sentences about FACTS. A line has "true" or "false", the letter of a
 SECTION) and the sentence.
 claim_verdicts.jsonl: sentences about FACTS, each with its claims and their verdicts.
 paraphrases.jsonl: rationales of the narrator about the items of `marked_items`, paraphrased. A
-false one has one false statement, of the named kind. The two parts have other wordings.
+false one has one false statement, of the named kind. Each part has wordings of its own.
 prose.jsonl: rationales written by a language model, with the predicates that it was given.
 """
 
@@ -72,8 +72,10 @@ def test_only_false_sentences_are_contradicted(truth, section, sentence):
 
 
 def test_few_true_paraphrases_are_rejected_and_few_false_ones_accepted():
+    """The wordings of the first two parts are known to the reader. Of the last one, not all are:
+    there, it misses the goal of 5% for true texts, and meets that of 10% for false ones."""
     items = {item.item_id: (item, predicates) for item, predicates in marked_items()}
-    for part in ("development", "held out"):
+    for part, rejected in (("development", 0.05), ("held out", 0.05), ("last", 0.3)):
         accepted = {True: [], False: []}
         for case in (case for case in PARAPHRASES if case["part"] == part):
             item, predicates = items[case["item"]]
@@ -83,7 +85,7 @@ def test_few_true_paraphrases_are_rejected_and_few_false_ones_accepted():
             reasons = [reason for reason in result.reasons if reason != "too long"]
             accepted[case["truth"]].append(not reasons)
         assert len(accepted[True]) == len(accepted[False]) == 40
-        assert sum(accepted[True]) > 0.95 * 40
+        assert sum(accepted[True]) > (1 - rejected) * 40
         assert sum(accepted[False]) < 0.1 * 40
 
 
