@@ -41,8 +41,6 @@ class Reader:
         self.predicates = predicates
         self.moment = moment
         self.known = known
-        self.named: list[str] = []
-        """The objects that the section has named."""
         self.last_nouns: list[str] = []
         """The objects of the last noun phrase."""
 
@@ -135,7 +133,6 @@ class Reader:
             if not isinstance(noun := tag.value, Noun):
                 continue
             fitting, span = self.find_fitting(noun), (tag.start, tag.stop)
-            self.named += fitting
             if len(fitting) == 1 and not noun.plural:
                 found.append(Claim("mention", (*fitting,), "", True, EITHER, None, span))
             elif noun.plural and (previous.name == "and" or " " not in tag.words):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
-from teacher.predicates.facts import COMPASS, OUT_OF_VIEW
+from teacher.predicates.facts import COMPASS
 from teacher.predicates.relations import CHANGES, KINDS
 from teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
 from teacher.reading.phrases import COARSE
@@ -214,11 +214,8 @@ class SceneReader(Reader):
             return Clause(self._find_antecedents(str(tag.value)))
         if tag.name == "none":
             return Clause([], "none")
-        objects = self.predicates.objects
-        if tag.name == "all":
-            return Clause([*objects], "all")
-        seen = [name for name, o in objects.items() if o.sight != OUT_OF_VIEW]
-        return Clause([name for name in seen if name not in self.named], "all")
+        # The text may not have named all that it means to exclude from "the other objects".
+        return Clause([*self.predicates.objects] if tag.name == "all" else [], "all")
 
     def _find_antecedents(self, pronoun: str) -> list[str]:
         """Return the objects that a pronoun refers to."""
