@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
-from teacher.predicates.facts import COMPASS
+from teacher.predicates.facts import COMPASS, OUT_OF_VIEW
 from teacher.predicates.relations import CHANGES, KINDS
 from teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
 from teacher.reading.phrases import COARSE
@@ -214,8 +214,12 @@ class SceneReader(Reader):
             return Clause(self._find_antecedents(str(tag.value)))
         if tag.name == "none":
             return Clause([], "none")
-        # The text may not have named all that it means to exclude from "the other objects".
-        return Clause([*self.predicates.objects] if tag.name == "all" else [], "all")
+        if tag.name != "all":
+            # Which objects "the others" are depends on those that the text leaves out.
+            return Clause([], "all")
+        # The built-in narrator says nothing of objects that are out of view at the cut.
+        objects = self.predicates.objects.values()
+        return Clause([o.object for o in objects if o.sight != OUT_OF_VIEW], "all")
 
     def _find_antecedents(self, pronoun: str) -> list[str]:
         """Return the objects that a pronoun refers to."""
