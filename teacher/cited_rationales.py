@@ -23,16 +23,20 @@ from teacher.narrator import list_clauses
 from teacher.predicates.facts import Predicates
 from teacher.sections import SECTIONS
 
-CITED_VERSION = "3"
+CITED_VERSION = "4"
 """Changes with the form of cited rationales and the rules for the words around slots."""
 SLOT = "{}"
 ANALYSIS = "Candidate analysis"
 PREFIXES = {"Scene parse": "s", "Motion analysis": "m", "Prediction": "p", "Outcome": "r"}
 """First letter of the ids of the facts of each section; the id of a candidate's fact is its letter,
 in the candidate analysis."""
-MAX_SENTENCES, MAX_FACTS, MAX_CHARACTERS = 8, 3, 160
-"""Maximum numbers of sentences in a section, of facts in a sentence, and of the characters around
-its slots."""
+MAX_SENTENCES, MAX_FACTS, MAX_CHARACTERS = 8, 3, 40
+"""Maximum numbers of sentences in a section, of facts in a sentence, and of the characters before,
+between and after its slots."""
+LITERAL = f"[^{{}}]{{0,{MAX_CHARACTERS}}}"
+TEXT = rf"^{LITERAL}(\{{\}}{LITERAL}){{1,{MAX_FACTS}}}$"
+"""Pattern of a sentence with at least one slot. It also limits the length: servers that constrain
+decoding by a pattern may ignore `maxLength`."""
 CONNECTIVES = {
     *("and", "so", "because", "since", "as", "while", "whereas", "when", "then", "thus", "hence"),
     *("therefore", "thereby", "accordingly", "consequently", "also", "moreover", "furthermore"),
@@ -57,7 +61,7 @@ def cited_schema() -> dict[str, Any]:
     def sentence(pattern: str) -> dict[str, Any]:
         fact = {"type": "string", "pattern": f"^{pattern}$"}
         facts = {"type": "array", "items": fact, "minItems": 1, "maxItems": MAX_FACTS}
-        text = {"type": "string", "maxLength": MAX_CHARACTERS}
+        text = {"type": "string", "pattern": TEXT}
         return _object({"text": text, "facts": facts})
 
     def sentences(pattern: str, least: int = 1, most: int = MAX_SENTENCES) -> dict[str, Any]:

@@ -41,8 +41,7 @@ def find_predicted(text: str, claims: Sequence[Claim]) -> list[Claim]:
     return [
         claim
         for claim in claims
-        if claim.certain
-        and claim.subjects
+        if claim.subjects
         and claim.candidate is None
         and claim.when in (TARGET, BETWEEN)
         and (claim.kind in VALUES or claim.kind in OBJECT_CHECKS or claim.kind == "close")

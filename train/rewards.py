@@ -68,9 +68,8 @@ def reward_truth(response: JudgedResponse) -> float:
     from -1 to 1.
 
     Each claim counts once, whatever its moment and the order of its objects; further mentions above
-    `MAX_MENTIONS` count as contradicted. Only certain claims can count as supported, and negated
-    ones count only if they are contradicted: otherwise, a list of what may be, or of what is not
-    the case, would be supported without any knowledge.
+    `MAX_MENTIONS` count as contradicted. Negated claims count only if they are contradicted:
+    otherwise, a list of what is not the case would be supported without any knowledge.
     """
     mentions: Counter[tuple] = Counter()
     affirmed, supported, contradicted = set(), set(), set()
@@ -97,7 +96,7 @@ def _identify(claim: Claim) -> tuple:
 
 
 def _is_earned(claim: Claim) -> bool:
-    return claim.verdict == SUPPORTED and claim.certain and claim.affirmed
+    return claim.verdict == SUPPORTED and claim.affirmed
 
 
 def reward_following(response: JudgedResponse) -> float:

@@ -165,6 +165,9 @@ class TeacherConfig(ServersConfig):
     """Bounds of the words for relations."""
     sufficient: bool = False
     """Reject rationales whose prediction fits a distractor as well."""
+    strict: bool = True
+    """Reject rationales with a sentence that the reader of claims cannot read. Otherwise, nobody
+    checks what such a sentence states."""
     min_words: int = NARRATOR_WORDS[0]
     """Minimum length of a rationale (words)."""
     max_words: int = NARRATOR_WORDS[1]

@@ -1,209 +1,395 @@
-"""Reads claims about candidates: where they show objects, which objects they lack, add or displace,
-and which candidate agrees with the target."""
+"""Reads sentences about candidates: where they show objects, which objects they lack, add or
+displace, and which candidate agrees with the target."""
 
 from __future__ import annotations
 
-from teacher.predicates.relations import KINDS
-from teacher.reading.claims import TARGET
-from teacher.reading.tagging import BOUNDARIES, RelationPhrase, Tag
-from teacher.reading.topics import TopicReader
+from collections.abc import Sequence
 
-ERRORS = {"error", "errors", "mistake", "mistakes", "fault", "faults", "flaw", "flaws"}
+from data.records import LETTERS
+from teacher.predicates.relations import KINDS
+from teacher.reading.claims import EITHER, TARGET, Claim, IndexedPredicates
+from teacher.reading.reader import SEPARATORS, VERBS, Reader, UnreadableError
+from teacher.reading.scenes import SceneReader
+from teacher.reading.tagging import RelationPhrase, Tag
+
+CHOOSING = {
+    "agree",
+    "be",
+    "visible",
+    "which",
+    "with",
+    "expected",
+    "future",
+    "show",
+    "break",
+    "comma",
+}
+"""Tags between "this layout" or "the answer" and the candidate."""
 TOUCHING = {"touching", "touches", "touch", "in contact"}
 """Words for a contact that a frame shows."""
+PLACING = {"in", "from", "for", "of"}
+"""Prepositions between an object and the candidate that shows or lacks it."""
 
 
-class CandidateReader(TopicReader):
-    """Reads sentences about candidates, and records claims about them and their objects."""
+class CandidateReader(Reader):
+    """Records claims about candidates and their objects. In the candidate analysis, the topic stays
+    until another candidate is named."""
 
-    def end(self) -> None:
-        if not self.keeps_topic and len(self.letters) == 1 and not self.doubted:
-            self._add_choice(self.letters[0])
-        for claim in self.drafts:
-            if claim.candidate != "":
-                self.claims.append(claim)
-            elif claim.kind == "region" and not self.keeps_topic:
-                # A region that an outcome states before it names a candidate is about the target.
-                self.claims.append(claim._replace(candidate=None))
+    def __init__(self, predicates: IndexedPredicates, keeps_topic: bool, known: list[str]) -> None:
+        super().__init__(predicates, TARGET if not keeps_topic else EITHER, known)
+        self.extras = predicates.extras
+        self.keeps_topic = keeps_topic
+        self.letters: list[str] = []
+        """The candidates that are the topic."""
 
-    def _add_choice(self, letter: str) -> None:
-        """Record that a candidate agrees if the sentence says nothing else about it, and names no
-        other candidate except as wrong."""
-        named = {str(t.value) for t in self.sentence if t.name == "candidate"}
-        wrong = {c.candidate for c in self.drafts if c.kind == "agrees" and not c.affirmed}
-        described = any(c.candidate == letter for c in self.drafts)
-        if not described and named <= wrong | {letter}:
-            tag = self.topic_tag or self.sentence.tags[-1]
-            self.drafts.append(self.claim("agrees", (), "", True, TARGET, tag, letter))
+    def read_sentence(self) -> None:
+        if not self.keeps_topic:
+            self.letters = []
+        self.objects: list[str] = []
+        """The object of which the candidate shows something, and whether nothing was said yet."""
+        self.unplaced: Tag | None = None
+        self.lacking = self.adding = False
+        while True:
+            separators = self.skip(SEPARATORS)
+            if self.near().name == "stop":
+                break
+            self._read_candidate_clause(separators)
+        self._end_object()
 
-    # Claims about an object in a candidate.
+    def forget(self) -> None:
+        self.letters = []
+
+    def _read_candidate_clause(self, separators: Sequence[str]) -> None:
+        self.denied = self.contrasted = self.expected = self.correct = False
+        self.extent: Tag | None = None
+        if self.near(1).name == "candidate":
+            self.take("both")
+        first = self.near()
+        self.lacking &= first.name == "object" and self.near(1).name not in VERBS | {"region"}
+        if first.name == "with" and self.near(1).name == "candidate":
+            self.at += 1
+            self._begin_topic(self._read_letters())
+            if self.near().name in SEPARATORS | {"stop"}:
+                return
+        elif first.name == "candidate":
+            self._begin_topic(self._read_letters())
+            if self.near().name in SEPARATORS:
+                return
+        elif first.name == "other_candidates":
+            self.at += 1
+            named = {str(tag.value) for tag in self.tags if tag.name == "candidate"}
+            self._begin_topic([letter for letter in LETTERS if letter not in named])
+        elif first.name == "pronoun" and first.value == "it":
+            self.at += 1
+        elif first.name == "agree" and not self.letters:
+            self._read_choice()
+            return
+        elif self._find_trailing() is not None:
+            self._begin_topic(self._find_trailing() or [])
+        elif not self.letters:
+            self._read_scene_clauses()
+            return
+        if not self.read_tags():
+            raise UnreadableError
+
+    def _begin_topic(self, letters: list[str]) -> None:
+        self._end_object()
+        self.letters, self.objects, self.adding = letters, [], False
+
+    def _read_letters(self) -> list[str]:
+        letters = [str(self.near().value)]
+        self.at += 1
+        while True:
+            start = self.at
+            self.skip({"comma", "and"})
+            if self.near().name != "candidate":
+                self.at = start
+                return letters
+            letters.append(str(self.near().value))
+            self.at += 1
+
+    def _find_trailing(self) -> list[str] | None:
+        """Return the candidate of a clause such as "the red cube is missing from candidate A"."""
+        for index in range(self.at, self.stop):
+            if self.tags[index].name in ("stop", "semicolon", "break", "comma", "agree"):
+                break
+            if self.tags[index].name == "candidate":
+                placing = index > self.at and self.tags[index - 1].words in PLACING
+                return [str(self.tags[index].value)] if placing else None
+        return None
+
+    def _read_choice(self) -> None:
+        """Read "this layout is that of candidate B"."""
+        tag = self.near()
+        self.skip(CHOOSING)
+        if self.near().name != "candidate":
+            raise UnreadableError
+        self._begin_topic(self._read_letters())
+        self._agree(True, tag)
+
+    def _read_scene_clauses(self) -> None:
+        """Read the clauses of an outcome before the first that names a candidate; they are about
+        the target."""
+        named = [k for k in range(self.at, self.stop) if self.tags[k].name == "candidate"]
+        ends = [k for k in range(self.at, min(named, default=0)) if self.tags[k].name in SEPARATORS]
+        if self.keeps_topic or not ends:
+            raise UnreadableError
+        claims = SceneReader(self.predicates, TARGET, self.known).read(
+            self.tags[self.at : ends[-1]]
+        )
+        if any(claim.kind == "unreadable" for claim in claims):
+            raise UnreadableError
+        self.claims += [claim for claim in claims if claim.kind != "mention"]
+        self.at = ends[-1]
+
+    # Objects.
+
+    def show(self, kind: str, value: str, tag: Tag, partners: Sequence[str] = ()) -> None:
+        """Record what the candidates of the topic show of the current object."""
+        if not self.objects or not self.letters or self.lacking:
+            raise UnreadableError
+        self.unplaced = None
+        for letter in self.letters:
+            for name in self.objects:
+                names = [name, *partners]
+                self.add(kind, names, value, not self.denied, TARGET, tag, letter)
+
+    def expect(self, kind: str, value: str, tag: Tag, partners: Sequence[str] = ()) -> None:
+        """Record where the current object should be."""
+        self.unplaced = None
+        for name in self.objects:
+            self.add(kind, [name, *partners], value, True, TARGET, tag)
+
+    def _end_object(self) -> None:
+        """Record that a candidate shows an object of which nothing else was said."""
+        if self.unplaced is not None and not self.adding:
+            tag, self.unplaced = self.unplaced, None
+            for letter in self.letters:
+                for name in self.objects:
+                    self.add("lacks", [name], "", False, TARGET, tag, letter)
+        self.unplaced = None
+
+    def on_object(self, tag: Tag) -> None:
+        if self.contrasted or self.expected:
+            raise UnreadableError
+        self.at -= 1
+        self._end_object()
+        if self.denied or self.lacking:
+            # An object that is lacking need not be known.
+            noun = tag.value
+            if len(self.find_fitting(noun)) == 1:
+                self.objects = self.read_noun()
+                for letter in self.letters:
+                    self.add("lacks", self.objects, "", True, TARGET, tag, letter)
+            else:
+                self.at += 1
+                self.objects = []
+            self.denied, self.lacking = False, True
+            return
+        self.objects = self.read_list() if self.near(-1).name != "and" else self.read_noun()
+        self.unplaced = tag
+        if self.adding:
+            self.show("extra", "", tag)
+
+    def on_still_noun(self, tag: Tag) -> None:
+        raise UnreadableError
 
     def on_region(self, tag: Tag) -> None:
-        if self.skipped:
-            return
-        if not self.objects:
-            if not (self.expected or self.negated):
-                self.add_claim_of_any("region", tag)
-            return
-        if self.expected or self.negated:
-            # The place where the object should be or is not: a claim about the target.
-            affirmed = self.contrasted or not (self.expected and self.negated)
-            for name in self.objects:
-                claim = self.claim("region", [name], str(tag.value), affirmed, TARGET, tag)
-                self.drafts.append(claim)
+        if self.denied and self.unplaced is not None:
+            # "In candidate A, the cube is not near the top."
+            self.show("region", str(tag.value), tag)
+        elif self.denied or self.contrasted or self.expected:
+            # "Shows the cube near the left, not near the top": it should be near the top.
+            if not self.objects or (self.denied and self.expected):
+                raise UnreadableError
+            self.expect("region", str(tag.value), tag)
         else:
-            self.add_claim("region", str(tag.value), True, tag)
+            self.show("region", str(tag.value), tag)
+            if self.correct:
+                self.expect("region", str(tag.value), tag)
 
     on_into = on_region
 
     def on_relation(self, tag: Tag) -> None:
-        partners = self.find_partners(tag)
-        if possessed := self.find_possessed(tag):
-            self.objects, partners = [possessed[0]], possessed[1:]
-        if self.skipped or not self.objects or partners is None:
-            return
         phrase = tag.value
         assert isinstance(phrase, RelationPhrase)
-        kind = KINDS[phrase.value]
-        if self.expected and not self.contrasted:
-            # Where the object should be: a claim about the target.
-            for name in self.objects:
-                names = (name, *partners)
-                claim = self.claim(kind, names, phrase.value, not self.negated, TARGET, tag)
-                self.drafts.append(claim)
+        partners, kind = self.find_partners(tag), KINDS[phrase.value]
+        if self.expected and not self.denied:
+            self.expect(kind, phrase.value, tag, partners)
         else:
-            denied = self.negated or self.contrasted
-            self.add_claim(kind, phrase.value, not denied, tag, partners)
+            self.denied |= self.contrasted
+            self.show(kind, phrase.value, tag, partners)
 
     def on_meet(self, tag: Tag) -> None:
-        """Read "A shows the cube touching the sphere"; a frame does not show other meetings."""
-        if tag.words not in TOUCHING or not self.objects or self.skipped or self.expected:
-            return
-        if self.near(1).name == "object" or self.near(2).name == "object":
-            self.cursor += 1 if self.near(1).name == "object" else 2
-            partners = self.read_list(1)
-            if None not in partners:
-                self.add_claim("gap", "against", not self.negated, tag, tuple(partners))
+        if tag.words not in TOUCHING or len(self.objects) != 1:
+            raise UnreadableError
+        self.take("with")
+        objects = self.objects
+        partners = self.read_noun()
+        self.objects = objects
+        self.show("gap", "against", tag, partners)
 
-    def on_direction(self, tag: Tag) -> None:
-        if self.near(-1).words != "from" and not self.expected and not self.negated:
-            if self.objects:
-                self.add_claim("displaced", str(tag.value), True, tag)
-            elif self.near(-1).name in ("off", "slight", "clear"):
-                self.add_claim_of_any("displaced", tag)
+    def on_with(self, tag: Tag) -> None:
+        if self.near().name == "other_objects":
+            return
+        if tag.words in PLACING and self.near().name == "candidate":
+            self.at += 1
+            return
+        if tag.words not in ("with", "at", "in"):
+            raise UnreadableError
+        owner = self.objects
+        if possessed := self.read_possession(owner):
+            names, relation = possessed
+            self.objects = names[:1]
+            value = relation.value.value
+            self.show(KINDS[value], value, relation, names[1:])
+            self.objects = owner
+
+    def on_pronoun(self, tag: Tag) -> None:
+        if tag.value != "it" or len(self.objects) != 1:
+            raise UnreadableError
 
     def on_off(self, tag: Tag) -> None:
-        if not self.expected:
-            self.add_claim("displaced", "", not self.negated, tag)
-
-    def on_misplace(self, tag: Tag) -> None:
-        self.misplacing = not self.negated
+        self.show("displaced", "", tag)
+        if self.extent is not None:
+            value = "slightly" if self.extent.name == "slight" else self.extent.words
+            self.show("displaced", value, self.extent)
+            self.extent = None
 
     def on_slight(self, tag: Tag) -> None:
-        self._add_extent("slightly", tag)
+        if self.near().name not in ("off", "direction", "moving"):
+            raise UnreadableError
+        self.extent = tag
+        if self.near().name == "direction":
+            self.on_off(tag)
 
-    def on_clear(self, tag: Tag) -> None:
-        if tag.words == "clearly":
-            self._add_extent("clearly", tag)
-        elif tag.words == "far" and self.near(1).name == "off":
-            self._add_extent("far", tag)
+    on_clear = on_slight
 
-    def _add_extent(self, extent: str, tag: Tag) -> None:
-        beside = (self.near(1).name, self.near(-1).name)
-        if not self.expected and not self.negated and {"off", "direction"} & set(beside):
-            self.add_claim("displaced", extent, True, tag)
+    def on_moving(self, tag: Tag) -> None:
+        if tag.words != "shifted":
+            raise UnreadableError
+        self.on_off(tag)
+
+    def on_direction(self, tag: Tag) -> None:
+        if not any(c.kind == "displaced" for c in self.claims):
+            raise UnreadableError
+        self.show("displaced", str(tag.value), tag)
 
     def on_lack(self, tag: Tag) -> None:
-        if not self.negated and not self.skipped:
-            self.lacking = True
+        if self.denied:
+            raise UnreadableError
+        self._end_object()
+        self.lacking, self.adding = True, False
 
     def on_no_contact(self, tag: Tag) -> None:
-        if tag.words.startswith("miss"):
-            self.on_lack(tag)
-        elif tag.words.startswith("avoid"):
-            self.negated = True
-
-    def on_moves(self, tag: Tag) -> None:
-        # "A misses the move of the red cube" does not say that the cube is missing.
-        self.lacking = False
-
-    on_moving = on_moves
-
-    def on_future(self, tag: Tag) -> None:
-        self.skipped |= tag.words == "would"
+        if not tag.words.startswith("miss"):
+            raise UnreadableError
+        self.on_lack(tag)
 
     def on_gone(self, tag: Tag) -> None:
-        if self.near(1).name == "object":
-            self.lacking = not self.negated
-        elif not self.expected:
-            self.add_claim("lacks", "", not self.negated, tag)
+        if self.expected:
+            raise UnreadableError
+        if self.near().name == "object":
+            self.on_lack(tag)
+        elif self.near().name in ("slight", "clear", "off", "direction"):
+            # "Has gone too far."
+            raise UnreadableError
+        else:
+            self.show("lacks", "", tag)
 
-    def on_out(self, tag: Tag) -> None:
-        if not self.expected:
-            self.add_claim("lacks", "", not self.negated, tag)
-
-    on_hidden = on_out
-    on_unseen = on_out
+    on_out = on_gone
+    on_hidden = on_gone
+    on_unseen = on_gone
 
     def on_extra(self, tag: Tag) -> None:
-        if self.objects:
-            self.add_claim("extra", "", True, tag)
-        else:
-            self.adding = True
+        self.show("extra", "", tag)
 
     def on_adds(self, tag: Tag) -> None:
-        self.adding = not self.negated
+        self.adding = True
 
     def on_other_objects(self, tag: Tag) -> None:
-        if self.lacking or self.near(1).name in ("region", "off", "direction", "expected"):
-            self.lacking = False
-        elif not self.skipped:
-            self.add_candidate_claim("other objects", not self.negated, tag)
-        self.objects, self.adding = [], False
+        for letter in self.letters:
+            self.add("other objects", (), "", not self.denied, TARGET, tag, letter)
 
-    # Claims about a whole candidate.
+    # Whole candidates.
+
+    def _agree(self, agrees: bool, tag: Tag) -> None:
+        for letter in self.letters:
+            self.add("agrees", (), "", agrees, TARGET, tag, letter)
 
     def on_agree(self, tag: Tag) -> None:
-        if self.near(1).name == "candidate" and self.is_compared(self.cursor + 1):
-            # "D matches B in everything but the red cube."
-            self.doubted = True
-        elif self._is_choice_ahead():
-            self.choosing = not self.negated
-        elif not self.letters:
-            self.choosing = not self.negated and not (self.keeps_topic and self.objects)
-        elif not self.objects and not self._is_partial():
-            self.add_candidate_claim("agrees", not (self.negated or self.denies_candidate), tag)
+        if not self.letters or self.near().name == "object":
+            raise UnreadableError
+        self._agree(not self.denied, tag)
+        self.skip({"agree"})
+        self.take("prediction")
 
-    def _is_choice_ahead(self) -> bool:
-        """Return whether the next candidate is said to agree: "the answer is therefore B"."""
-        stop = self.sentence.skip(self.cursor + 1, {"be", "word", "break", "future"})
-        copula = any(t.name in ("be", "future") for t in self.sentence.tags[self.cursor + 1 : stop])
-        return copula and self.sentence[stop].name == "candidate"
+    def on_closest(self, tag: Tag) -> None:
+        self.unplaced = None
+        self.on_agree(tag)
 
     def on_differ(self, tag: Tag) -> None:
-        self.doubted = True
-        if tag.words.startswith("differ") and self._is_between():
-            # "A and B differ in the red cube", "A differs from B in the red cube".
-            return
-        if self.lacking:
-            # "D does not have the error of C."
-            self.lacking = False
-        elif self.objects and self.near(-1).name == "comma" and tag.words in ERRORS:
-            # "It is near the left, an error not seen in B."
-            self.objects, self.skipped = [], True
-        elif not self.objects and not self.negated:
-            self.add_candidate_claim("agrees", False, tag)
+        self._agree(self.denied, tag)
+        self.take("prediction")
 
-    def _is_between(self) -> bool:
-        """Return whether candidates are said to differ from each other, not from the target."""
-        if self.next_of(BOUNDARIES | {"object", "candidate"}).name == "candidate":
-            return True
-        return len(self.letters) > 1 and self.near(1).name != "ignore"
+    # Function words.
 
-    def _is_partial(self) -> bool:
-        """Return whether the agreement is limited to some objects or has an exception."""
-        rest = {tag.name for tag in self.sentence.tags[self.cursor + 1 :]}
-        if rest & {"lack", "gone", "off", "differ", "misplace", "extra"}:
-            return True
-        limit = self.sentence[self.sentence.skip(self.cursor + 1, {"by", "word", "with"})]
-        return limit.name == "object"
+    def on_show(self, tag: Tag) -> None:
+        if self.denied:
+            raise UnreadableError
+        self.lacking = self.adding = False
+        if self.near().name == "agree":
+            self.on_agree(self.tags[self.at])
+            self.at += 1
+
+    def on_stays(self, tag: Tag) -> None:
+        """Read "keeps the red cube near the top" and "leaves it there"."""
+        if self.near().name != "object" or self.denied:
+            raise UnreadableError
+        self.on_show(tag)
+
+    on_leaves = on_stays
+    on_moves = on_stays
+
+    def on_not(self, tag: Tag) -> None:
+        if tag.words in ("neither", "nor") or self.denied:
+            raise UnreadableError
+        self.denied = True
+
+    def on_correctly(self, tag: Tag) -> None:
+        self.correct = True
+
+    def on_contrast(self, tag: Tag) -> None:
+        self.contrasted = True
+
+    def on_expected(self, tag: Tag) -> None:
+        self.expected = True
+
+    def on_be(self, tag: Tag) -> None:
+        pass
+
+    on_visible = on_be
+    on_both = on_be
+
+    def on_future(self, tag: Tag) -> None:
+        if tag.words == "would":
+            raise UnreadableError
+
+    def on_prediction(self, tag: Tag) -> None:
+        """Read "the prediction puts it near the top"."""
+        if not self.take("show"):
+            raise UnreadableError
+        self.expected = True
+
+    def on_which(self, tag: Tag) -> None:
+        if self.near().name not in ("agree", "differ", "be", "expected", "show"):
+            raise UnreadableError
+
+
+def read_answer(text: str, start: int, stop: int) -> list[Claim]:
+    """Return the claim of the section "Answer"."""
+    letter = text[start:stop].strip()
+    if len(letter) != 1:
+        return []
+    position = text.index(letter, start)
+    return [Claim("agrees", (), "", True, TARGET, letter, (position, position + 1))]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
+from itertools import product
 from typing import NamedTuple
 
 from conf.schema import RelationBounds
@@ -29,6 +30,8 @@ from teacher.reading.phrases import COARSE
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
 """The moment of a claim: the cut (the last frame that the predicates treat as observed), the time
 from the cut to the target, the target, or, if the text leaves it open, the cut or the target."""
+JOINT = " or "
+"""Between the names of the objects of which the text may mean any."""
 VERDICTS = ("supported", "contradicted", "unknown")
 
 
@@ -39,14 +42,15 @@ class Claim(NamedTuple):
     value "near the left" (words of the predicates), and is not `affirmed`. `subjects` is empty if
     the text leaves it open; a value after "~" is meant roughly. `when` is the moment, `candidate`
     the letter of the candidate that the claim is about (None for the scene), and `span` the
-    position in the text. Only a `certain` claim can have the verdict "contradicted".
+    position in the text.
 
     Kinds for an object: "mention" (it exists), "region", "direction", "speed", "still" (at rest),
     "extent", "sight", "leaves", "enters". For a pair: "course", "meeting", "time" (of the meeting),
     "close", "close region" (of a close pair), "place of either" (of the pair or its second object).
     For a candidate: "agrees", "other objects"; objects: "region", "lacks", "extra", "displaced".
     For two or three objects, of the scene or of a candidate: the kinds of relations (see
-    `teacher.predicates.relations`), and "weight".
+    `teacher.predicates.relations`), and "weight". "unreadable" stands for a sentence that could not
+    be read, and always has the verdict "unknown".
     """
 
     kind: str
@@ -57,7 +61,6 @@ class Claim(NamedTuple):
     candidate: str | None
     span: tuple[int, int]
     verdict: str = "unknown"
-    certain: bool = True
 
     def __str__(self) -> str:
         words = [self.kind, *([] if self.affirmed else ["not"]), self.value.lstrip(COARSE)]
@@ -103,9 +106,19 @@ class IndexedPredicates:
         found = self.observed or ()
         return len(objects) > 1 and normalize_relation(Relation(kind, objects, value)) in found
 
+    def judge(self, claim: Claim) -> Claim:
+        """Return a claim with its verdict. If the text leaves open which object is meant, the claim
+        is contradicted if it is false of each that may be, otherwise unknown."""
+        options = [*product(*(name.split(JOINT) for name in claim.subjects))]
+        verdicts = {self.verdict(claim._replace(subjects=names)) for names in options}
+        if len(options) == 1:
+            return claim._replace(verdict=verdicts.pop())
+        false = verdicts == {"contradicted"}
+        return claim._replace(subjects=(), verdict="contradicted" if false else "unknown")
+
     def verdict(self, claim: Claim) -> str:
-        """Return one of `VERDICTS`; "unknown" if the predicates do not tell, if they contradict a
-        claim that is not certain, or if several objects have the name that the claim uses."""
+        """Return one of `VERDICTS`; "unknown" if the predicates do not tell, or if several objects
+        have the name that the claim uses."""
         if claim.kind != "mention" and self.look_alikes.intersection(claim.subjects):
             return "unknown"
         truth = self.truth(claim)
@@ -113,10 +126,12 @@ class IndexedPredicates:
             return "unknown"
         if truth == claim.affirmed:
             return "supported"
-        return "contradicted" if claim.certain else "unknown"
+        return "contradicted"
 
     def truth(self, claim: Claim) -> bool | None:
         """Return whether a claim without its negation holds; None if predicates do not tell."""
+        if claim.kind == "unreadable":
+            return None
         if not self.records_contacts and (claim.kind in PAIR_CHECKS or claim.kind == "gap"):
             return None
         if claim.kind == "weight":
@@ -130,12 +145,10 @@ class IndexedPredicates:
             name = claim.subjects[0]
             # The text may name an object that only a candidate shows.
             return name in self.objects or (claim.when == EITHER and name in self.extras)
-        if claim.kind in ("close region", "place of either") and not claim.subjects:
-            return self._truth_of_any(claim._replace(kind="region"))
+        if claim.kind == "close region" and not claim.subjects:
+            return self._truth_of_any(claim)
         if claim.kind in PAIR_CHECKS:
             return PAIR_CHECKS[claim.kind](self, claim)
-        if not claim.subjects:
-            return self._truth_of_any(claim)
         facts = self.objects.get(claim.subjects[0])
         return None if facts is None else OBJECT_CHECKS[claim.kind](facts, claim.value, claim.when)
 
@@ -164,8 +177,6 @@ class IndexedPredicates:
         if claim.kind == "other objects":
             return self.candidates[letter].other_objects
         differences = self.differences[letter]
-        if not claim.subjects:
-            return self._truth_of_any_shown(claim, differences.values())
         name = claim.subjects[0]
         if claim.kind == "region" and (region := self._find_region(letter, name)) is not None:
             difference = differences.get(name)
@@ -200,29 +211,11 @@ class IndexedPredicates:
         return regions[0] if len(regions) == 1 else None
 
     def _truth_of_any(self, claim: Claim) -> bool | None:
-        """Return False if a claim is false of every object, as "it is near the top" if no object is
-        there; otherwise None."""
-        if claim.kind not in ("region", "direction") or not claim.affirmed:
-            return None
-        truths = {OBJECT_CHECKS[claim.kind](o, claim.value, EITHER) for o in self.objects.values()}
-        near = claim.kind == "region" and any(_same(claim.value, r) for r in self.close.values())
+        """Return False if the region of a claim is false of every object, as "the collision occurs
+        near the top" if no object is there; otherwise None."""
+        truths = {_region(o, claim.value, EITHER) for o in self.objects.values()}
+        near = any(_same(claim.value, region) for region in self.close.values())
         return False if truths == {False} and not near else None
-
-    def _truth_of_any_shown(self, claim: Claim, found: Collection[Difference]) -> bool | None:
-        """Return False if no object of a candidate has the region or displacement, else None."""
-        if claim.kind not in ("region", "displaced") or not claim.affirmed:
-            return None
-        if claim.kind == "displaced":
-            if claim.value.lstrip(COARSE) not in COMPASS or any(d.kind == "region" for d in found):
-                return None
-            truths = {_same(claim.value, d.heading) for d in found if d.heading}
-        else:
-            # The words may also describe where an object should be.
-            truths = {_region(o, claim.value, EITHER) for o in self.objects.values()}
-            truths |= {_same(claim.value, d.region) for d in found if d.region}
-            if any(d.kind == "extra" for d in found):
-                return None
-        return False if truths <= {False} else None
 
 
 def _same(value: str, actual: str | None) -> bool | None:
@@ -236,7 +229,7 @@ def _same(value: str, actual: str | None) -> bool | None:
     if value in COMPASS:
         apart = abs(COMPASS.index(value) - COMPASS.index(actual))
         apart = min(apart, 8 - apart)
-        return True if apart == 0 else None if apart <= 2 else False
+        return True if apart == 0 else None if apart == 1 else False
     if value == actual:
         return True
     side = value.removeprefix("near the ")

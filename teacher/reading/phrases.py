@@ -13,7 +13,7 @@ from teacher.predicates.facts import COMPASS
 COARSE = "~"
 """Prefix of a value that the text states only roughly. "Leftward" has the value "~west": true for
 west, false for directions more than 90 degrees from it, and unknown for the others."""
-ENDINGS = ("", "ward", "wards", "erly", "bound", "wardly")
+ENDINGS = ("", "ern", "ward", "wards", "erly", "bound", "wardly")
 """Endings of a compass direction, as in "eastward" and "eastbound"."""
 
 Phrase = tuple[tuple[str, ...], str, str]

@@ -1,187 +1,249 @@
-"""The base class of the readers: the loop over tags, noun phrases, and lists of objects."""
+"""The base class of the readers: the tags of a sentence, noun phrases, and lists of objects."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Container, Sequence
+from collections.abc import Collection, Container, Sequence
 
-from teacher.predicates.relations import EXTENTS
-from teacher.reading.certainty import CertaintyCheck
-from teacher.reading.claims import CUT, EITHER, Claim, IndexedPredicates
-from teacher.reading.tagging import Noun, RelationPhrase, Sentence, Tag
+from teacher.reading.claims import CUT, EITHER, JOINT, Claim, IndexedPredicates
+from teacher.reading.tagging import END, Noun, RelationPhrase, Tag
 
-MAX_OBJECTS = 9
-"""Maximum number of objects in a list, and in the subject of a clause."""
-POSSESSIVES = {"with", "has", "have", "having"}
-"""Last words before the object in "the cube has the sphere left of it"."""
+SEPARATORS = {"comma", "semicolon", "and", "break", "moment"}
+"""Tags that may lie between clauses."""
+VERBS = {
+    *("be", "moves", "stays", "future", "expected", "still", "show", "across", "leaves", "enters"),
+    *("past", "meet", "not", "in_place"),
+}
+"""Tags that may be the verb of the last noun phrase before them."""
+DENIALS = {"not", "none", "no_contact", "lack", "gone"}
+"""Tags that deny something, so that "or" joins what is denied. Elsewhere, it leaves open what is
+true."""
+LACKING = {"no", "lack", "gone"}
+"""Words or tags before an object that need not exist."""
 
-Names = list[str | None]
-"""Names of objects, such as "red metal cube"; None for an object that the text leaves open."""
+
+class UnreadableError(Exception):
+    """No rule explains the next words of a sentence."""
 
 
 class Reader:
-    """Calls `begin`, then the method `on_<name>` for each tag of a sentence if there is one, such
-    as `on_region` for "near the left", then `end`. Methods may move the cursor over tags."""
+    """Reads sentences of one section. For each tag, the method `on_<name>` is called, such as
+    `on_region` for "near the top". A sentence with a tag that has no method, or that stands where
+    its method does not expect it, is unreadable and makes no claim but "unreadable"."""
 
-    allows_extras = False
-    """Whether the text may name objects of candidates that the scene does not have."""
-    still_moment = EITHER
-    """The moment at which the object of "the stationary red cube" is stationary."""
+    extras: Collection[str] = ()
+    """Objects that the text may name although the scene does not have them."""
 
-    def __init__(self, predicates: IndexedPredicates) -> None:
+    def __init__(self, predicates: IndexedPredicates, moment: str, known: list[str]) -> None:
+        """Args:
+        moment: The moment that the present tense of the section refers to.
+        known: The objects that the text has named; the reader adds those of its section.
+        """
         self.predicates = predicates
+        self.moment = moment
+        self.known = known
+        self.last_nouns: list[str] = []
+        """The objects of the last noun phrase."""
 
-    def read(self, sentence: Sentence) -> list[Claim]:
+    def read(self, tags: Sequence[Tag]) -> list[Claim]:
         """Return the claims of a sentence, without verdicts."""
-        self.sentence = sentence
-        self.cursor = 0
-        """The index of the current tag."""
+        self.tags = _leave_out_fillers(tags)
+        self.at, self.stop = 0, len(self.tags)
+        """The indexes of the current tag and of the tag before which reading stops."""
         self.claims: list[Claim] = []
-        self.mentioned: Names = []
-        """The objects that the sentence has named so far."""
-        self.names_at: dict[int, Names] = {}
-        """The objects that each noun phrase names, by its start in the text."""
-        self.shared_values: dict[tuple[str, tuple[str | None, ...]], dict[tuple[int, int], str]] = (
-            defaultdict(dict)
-        )
-        """Values stated of several objects, by kind and objects, then by span."""
-        self.begin()
-        while self.cursor < len(sentence.tags):
-            tag = sentence[self.cursor]
-            if handler := getattr(self, f"on_{tag.name}", None):
-                handler(tag)
-            self.cursor += 1
-        self.end()
-        check = CertaintyCheck(sentence, self.names_at)
-        return [c._replace(certain=check.is_certain(c)) for c in self._assign_shared(self.claims)]
+        mentions = self._find_mentions()
+        if all(tag.name == "stop" for tag in self.tags):
+            return []
+        try:
+            if any(tag.words == "or" for tag in tags) and not DENIALS & {tag.name for tag in tags}:
+                raise UnreadableError
+            self.read_sentence()
+        except UnreadableError:
+            self.forget()
+            if any(claim.when == CUT for claim in mentions):
+                # An object that does not exist is reason enough.
+                return mentions
+            span = tags[0].start, tags[-1].stop
+            return [*mentions, Claim("unreadable", (), "", True, self.moment, None, span)]
+        return [*mentions, *self.claims]
 
-    def begin(self) -> None:
+    def read_sentence(self) -> None:
         raise NotImplementedError
 
-    def end(self) -> None:
+    def forget(self) -> None:
+        """Forget what the next sentence could refer to, since this one could not be read."""
         raise NotImplementedError
 
-    def near(self, offset: int) -> Tag:
-        """Return the tag at an offset from the current one; END outside the sentence."""
-        return self.sentence[self.cursor + offset]
+    # The current tag.
 
-    def next_of(self, wanted: Container[str], step: int = 1) -> Tag:
-        """Return the next (`step` 1) or previous (-1) tag with a name in `wanted`, or END."""
-        return self.sentence[self.sentence.find(self.cursor + step, wanted, step)]
+    def near(self, offset: int = 0) -> Tag:
+        """Return the tag at an offset from the current one; END outside the readable tags."""
+        index = self.at + offset
+        return self.tags[index] if 0 <= index < self.stop else END
 
-    def claim(
+    def take(self, *names: str) -> Tag | None:
+        """Return the current tag and move on if it has one of these names."""
+        tag = self.near()
+        if tag.name not in names:
+            return None
+        self.at += 1
+        return tag
+
+    def skip(self, names: Container[str]) -> list[str]:
+        """Move over tags with these names, and return the names."""
+        start = self.at
+        while self.near().name in names:
+            self.at += 1
+        return [tag.name for tag in self.tags[start : self.at]]
+
+    def read_tags(self, ends: Container[str] = SEPARATORS) -> int:
+        """Call the methods of the tags up to one of `ends`, and return the number of these tags."""
+        start = self.at
+        while (tag := self.near()).name not in ends and tag.name != "stop":
+            self.at += 1
+            handler = getattr(self, f"on_{tag.name}", None)
+            if handler is None:
+                raise UnreadableError
+            handler(tag)
+        return self.at - start
+
+    def add(
         self,
         kind: str,
-        subjects: Sequence[str | None],
+        names: Sequence[str],
         value: str,
         affirmed: bool,
         when: str,
         tag: Tag,
         candidate: str | None = None,
-    ) -> Claim:
-        """Return the claim that `tag` states, without subjects if one of them is None. It can then
-        be contradicted only if it is false of every object."""
-        names = () if None in subjects else tuple(subjects)
-        return Claim(kind, names, value, affirmed, when, candidate, (tag.start, tag.stop))
+    ) -> None:
+        """Record the claim that `tag` states."""
+        span = (tag.start, tag.stop)
+        self.claims.append(Claim(kind, tuple(names), value, affirmed, when, candidate, span))
 
-    def read_list(self, most: int = MAX_OBJECTS) -> Names:
-        """Return the objects of the list that begins at the current tag, and move the cursor to the
-        last; only the first if no "and" or "nor" precedes the last of at most `most` objects."""
-        ends, complete = [self.cursor], False
-        while len(ends) < most and not complete:
-            step = ends[-1] + 1
-            comma = self.sentence[step].name == "comma"
-            if comma and self.sentence[step + 1].name == "and":
-                step += 1
-            complete = self.sentence[step].name == "and" or self.sentence[step].words == "nor"
-            if not (comma or complete) or self.sentence[step + 1].name != "object":
-                complete = False
-                break
-            ends.append(step + 1)
-        names: Names = []
-        for index in ends if complete else ends[:1]:
-            self.cursor = index
-            tag = self.sentence[index]
-            names += self.names_at.setdefault(tag.start, self._find_objects(tag))
-        return names
+    # Noun phrases.
 
-    def record_shared(self, kind: str, value: str, subjects: Names, tag: Tag) -> None:
-        """Record a value stated of several objects, if an object has only one value of the kind."""
-        exclusive = kind in ("region", "direction", "speed", "displaced")
-        if len(subjects) > 1 and exclusive and value not in ("", *EXTENTS):
-            self.shared_values[kind, tuple(subjects)][tag.start, tag.stop] = value
+    def find_fitting(self, noun: Noun) -> list[str]:
+        """Return the names of the objects that have the stated attributes."""
+        return [name for name in (*self.predicates.objects, *self.extras) if noun.fits(name)]
 
-    def _assign_shared(self, claims: list[Claim]) -> list[Claim]:
-        """Return the claims with one value for each object: in "the cube and the sphere are near
-        the top and near the left", the cube keeps the first value and the sphere the second. If
-        the numbers of objects and values differ, these claims are dropped."""
-        for (kind, subjects), values in self.shared_values.items():
-            if len(set(values.values())) < 2:
+    def _find_mentions(self) -> list[Claim]:
+        """Return the claims that the named objects exist, and those that they are at rest."""
+        found: list[Claim] = []
+        for previous, tag in zip((END, *self.tags), self.tags, strict=False):
+            if not isinstance(noun := tag.value, Noun):
                 continue
-            matched = len(values) == len(subjects)
-            owners = dict(zip(values, subjects, strict=True)) if matched else {}
-            claims = [
-                c
-                for c in claims
-                if c.kind != kind or c.span not in values or c.subjects == (owners.get(c.span),)
-            ]
-        return claims
+            fitting, span = self.find_fitting(noun), (tag.start, tag.stop)
+            if len(fitting) == 1 and not noun.plural:
+                found.append(Claim("mention", (*fitting,), "", True, EITHER, None, span))
+            elif noun.plural and (previous.name == "and" or " " not in tag.words):
+                # "The red and blue spheres", "it blocks".
+                continue
+            elif len(fitting) < 1 + noun.plural and not {previous.words, previous.name} & LACKING:
+                phrase = f"{noun.phrase}s" if noun.plural else noun.phrase
+                found.append(Claim("mention", (phrase,), "", True, CUT, None, span))
+        return found
 
-    def find_partners(self, tag: Tag) -> tuple[str, ...] | None:
-        """Return the other objects of a relation; None if one is a pronoun or not a known one."""
-        phrase = tag.value
-        assert isinstance(phrase, RelationPhrase)
-        partners: list[str] = []
-        for noun in phrase.nouns:
-            names = [None] if noun is None else self._find_objects(tag, noun)
-            if len(names) != 1 or names[0] is None:
-                return None
-            partners.append(names[0])
-        return tuple(partners)
+    def find_objects(self, noun: Noun) -> list[str]:
+        """Return the objects that a noun phrase names. If it leaves open which one it means, and
+        the text has not named just one of them, the names are joined by `JOINT`.
 
-    def find_possessed(self, tag: Tag) -> tuple[str, str] | None:
-        """Return the sphere and the cube in "the cube has the sphere left of it" and "the cube with
-        the sphere left of it", where `tag` is the relation; None if the text is different."""
-        assert isinstance(tag.value, RelationPhrase)
-        verb, thing = self.near(-2), self.near(-1)
-        possessed = thing.name == "object" and verb.last_word in POSSESSIVES
-        if tag.value.nouns != (None,) or not possessed:
-            return None
-        index = self.cursor - 1
-        while self.sentence[index - 1].last_word in POSSESSIVES:
-            # "The cube with the sphere left of it and with the cylinder near it": the cube.
-            index = self.sentence.find(index - 1, {"object"}, -1)
-        owner = self.sentence[index]
-        names = [self.names_at.get(start, ()) for start in (thing.start, owner.start)]
-        if any(len(found) != 1 or None in found for found in names):
-            return None
-        return str(names[0][0]), str(names[1][0])
+        Raises:
+            UnreadableError: There is none, or the plural leaves open which ones are meant.
+        """
+        fitting = self.find_fitting(noun)
+        named = [name for name in fitting if name in self.known]
+        if noun.plural and named not in ([], fitting):
+            # "The cubes": all, or those that the text has named.
+            raise UnreadableError
+        if (len(fitting) < 2 or noun.still) if noun.plural else not fitting:
+            raise UnreadableError
+        if len(fitting) > 1 and not noun.plural:
+            if len({*named}) != 1:
+                return [JOINT.join(fitting)]
+            fitting = named
+        self.known += fitting
+        return fitting
 
-    def _find_objects(self, tag: Tag, noun: Noun | None = None) -> Names:
-        """Return the objects that a noun phrase names, and record the claim that they exist.
+    def read_noun(self) -> list[str]:
+        """Return the objects of the noun phrase at the current tag, and move on."""
+        tag = self.take("object")
+        if tag is None or not isinstance(tag.value, Noun):
+            raise UnreadableError
+        self.last_nouns = self.find_objects(tag.value)
+        if tag.value.still:
+            self.on_still_noun(tag)
+        return self.last_nouns
+
+    def on_still_noun(self, tag: Tag) -> None:
+        """Record that the object of "the stationary red cube" is at rest."""
+        raise UnreadableError
+
+    def read_list(self, is_complement: bool = False) -> list[str]:
+        """Return the objects of a list such as "the cube, the sphere and the cylinder", and move
+        on; only the first if no "and" precedes the last.
 
         Args:
-            noun: The noun phrase, if it is a part of the tag.
+            is_complement: Whether the list follows its verb. An object before another verb is then
+                no part of it: "hits the red cube, and the sphere stays".
         """
-        noun = noun or tag.value
-        assert isinstance(noun, Noun)
-        known = [*self.predicates.objects, *(self.predicates.extras if self.allows_extras else ())]
-        fitting = [name for name in known if noun.fits(name)]
-        previous = self.near(-1).words
-        if len(fitting) > 1 and not (noun.color or noun.material or noun.plural or noun.is_other):
-            # "The red cube and the blue sphere move, the cube quickly."
-            fitting = [name for name in fitting if name in self.mentioned] or fitting
-        if not fitting and not noun.is_other and previous != "no":
-            self.claims.append(self.claim("mention", [noun.phrase], "", True, CUT, tag))
-            return [None]
-        if noun.plural and len(fitting) == 2 and previous == "both":
-            self.mentioned += fitting
-            return fitting
-        if noun.plural or noun.is_other or len(fitting) != 1:
-            self.mentioned.append(None)
-            return [None]
-        self.mentioned += fitting
-        self.claims.append(self.claim("mention", fitting, "", True, EITHER, tag))
-        if noun.still and fitting[0] in self.predicates.objects:
-            self.claims.append(self.claim("still", fitting, "", True, self.still_moment, tag))
-        return fitting
+        self.take("both")
+        ends, index, complete = [self.at], self.at + 1, False
+        while not complete:
+            separators = []
+            while self.tags[index : index + 1] and self.tags[index].name in ("comma", "and"):
+                separators.append(self.tags[index].name)
+                index += 1
+            if is_complement and "and" in separators and self.tags[index : index + 1]:
+                # "Close to the cube and to the sphere."
+                index += self.tags[index].words in ("to", "with")
+            tag = self.tags[index] if index < self.stop else END
+            if tag.name != "object" or separators not in (["comma"], ["and"], ["comma", "and"]):
+                break
+            ends.append(index)
+            complete = "and" in separators
+            index += 1
+        if is_complement and complete and (index < self.stop and self.tags[index].name in VERBS):
+            complete, ends = False, ends[:1]
+        names: list[str] = []
+        for end in ends if complete else ends[:1]:
+            self.at = end
+            names += self.read_noun()
+        self.last_nouns = names
+        return names
+
+    def find_partners(self, tag: Tag) -> list[str]:
+        """Return the other objects of a relation."""
+        assert isinstance(tag.value, RelationPhrase)
+        if None in tag.value.nouns:
+            raise UnreadableError
+        return [name for noun in tag.value.nouns if noun for name in self.find_objects(noun)]
+
+    def read_possession(self, owner: Sequence[str]) -> tuple[list[str], Tag] | None:
+        """Read "the sphere left of it" after "the cube has" or "with", and return the objects of
+        the relation and its tag; None, without moving on, if other words follow.
+
+        Args:
+            owner: The objects to which "it" refers.
+        """
+        start = self.at
+        if self.near().name == "object":
+            things = self.read_noun()
+            self.take("be")
+            tag = self.take("relation")
+            if tag is not None and tag.value.nouns == (None,) and len(things) == len(owner) == 1:
+                return [*things, *owner], tag
+        self.at = start
+        return None
+
+
+def _leave_out_fillers(tags: Sequence[Tag]) -> list[Tag]:
+    """Return the tags of a sentence without words that state nothing, such as the "toward" before a
+    direction. "Still" is such a word unless it ends its clause."""
+    kept: list[Tag] = []
+    for tag, following in zip(tags, (*tags[1:], END), strict=True):
+        if tag.name == "word" and tag.words == "still":
+            if following.name in SEPARATORS | {"stop"}:
+                kept.append(tag._replace(name="still"))
+        elif tag.name != "filler" and (tag.name, following.name) != ("with", "direction"):
+            kept.append(tag)
+    return kept

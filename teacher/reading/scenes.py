@@ -1,218 +1,679 @@
-"""Reads claims about one object of the scene: its place, motion and visibility."""
+"""Reads sentences about the scene: the places, motions and meetings of its objects."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+from teacher.predicates.facts import COMPASS, OUT_OF_VIEW
 from teacher.predicates.relations import CHANGES, KINDS
 from teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
-from teacher.reading.pairs import PAIR_TAGS
 from teacher.reading.phrases import COARSE
-from teacher.reading.subjects import SubjectReader
-from teacher.reading.tagging import BOUNDARIES, COLUMNS, MIDDLE, ROWS, RelationPhrase, Tag
+from teacher.reading.reader import SEPARATORS, Reader, UnreadableError
+from teacher.reading.tagging import (
+    COLOR_WORDS,
+    COLUMNS,
+    END,
+    MATERIAL_WORDS,
+    ROWS,
+    Noun,
+    RelationPhrase,
+    Tag,
+)
 
-STILL_VERBS = {
-    *("does", "do", "did", "is", "are", "has", "have", "shows", "show", "keeps", "keep"),
-    *("rest", "rests", "stand", "stands", "sit", "sits", "lie", "lies"),
+NOUN_STARTS = {"object", "both", "pronoun", "unnamed", "all", "none", "paths", "other_objects"}
+"""Tags that may begin a subject."""
+FRONTED = {
+    *("region", "from", "direction", "speed", "still", "moving", "out", "hidden", "be", "slight"),
+    *("across", "toward", "into"),
 }
-"""First words of the phrases of the tag "still" that contain a verb: "does not move", "rests"."""
-DENYING = {"not", "be", "moves", "moving", "contrast", "still"}
-"""Tags after which a direction in a negated clause is denied, as in "is not moving east"."""
-SIDE_WORDS = {*ROWS, *COLUMNS, *MIDDLE}
+"""Tags that may precede their subject, as in "near the top is the red cube"."""
+OF_CONTACT = {"be", "future", "expected", "time", "occurs", "region"}
+"""Tags of the clause after "the contact between the cube and the sphere"."""
+SINGULAR = {"is", "was", "does", "has"}
+STILL_VERBS = SINGULAR | {
+    *(
+        "do",
+        "did",
+        "are",
+        "rests",
+        "rest",
+        "stands",
+        "stand",
+        "sits",
+        "sit",
+        "lies",
+        "lie",
+        "keeps",
+    ),
+    *("keep", "have", "shows", "show", "stays", "stay", "remains", "remain"),
+}
+"""First words of the phrases of the tag "still" that contain a verb."""
+PLURAL = {"are", "were", "do", "have", "move", "meet", "collide", "stay", "remain"}
+FINITE = {
+    "be",
+    "moves",
+    "stays",
+    "future",
+    "across",
+    "leaves",
+    "enters",
+    "show",
+    "past",
+    "expected",
+}
+OF_MATERIAL = ("of", "in", "made of", "made from")
+AFTER_HAVE = {
+    *("moving", "be", "not", "in_place", "stays", "moves", "past", "across", "slight", "both"),
+    *("enters", "leaves"),
+}
+"""Tags after "has" where it is an auxiliary."""
+OPENING = ("once ", "when ", "after ")
+"""First words of the phrases for a contact that precede their subject."""
+SIDES = {"left": "west", "right": "east", "top": "north", "bottom": "south"}
 
 
-class SceneReader(SubjectReader):
-    """Reads sentences about the scene, and records claims about the subject of each clause."""
+@dataclass
+class Clause:
+    """The subject of a clause, and what its words have said of it so far."""
 
-    def on_region(self, tag: Tag, when: str = "") -> None:
-        event = self.pair_event
-        if event:
-            if event.kind == "close":
-                self.add_close_region(event, tag)
-            return
-        previous, following = self.near(-1).name, self.near(1).name
-        if self.negated and self._is_kept(tag):
-            self.add_claim("region", str(tag.value), True, EITHER, tag)
-            return
-        if self.negated and previous not in ("not", "be", "future", "contrast"):
-            return
-        if following == "and" and self.near(2).value in SIDE_WORDS:
-            # "Near the left and the right are ..." gives each object one place.
-            return
-        if following == "none" or (following == "be" and tag.words.startswith("the ")):
-            # "The top is empty", "near the top nothing remains".
-            return
-        if self._is_place_left():
-            return
-        if previous in ("semicolon", "break") and following in ("pronoun", "object"):
-            if following == "object":
-                self.pending.append(("region", str(tag.value), True, when or self.moment, tag, ()))
-            return
-        if not when:
-            when = TARGET if self.future else CUT if self.past else self.moment
-            if self._is_former():
-                when = CUT
-            elif previous == "object" and self.moment == TARGET:
-                # "The red cube near the top will be near the left."
-                when = EITHER
-        self.add_claim("region", str(tag.value), not self.negated, when, tag)
+    subjects: list[str]
+    kind: str = "objects"
+    """"all" for "all objects" and "the other objects", "none" for "no pair", and "contact" for "the
+    contact between the cube and the sphere"."""
+    has_verb: bool = False
+    negated: bool = False
+    future: bool = False
+    past: bool = False
+    staying: bool = False
+    moving: bool = False
+    on_path: bool = False
+    """Whether the clause is about the path up to the target."""
+    slight: Tag | None = None
+    time: Tag | None = None
+    event: str = ""
+    """The kind of the last claim about a pair, and the pairs."""
+    pairs: list[tuple[str, ...]] = field(default_factory=list)
+    said: set[str] = field(default_factory=set)
+    """The kinds of the claims about the subjects."""
+    has_complement: bool = False
+    """Whether the last words were about another object, too, so that the next may be about it."""
 
-    def _is_kept(self, tag: Tag) -> bool:
-        """Return whether the negation affirms the region: "has not moved from near the top"."""
-        previous = self.near(-1)
-        if tag.name == "from":
-            return previous.name in ("moves", "moving")
-        if previous.name == "object":
-            return not self.blocked and self.near(-2).words not in ("is", "are", "be")
-        return self._is_place_left()
 
-    def _is_place_left(self) -> bool:
-        """Return whether an object leaves the region, as in "leaves its place near the top"."""
-        verbs = self.sentence.tags[max(0, self.cursor - 3) : self.cursor]
-        return any(tag.name == "leaves" and self._is_single_word(tag) for tag in verbs)
+class SceneReader(Reader):
+    """Records claims about the subject of each clause."""
 
-    def _is_former(self) -> bool:
-        """Return whether the next tag dates the claim earlier, as in "out of view before"."""
-        return self.near(1).name == "past" or self.near(1).words == "before"
+    clause: Clause | None = None
+    previous: Clause | None = None
 
-    def on_relation(self, tag: Tag) -> None:
-        if self.pair_event:
+    def read_sentence(self) -> None:
+        self.previous, self.clause = self.clause or self.previous, None
+        self.carried: list[str] = []
+        """The subjects of clauses without a verb, which may share the next verb: "the cube near the
+        top and the sphere near the left are at rest"."""
+        self.frame: list[str] = []
+        """The pair of "between the cube and the sphere, the cube moves west"."""
+        self.opening: Tag | None = None
+        """The moment with which the sentence opens."""
+        self.is_bare = self.was_verbal = False
+        """Whether nothing was said of the last subject; whether an earlier clause had a verb."""
+        while True:
+            separators = self.skip(SEPARATORS)
+            if self.near() is END or self.near().name == "stop":
+                break
+            self.read_clause(separators)
+        if self.is_bare or self.clause is None:
+            raise UnreadableError
+
+    def forget(self) -> None:
+        self.clause = self.previous = None
+
+    # Subjects.
+
+    def read_clause(self, separators: Sequence[str] = ()) -> None:
+        moments = ("future", "time", "past", "expected")
+        if self.near(1).name in NOUN_STARTS | {"comma", "contact"} and (tag := self.take(*moments)):
+            # "At the target moment, the cube is near the top." "Soon, they will meet."
+            self.take("comma")
+            self.opening = tag
+        opening = self.take("there")
+        if opening:
+            self.take("future", "expected")
+            self.skip({"be"})
+            if self.near(1).name == "contact":
+                self.opening = self.take("time") or self.opening
+        struck = self.near() if self.near().words.startswith(OPENING) else None
+        if struck is not None:
+            # "Once struck, the cube moves west."
+            self.at += 1
+            self.take("comma")
+            self.begin(self.read_subject())
+            self.on_struck(struck)
+            self.clause.event = ""
+        elif self.near().name == "between":
+            self.at += 1
+            self.frame = self.read_list()
             return
-        phrase = tag.value
-        assert isinstance(phrase, RelationPhrase)
-        kind = KINDS[phrase.value]
-        partners = self.find_partners(tag)
-        if possessed := self.find_possessed(tag):
-            self.blocked = False
-            self.start_clause([possessed[0]])
-            partners = possessed[1:]
-        if kind in CHANGES:
-            self.record_verb()
-        if partners is None:
+        elif self.near().words == "with":
+            self.at += 1
+            self.begin(self.read_subject())
+        elif self._is_fronted(separators, nominal=opening is not None):
+            self._read_fronted()
+        elif self.near().name in NOUN_STARTS or self.near().words == "neither":
+            if self.clause is None and self.near().name == "pronoun" and "break" in separators:
+                # "As it moves west, the cube leaves": "it" is the cube.
+                raise UnreadableError
+            self.begin(self.read_subject())
+        elif self.near().name in ("contact", "no_contact", "course") and (
+            self.clause is None or self.near(1).name in ("between", "links", "be", "occurs")
+        ):
+            self._read_contact()
+        elif self.near().name == "which":
+            self.on_which(self.near())
+            self.is_bare = False
             return
-        if kind in CHANGES:
-            when = BETWEEN
+        elif self.clause is None or opening or self.near(-1).words == "or":
+            raise UnreadableError
         else:
-            when = TARGET if self.future else CUT if self.past else self.moment
-        self.add_claim(kind, phrase.value, not self.negated, when, tag, partners=partners)
+            self.clause.negated = False
+            self.clause.event = self.clause.event if self.clause.event == "close" else ""
+        else_said = struck or self.clause.event or self.clause.said
+        self.is_bare = not self._read_predicate() and not else_said
+
+    def begin(self, clause: Clause) -> None:
+        """Begin a clause with another subject."""
+        if self.clause is not None:
+            self.was_verbal |= self.clause.has_verb
+            self.carried = [] if self.clause.has_verb else [*self.carried, *self.clause.subjects]
+        if self.frame and not {*clause.subjects} <= {*self.frame}:
+            raise UnreadableError
+        self.clause = clause
+        if self.opening is not None:
+            clause.past = self.opening.name == "past"
+            clause.future = not clause.past
+            clause.time = self.opening if self.opening.name == "time" else None
+
+    def read_subject(self) -> Clause:
+        tag = self.near()
+        if tag.words == "neither":
+            self.at += 1
+            names = self.read_noun()
+            self.take("comma")
+            if (joint := self.take("not")) is None or joint.words != "nor":
+                raise UnreadableError
+            return Clause([*names, *self.read_noun()], negated=True)
+        if tag.name == "object" or (tag.name == "both" and self.near(1).name == "object"):
+            return Clause(self.read_list())
+        self.at += 1
+        if tag.name == "paths":
+            # "The paths of the cube and the sphere lead to a collision."
+            self.take("with", "between")
+            return Clause(self.read_list())
+        if tag.name in ("pronoun", "both"):
+            return Clause(self._find_antecedents(str(tag.value)))
+        if tag.name == "none":
+            return Clause([], "none")
+        if tag.name != "all":
+            # Which objects "the others" are depends on those that the text leaves out.
+            return Clause([], "all")
+        # The built-in narrator says nothing of objects that are out of view at the cut.
+        objects = self.predicates.objects.values()
+        return Clause([o.object for o in objects if o.sight != OUT_OF_VIEW], "all")
+
+    def _find_antecedents(self, pronoun: str) -> list[str]:
+        """Return the objects that a pronoun refers to."""
+        last = self.clause or self.previous
+        if last is None or (len(last.subjects) == 1) != (pronoun == "it"):
+            raise UnreadableError
+        if not last.subjects or not {*self.last_nouns} <= {*last.subjects}:
+            # "The cube hits the sphere. It moves west": either may.
+            raise UnreadableError
+        return last.subjects
+
+    def _is_fronted(self, separators: Sequence[str], nominal: bool) -> bool:
+        """Return whether the next words precede their subject, also as in "there is a slight shift
+        of the cube" if `nominal` is true."""
+        end = self.at
+        while end < self.stop and self.tags[end].name in FRONTED | (
+            {"moves"} if nominal else set()
+        ):
+            end += 1
+        end += nominal and end < self.stop and self.tags[end].words == "of"
+        direct = end < self.stop and self.tags[end].name in NOUN_STARTS
+        comma = self.tags[end : end + 1] and self.tags[end].name == "comma"
+        late = comma and self.tags[end + 1 : end + 2] and self.tags[end + 1].name in NOUN_STARTS
+        first = self.clause is None or (separators and separators[-1] in ("break", "semicolon"))
+        return end > self.at and bool(direct or (late and first))
+
+    def _read_fronted(self) -> None:
+        start = self.at
+        self.skip(FRONTED | {"moves"})
+        end = self.at
+        self.take("comma", "with")
+        self.begin(self.read_subject())
+        resume, last = self.at, self.stop
+        self.at, self.stop = start, end
+        self._read_predicate()
+        self.at, self.stop = resume, last
+
+    def _read_contact(self) -> None:
+        """Read "the contact between the cube and the sphere" as a subject."""
+        tag, last = self.near(), self.clause or self.previous
+        self.at += 1
+        self.begin(Clause([], "contact"))
+        if self.take("between", "with", "links"):
+            kind = "course" if tag.name == "course" else "meeting"
+            self._add_event(kind, tag, self.read_list(), [], tag.name != "no_contact")
+        elif tag.name != "contact":
+            raise UnreadableError
+        elif last is not None and (last.pairs or len(last.subjects) == 2):
+            # "They are on a collision course, and contact is imminent."
+            self._add_event("meeting", tag, [*(last.pairs or [last.subjects])[0]], [])
+
+    # Predicates.
+
+    def _read_predicate(self) -> int:
+        """Read what the clause says of its subject, and return the number of tags."""
+        count = self.read_tags()
+        self._end_predicate()
+        return count
+
+    def _end_predicate(self) -> None:
+        clause = self.clause
+        if clause.slight is not None:
+            if not clause.moving:
+                raise UnreadableError
+            self.state("extent", "shifts slightly", BETWEEN, clause.slight)
+            clause.slight = None
+
+    def state(self, kind: str, value: str, when: str, tag: Tag, affirmed: bool = True) -> None:
+        """Record a claim about each subject of the clause."""
+        clause = self.clause
+        about_rest = kind in ("extent", "still") and (clause.has_verb or clause.kind == "objects")
+        if clause.kind != "objects" and not (clause.kind == "all" and about_rest):
+            raise UnreadableError
+        if clause.event == "meeting" or clause.has_complement:
+            # "Is knocked out of view", "meets the sphere near the top".
+            raise UnreadableError
+        if len(clause.subjects) > 1 and kind in clause.said:
+            # "The cube and the sphere are near the top and near the left."
+            raise UnreadableError
+        clause.said.add(kind)
+        for name in clause.subjects:
+            self.add(kind, [name], value, affirmed != clause.negated, when, tag)
+
+    def verb(self, tag: Tag) -> None:
+        """Note the verb of the clause. A plural verb is also that of earlier subjects."""
+        clause = self.clause
+        clause.has_complement &= tag.name not in FINITE | {"meet"}
+        first = tag.words.split()[0]
+        if clause.kind == "contact" and tag.name not in OF_CONTACT:
+            raise UnreadableError
+        if not clause.has_verb and tag.name in FINITE | {"meet"}:
+            plural = first in PLURAL
+            if self.was_verbal and self.carried and plural and len(clause.subjects) == 1:
+                # "The cube moves west, the sphere east, and the cylinder are at rest."
+                raise UnreadableError
+            if not (self.was_verbal or first in SINGULAR or (first.endswith("s") and not plural)):
+                clause.subjects = [*dict.fromkeys([*self.carried, *clause.subjects])]
+            self.carried = []
+            clause.has_verb = True
+
+    @property
+    def when(self) -> str:
+        """The moment of a statement about a state."""
+        clause = self.clause
+        if self.moment == TARGET and not clause.has_verb and not clause.future:
+            # "The red cube near the top will be near the left."
+            return EITHER
+        return TARGET if clause.future else CUT if clause.past else self.moment
+
+    def on_be(self, tag: Tag) -> None:
+        self.verb(tag)
+
+    def on_future(self, tag: Tag) -> None:
+        self.verb(tag)
+        self.clause.future = True
+
+    on_expected = on_future
+
+    def on_past(self, tag: Tag) -> None:
+        self.verb(tag)
+        self.clause.past = True
+
+    def on_not(self, tag: Tag) -> None:
+        if self.clause.kind != "objects" or self.clause.negated:
+            raise UnreadableError
+        self.clause.negated = True
+
+    def on_both(self, tag: Tag) -> None:
+        count = len({*self.clause.subjects, *self.carried})
+        if count < 2 or (tag.words == "both" and count > 2):
+            raise UnreadableError
+
+    # Places and motions.
+
+    def on_region(self, tag: Tag) -> None:
+        clause = self.clause
+        if clause.event == "close":
+            self._add_close_region(tag)
+        elif clause.kind == "contact":
+            self.add("close region", [], str(tag.value), True, self.moment, tag)
+        elif clause.event and self.near(-2).name == "object":
+            # "Meets the red cube near the top": the place of either.
+            raise UnreadableError
+        else:
+            self.state("region", str(tag.value), self.when, tag)
 
     def on_into(self, tag: Tag) -> None:
-        self.on_region(tag, CUT if self.moment == CUT and not self.mentions_motion else TARGET)
+        side = tag.last_word
+        if not self.clause.moving:
+            value = tag.value if side not in SIDES else f"{COARSE}{str(tag.value).lstrip(COARSE)}"
+            self.state("region", str(value), self.when, tag)
+        elif side in SIDES and "near" not in tag.words and "-" not in str(tag.value):
+            self._add_direction(COARSE + SIDES[side], tag)
+        else:
+            self.state("region", str(tag.value), TARGET, tag)
+
+    def on_toward(self, tag: Tag) -> None:
+        words = str(tag.value).replace("-", " ").split()
+        heading = "".join(SIDES.get(word, "") for word in words if word in {*ROWS, *COLUMNS})
+        if heading not in COMPASS:
+            raise UnreadableError
+        self._add_direction(COARSE + heading, tag)
 
     def on_from(self, tag: Tag) -> None:
-        self.on_region(tag, CUT)
+        if self.clause.negated:
+            raise UnreadableError
+        self.state("region", str(tag.value), CUT, tag)
+
+    def on_relation(self, tag: Tag) -> None:
+        phrase = tag.value
+        assert isinstance(phrase, RelationPhrase)
+        if phrase.value == "passes" and self.near().name == "no_contact":
+            denial = self.take("no_contact")
+            self._add_event("meeting", denial, self.clause.subjects, self.find_partners(tag), False)
+            return
+        partners, kind = self.find_partners(tag), KINDS[phrase.value]
+        self.last_nouns = partners
+        if kind in CHANGES:
+            self.verb(tag._replace(name="moves"))
+        if self.clause.kind != "objects":
+            raise UnreadableError
+        when = BETWEEN if kind in CHANGES else self.when
+        self.clause.has_complement = True
+        for name in self.clause.subjects:
+            affirmed = not self.clause.negated
+            self.add(kind, [name, *partners], phrase.value, affirmed, when, tag)
+
+    def on_show(self, tag: Tag) -> None:
+        if tag.last_word not in ("has", "have", "having"):
+            raise UnreadableError
+        self.verb(tag)
+        if self.near().name in AFTER_HAVE:
+            # "Has moved" is a path up to the target; "has been near the top" is not.
+            self.clause.on_path |= self.near().name in ("moving", "slight")
+        elif possessed := self.read_possession(self.clause.subjects):
+            self._add_possession(*possessed)
+        else:
+            raise UnreadableError
+
+    def _add_possession(self, names: list[str], tag: Tag) -> None:
+        value = tag.value.value
+        self.add(KINDS[value], names, value, not self.clause.negated, self.when, tag)
+
+    def on_with(self, tag: Tag) -> None:
+        if tag.words in OF_MATERIAL and self.near().name == "word":
+            return
+        if tag.words in ("toward", "towards") and self.near().name == "object":
+            self.on_approach(tag)
+            return
+        if tag.words == "to" and self.near().name in ("moves", "be", "meet", "still", "stays"):
+            return
+        if tag.words != "with" or self.clause.negated:
+            raise UnreadableError
+        if possessed := self.read_possession(self.clause.subjects):
+            self._add_possession(*possessed)
+            return
+        self._end_predicate()
+        self.begin(self.read_subject())
+
+    def on_word(self, tag: Tag) -> None:
+        """Read the color or material in "is gray" and "of rubber"."""
+        if tag.words not in {**COLOR_WORDS, **MATERIAL_WORDS} or self.clause.negated:
+            raise UnreadableError
+        look = {**COLOR_WORDS, **MATERIAL_WORDS}[tag.words]
+        for name in self.clause.subjects:
+            named = name if look in name.split() else f"{look} {name}"
+            self.add("mention", [named], "", True, CUT, tag)
+        self.clause.said.add("mention")
+
+    def on_which(self, tag: Tag) -> None:
+        """Read a relative clause about the object before it."""
+        self.take("which")
+        outer, names = self.clause, self.last_nouns
+        if len(names) > 1 and self.near().words not in ("are", "both"):
+            names = []
+        before = self.tags[self.at - 2].name if self.at > 1 else ""
+        if outer is None or not names or before not in ("object", "comma", "relation"):
+            raise UnreadableError
+        self.clause = Clause([*names])
+        start, count = self.at, len(self.claims)
+        while self.near().name not in SEPARATORS | {"stop"} or self._continues():
+            verbs = self.clause.has_verb and self.at > start + 1
+            if verbs and self.near().name in FINITE and self.near(-1).name not in FINITE | {"not"}:
+                break
+            self.take("and")
+            current = self.near()
+            self.at += 1
+            handler = getattr(self, f"on_{current.name}", None)
+            if handler is None:
+                raise UnreadableError
+            handler(current)
+        self._end_predicate()
+        if len(self.claims) == count:
+            raise UnreadableError
+        self.clause = outer
+
+    def _continues(self) -> bool:
+        """Return whether "and" continues a relative clause, as in "which stops and rests"."""
+        return self.near().name == "and" and self.near(1).name not in {
+            *(*NOUN_STARTS, *SEPARATORS, "region", "from"),
+        }
 
     def on_direction(self, tag: Tag) -> None:
-        previous, following = self.near(-1), self.near(1)
-        if self.pair_event or previous.words == "from" or following.words in ("of", "from"):
-            return
-        if self.negated and previous.name not in DENYING:
-            return
+        self._add_direction(str(tag.value), tag)
+
+    def _add_direction(self, value: str, tag: Tag) -> None:
+        clause = self.clause
         when = self.moment
-        if when != CUT:
-            # "Toward the east, the red cube shifts slightly" describes the path to the target.
-            ahead = not self.subjects and any(t.name in ("slight", "across") for t in self.sentence)
-            when = BETWEEN if self.describes_path or ahead else EITHER
-        self.add_claim("direction", str(tag.value), not self.negated, when, tag)
+        if clause.past:
+            when = CUT
+        elif when != CUT or clause.future or clause.on_path:
+            when = BETWEEN if clause.on_path or clause.future or clause.slight else EITHER
+        self.state("direction", value, when, tag)
 
     def on_speed(self, tag: Tag) -> None:
-        following = self.near(1).name
-        moving = self.mentions_motion or following in ("moves", "moving", "across")
-        # "The red cube is quick."
-        moving |= self.near(-1).name == "be" and following in BOUNDARIES
-        if not moving or self.pair_event or following in PAIR_TAGS:
-            return
-        self.add_claim("speed", str(tag.value), not self.negated, CUT, tag)
-
-    def on_still(self, tag: Tag) -> None:
-        if "not" in tag.words.split() and self.near(1).name in ("direction", "speed"):
-            # "Does not move east" does not say that the object is still.
-            self.negated = self.mentions_motion = True
-            self.record_verb()
-            return
-        if tag.words.split()[0] in STILL_VERBS:
-            self.record_verb()
-        when = self.still_moment
-        if when != CUT and (self.staying or self.future):
-            when = BETWEEN
-        self.add_claim("still", "", not self.negated, when, tag)
-
-    def on_rest(self, tag: Tag) -> None:
-        if self.near(1).name in BOUNDARIES:
-            self.record_verb()
-        if self.near(-1).name in ("object", "and"):
-            self.on_still(tag)
+        self.state("speed", str(tag.value), CUT, tag)
 
     def on_moves(self, tag: Tag) -> None:
-        self.record_verb()
-        self.on_moving(tag)
+        self.verb(tag)
+        self.clause.moving = True
+        if self.near().name in SEPARATORS | {"stop"} and self.clause.slight is None:
+            when = BETWEEN if self.clause.future else CUT if self.moment == CUT else EITHER
+            self.state("still", "", when, tag, affirmed=False)
 
     def on_moving(self, tag: Tag) -> None:
-        self.mentions_motion = True
-        self.describes_path |= tag.words in ("moved", "traveled", "travelled", "rolled")
-        if self.negated and self.near(1).name in BOUNDARIES:
-            self.add_claim("still", "", True, self.still_moment, tag)
+        self.clause.on_path |= tag.value == "path"
+        self.on_moves(tag)
 
-    def on_off(self, tag: Tag) -> None:
-        self.mentions_motion = True
+    def on_still(self, tag: Tag) -> None:
+        if tag.words.split()[0] in STILL_VERBS:
+            self.verb(tag._replace(name="stays"))
+        if "not" in tag.words and self.near().name not in {*SEPARATORS, "stop", "region"}:
+            # "Does not move east."
+            raise UnreadableError
+        later = self.clause.staying or self.clause.future
+        when = CUT if self.moment == CUT and not later else BETWEEN if later else EITHER
+        self.state("still", "", when, tag)
 
-    def on_slight(self, tag: Tag) -> None:
-        if self.mentions_motion or self.near(1).name in ("moves", "moving", "off"):
-            self.describes_path = True
-            self.add_claim("extent", "shifts slightly", not self.negated, BETWEEN, tag)
+    def on_still_noun(self, tag: Tag) -> None:
+        noun = tag.value
+        assert isinstance(noun, Noun)
+        for name in self.last_nouns:
+            self.add("still", [name], "", True, CUT if self.moment == CUT else EITHER, tag)
 
-    def on_across(self, tag: Tag) -> None:
-        self.mentions_motion = self.describes_path = True
-        self.record_verb()
-        self.add_claim("extent", "moves across", not self.negated, BETWEEN, tag)
+    def on_stays(self, tag: Tag) -> None:
+        self.verb(tag)
+        self.clause.staying = True
 
     def on_in_place(self, tag: Tag) -> None:
-        clause = tag.words.split()[0] in ("where", "in", "as", "nearly", "almost", "roughly")
-        if not clause or self.staying:
-            self.record_verb()
-            if self.moment == CUT:
-                self.on_still(tag)
-                return
-            value = COARSE if tag.value == COARSE else "stays"
-            self.add_claim("extent", value, not self.negated, BETWEEN, tag)
+        self.verb(tag._replace(name="stays"))
+        if self.near().name not in SEPARATORS | {"stop", "region"}:
+            # "Where it is close to the sphere."
+            raise UnreadableError
+        if self.moment == CUT and not self.clause.future:
+            self.state("still", "", CUT, tag)
+        else:
+            self.state("extent", COARSE if tag.value == COARSE else "stays", BETWEEN, tag)
+
+    def on_slight(self, tag: Tag) -> None:
+        self.clause.slight = tag
+
+    def on_across(self, tag: Tag) -> None:
+        self.verb(tag)
+        self.clause.moving = self.clause.on_path = True
+        self.state("extent", "moves across", BETWEEN, tag)
+
+    # Sight.
 
     def on_leaves(self, tag: Tag) -> None:
-        self._add_crossing("leaves", tag, BOUNDARIES)
+        self.verb(tag)
+        # What has not happened by the cut may happen later.
+        past = self.clause.negated and self.moment == CUT and not self.clause.future
+        self.state(tag.name, "", CUT if past else BETWEEN, tag)
 
-    def on_enters(self, tag: Tag) -> None:
-        self._add_crossing("enters", tag, BOUNDARIES | {"region"})
-
-    def _is_single_word(self, tag: Tag) -> bool:
-        """Return whether the tag is one word: "leaves", but not "leaves the view"."""
-        return " " not in tag.words
-
-    def _add_crossing(self, kind: str, tag: Tag, ends: set[str]) -> None:
-        """Record that the subject leaves or enters the view. A single word such as "leaves" counts
-        only if a tag in `ends` follows, because it may have an object ("leaves its place")."""
-        self.record_verb()
-        if not self._is_single_word(tag) or self.near(1).name in ends:
-            # An event that has not happened by the cut may happen later.
-            when = CUT if self.negated and self.moment == CUT and not self.future else BETWEEN
-            self.add_claim(kind, "", not self.negated, when, tag)
+    on_enters = on_leaves
 
     def on_out(self, tag: Tag) -> None:
-        self._add_sight("out of view", tag)
+        self.state("sight", "out of view", self.when, tag)
 
     def on_hidden(self, tag: Tag) -> None:
-        self._add_sight("hidden", tag)
+        self.state("sight", "hidden", self.when, tag)
 
     def on_unseen(self, tag: Tag) -> None:
-        if tag.words.startswith("cannot"):
-            self.record_verb()
-        self._add_sight("unseen", tag)
+        self.state("sight", "unseen", self.when, tag)
 
-    def on_gone(self, tag: Tag) -> None:
-        words = tag.words.split()
-        if words[0] in ("is", "are"):
-            self.record_verb()
-        if words[-1] in ("view", "visible", "seen", "shown"):
-            self._add_sight("unseen", tag)
+    def on_visible(self, tag: Tag) -> None:
+        self.state("sight", "unseen", self.when, tag, affirmed=False)
 
-    def _add_sight(self, value: str, tag: Tag) -> None:
-        when = TARGET if self.future else self.moment
-        if self.past or self.near(-1).name == "by" or self._is_former():
-            when = EITHER
-        self.add_claim("sight", value, not self.negated, when, tag)
+    # Pairs.
+
+    def on_course(self, tag: Tag) -> None:
+        self.verb(tag)
+        has_partners = self.take("with") or self.near().name == "object"
+        partners = self.read_list(True) if has_partners else []
+        alone = len(self.clause.subjects) == 1 and not partners
+        value = str(tag.value)
+        self._add_event("course", tag, self.clause.subjects, partners, value=value, alone=alone)
+
+    def on_approach(self, tag: Tag) -> None:
+        self.verb(tag._replace(name="moves"))
+        partners = self.read_list(True)
+        self._add_event("course", tag, self.clause.subjects, partners, value=COARSE)
+
+    def on_meet(self, tag: Tag) -> None:
+        self.verb(tag)
+        self.take("with")
+        at_object = self.near().name in ("object", "both")
+        partners = self.read_list(True) if at_object else []
+        self._add_event("meeting", tag, self.clause.subjects, partners)
+
+    def on_no_contact(self, tag: Tag) -> None:
+        self.verb(tag._replace(name="meet"))
+        self.take("with")
+        partners = self.read_list(True) if self.near().name == "object" else []
+        self._add_event("meeting", tag, self.clause.subjects, partners, False)
+
+    def on_struck(self, tag: Tag) -> None:
+        partners = self.read_list(True) if self.take("with") else []
+        self._add_event("meeting", tag, self.clause.subjects, partners, alone=True)
+
+    def on_close(self, tag: Tag) -> None:
+        partners = self.read_list(True) if self.near().name == "object" else []
+        self._add_event("close", tag, self.clause.subjects, partners, value=str(tag.value))
+
+    def on_contact(self, tag: Tag) -> None:
+        """Read "on the verge of contact"."""
+        if self.clause.time is None:
+            raise UnreadableError
+        self._add_event("meeting", tag, self.clause.subjects, [])
+
+    def on_occurs(self, tag: Tag) -> None:
+        if self.clause.kind == "objects" and self.near().name in (
+            "from",
+            "into",
+            "speed",
+            "direction",
+        ):
+            # "Comes from near the left."
+            self.verb(tag._replace(name="moves"))
+            self.clause.moving = True
+        elif self.clause.kind != "contact":
+            raise UnreadableError
+        self.clause.has_verb = True
+
+    def on_time(self, tag: Tag) -> None:
+        clause = self.clause
+        clause.time = tag
+        if clause.event == "meeting":
+            for pair in clause.pairs:
+                self.add("time", pair, str(tag.value), True, BETWEEN, tag)
+
+    def _add_event(
+        self,
+        kind: str,
+        tag: Tag,
+        subjects: list[str],
+        partners: list[str],
+        affirmed: bool = True,
+        value: str = "",
+        alone: bool = False,
+    ) -> None:
+        """Record a claim about pairs: each subject with each partner or, without partners, both
+        subjects. With `alone`, a subject meets an object that is not named."""
+        clause = self.clause
+        if clause.kind == "none" and kind != "close" and not partners:
+            pairs: list[tuple[str, ...]] = [()]
+            affirmed = not affirmed
+        elif partners:
+            pairs = [*product(subjects, partners)]
+        else:
+            pairs = [(name,) for name in subjects] if alone else [tuple(subjects)]
+        sizes = {len({*pair}) for pair in pairs}
+        if (sizes != {2} and not alone and clause.kind != "none") or clause.kind == "all":
+            raise UnreadableError
+        affirmed = affirmed != clause.negated
+        limited = self.moment == TARGET and not affirmed
+        if kind == "close":
+            when = TARGET if clause.future or self.moment == TARGET else self.moment
+        elif self.moment == CUT and not clause.future:
+            when = CUT
+        else:
+            when = TARGET if limited else BETWEEN
+        for pair in pairs:
+            self.add(kind, pair, value, affirmed, when, tag)
+            if clause.time and affirmed and kind == "meeting":
+                self.add("time", pair, str(clause.time.value), True, BETWEEN, clause.time)
+        clause.event, clause.pairs = kind, pairs if affirmed else []
+        clause.has_complement = bool(partners)
+
+    def _add_close_region(self, tag: Tag) -> None:
+        """Record the region of a close pair, as in "they are very close near the top"."""
+        if len(self.clause.pairs) != 1:
+            raise UnreadableError
+        when = TARGET if self.moment == TARGET or self.clause.future else EITHER
+        after_object = self.near(-2).name != "close"
+        kind = "place of either" if after_object else "close region"
+        self.add(kind, self.clause.pairs[0], str(tag.value), True, when, tag)

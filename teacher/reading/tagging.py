@@ -8,7 +8,7 @@ these prepositions), "relation" ("left of the red cube"), "candidate" (a letter)
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from data.records import COLORS, LETTERS, MATERIALS, SHAPES
@@ -17,20 +17,16 @@ from teacher.predicates.relations import KINDS
 from teacher.reading.phrases import COARSE, PHRASES_BY_FIRST_WORD
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")
-ARTICLES = {"the", "a", "an", "its", "their", "that", "this", "some", "any", "another", "such"}
+ARTICLES = {"the", "a", "an", "its", "their", "that", "this"}
 STILL_WORDS = {"stationary", "still", "resting", "motionless", "static", "unmoving"}
-QUALITIES = STILL_WORDS | {
-    *("moving", "rolling", "fast", "slow", "quick", "incoming", "approaching", "colliding"),
-    *("struck", "hidden", "visible", "nearby", "distant", "lone", "only", "same", "remaining"),
-    "other",
-}
-"""Adjectives that may precede the color of an object, as in "the moving red cube"."""
+QUALITIES = STILL_WORDS | {"moving", "same", "only"}
+"""Adjectives that may precede the color of an object, as in "the stationary red cube"."""
 CANDIDATES = frozenset(LETTERS)
 AFTER_ARTICLE = {
     *("pair", "collision", "contact", "course", "slight", "short", "layout", "scene", "motion"),
 }
 """Words that follow the article "A", besides adjectives of objects; else "A" is a candidate."""
-LABELS = {"candidate", "candidates", "image", "images", "option", "options", "layout", "answer"}
+LABELS = {"candidate", "candidates", "image", "images", "option", "options"}
 """Nouns for a candidate, which have no tag. An "A" after one of them is a candidate's letter."""
 PUNCTUATION = {
     **dict.fromkeys(".!?", "stop"),
@@ -65,7 +61,7 @@ PREPOSITIONS = {
 """Prepositions that may begin a region."""
 REGION_TAGS = {"to": "into", "towards": "toward"} | {w: w for w in ("into", "from", "toward")}
 """The tag of a region after these prepositions; after others, the tag is "region"."""
-PRONOUNS = {"it", "them"}
+PRONOUNS = {"it", "itself", "them"}
 """Pronouns for the other object of a relation."""
 PLACED = {
     *("is", "are", "be", "was", "were", "been", "will", "not", "as"),
@@ -85,7 +81,7 @@ ALONE = {"extreme", "edge"}
 """Kinds of relations without other objects."""
 IMAGE_NOUNS = {"view", "scene", "image", "frame", "picture", "screen", "field"}
 REGION_FILLERS = {"the", "its", "very", "far", "area", "region", "near", "same", "around", "of"}
-REGION_STARTS = {*PREPOSITIONS, *ROWS, *COLUMNS, *MIDDLE, "the"}
+REGION_STARTS = {*PREPOSITIONS, *ROWS, *COLUMNS, *MIDDLE, "the", "close", "very"}
 LOOKS = {*COLOR_WORDS, *MATERIAL_WORDS, *SHAPE_WORDS, *PLURALS}
 NOUN_STARTS = ARTICLES | QUALITIES | LOOKS
 ADJECTIVES = LOOKS | QUALITIES - {"still", "only", "same"}
@@ -98,14 +94,13 @@ class Name(str):
 
 class Noun(NamedTuple):
     """The attributes that a noun phrase states ("" if it does not state one). `still` is true for
-    "the stationary red cube", `is_other` for "another cube"."""
+    "the stationary red cube"."""
 
     color: str
     material: str
     shape: str
     plural: bool
     still: bool
-    is_other: bool
 
     @property
     def phrase(self) -> str:
@@ -146,38 +141,8 @@ class Tag(NamedTuple):
         return self.words.split()[-1] if self.words else ""
 
 
-BOUNDARIES = {"comma", "semicolon", "and", "break", "stop"}
-"""Names of tags that may end a clause."""
 END = Tag("stop", "", 0, 0, "")
-"""Stands for the tag at any index outside a sentence."""
-
-
-class Sentence:
-    """The tags of a sentence; an index outside it returns END."""
-
-    def __init__(self, text: str, tags: Sequence[Tag]) -> None:
-        """`text`: the text of which `start` and `stop` of the tags are positions."""
-        self.text = text
-        self.tags = tags
-
-    def __getitem__(self, index: int) -> Tag:
-        return self.tags[index] if 0 <= index < len(self.tags) else END
-
-    def __iter__(self) -> Iterator[Tag]:
-        return iter(self.tags)
-
-    def skip(self, index: int, skipped: Container[str], step: int = 1) -> int:
-        """Return the index of the first tag whose name is not in `skipped`, from `index` on in
-        steps of `step` (1 or -1). If there is none, the index is outside the sentence."""
-        while 0 <= index < len(self.tags) and self.tags[index].name in skipped:
-            index += step
-        return index
-
-    def find(self, index: int, wanted: Container[str], step: int = 1) -> int:
-        """Return the index of the first tag whose name is in `wanted`; see `skip`."""
-        while 0 <= index < len(self.tags) and self.tags[index].name not in wanted:
-            index += step
-        return index
+"""Stands for the tag after the last one of a sentence."""
 
 
 def find_tags(text: str, start: int, stop: int, names: Iterable[str] = ()) -> list[Tag]:
@@ -276,12 +241,9 @@ def _is_article(words: list[str], letter: str, i: int) -> bool:
 
 def _find_noun(words: list[str], i: int) -> Found | None:
     """Return the noun phrase at word i, such as "the stationary red cube", if there is one."""
-    still = is_other = False
+    still = False
     while words[i] in ARTICLES or words[i] in QUALITIES:
         still |= words[i] in STILL_WORDS
-        is_other |= words[i] in ("other", "another", "remaining")
-        i += 1
-    if words[i] in ("two", "both"):
         i += 1
     color = COLOR_WORDS.get(words[i], "")
     i += bool(color)
@@ -292,7 +254,7 @@ def _find_noun(words: list[str], i: int) -> Found | None:
         shape = words[i]
     if shape is None or not (color or material or shape):
         return None
-    return "object", Noun(color, material, shape, words[i] in PLURALS, still, is_other), i + 1
+    return "object", Noun(color, material, shape, words[i] in PLURALS, still), i + 1
 
 
 def _find_relation(words: list[str], begin: int, i: int, value: str) -> Found | None:
@@ -323,6 +285,8 @@ def _find_relation(words: list[str], begin: int, i: int, value: str) -> Found | 
 def _find_region(words: list[str], i: int) -> Found | None:
     """Return the region at word i, such as "to the upper left corner", if there is one."""
     begin, name = i, "region"
+    for opening in (["very", "close", "to"], ["close", "to"]):
+        i += len(opening) * (words[i : i + len(opening)] == opening)
     while words[i] in PREPOSITIONS:
         name = REGION_TAGS.get(words[i], name)
         i += 1

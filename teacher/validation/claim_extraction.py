@@ -8,10 +8,10 @@ The package `teacher.reading` describes the steps.
 from __future__ import annotations
 
 from teacher.predicates.facts import Predicates
-from teacher.reading.candidates import CandidateReader
+from teacher.reading.candidates import CandidateReader, read_answer
 from teacher.reading.claims import CUT, EITHER, TARGET, Claim, IndexedPredicates
 from teacher.reading.scenes import SceneReader
-from teacher.reading.tagging import Sentence, Tag, find_tags
+from teacher.reading.tagging import Tag, find_tags
 from teacher.sections import split_sections
 
 MOMENTS = {
@@ -22,45 +22,33 @@ MOMENTS = {
 }
 """The moment that the present tense of a section refers to."""
 
-MAX_SENTENCE_TAGS = 250
-"""Maximum number of tags of a sentence (see `teacher.reading.tagging`); a longer one is split."""
-
 
 def extract_claims(text: str, predicates: Predicates) -> tuple[Claim, ...]:
     """Return the claims of a rationale in text order, each with its verdict; never raises."""
     indexed = IndexedPredicates(predicates)
     names = [*indexed.objects, *indexed.extras]
+    known: list[str] = []
     claims: list[Claim] = []
     for name, start, stop in split_sections(text):
         if name == "Answer":
-            claims += _extract_answer(text, start, stop)
+            claims += read_answer(text, start, stop)
             continue
-        scene = SceneReader(indexed, MOMENTS.get(name, EITHER))
-        candidates = CandidateReader(indexed, keeps_topic=name == "Candidate analysis")
+        scene = SceneReader(indexed, MOMENTS.get(name, EITHER), known)
+        candidates = CandidateReader(indexed, name == "Candidate analysis", known)
         for tags in _split_sentences(find_tags(text, start, stop, names)):
             names_candidate = any(tag.name == "candidate" for tag in tags)
             if name == "Candidate analysis" or (name == "Outcome" and names_candidate):
-                claims += candidates.read(Sentence(text, tags))
+                claims += candidates.read(tags)
             else:
-                claims += scene.read(Sentence(text, tags))
+                claims += scene.read(tags)
     claims.sort(key=lambda claim: claim.span)
-    return tuple(claim._replace(verdict=indexed.verdict(claim)) for claim in claims)
-
-
-def _extract_answer(text: str, start: int, stop: int) -> list[Claim]:
-    letter = text[start:stop].strip()
-    if len(letter) != 1:
-        return []
-    position = text.index(letter, start)
-    return [Claim("agrees", (), "", True, TARGET, letter, (position, position + 1))]
+    return tuple(map(indexed.judge, claims))
 
 
 def _split_sentences(section: list[Tag]) -> list[list[Tag]]:
-    """Split a section into sentences of at most MAX_SENTENCE_TAGS tags. Readers look ahead to the
-    end of a sentence, so this bound keeps their time linear in the length of the text."""
     sentences: list[list[Tag]] = [[]]
     for tag in section:
         sentences[-1].append(tag)
-        if tag.name == "stop" or len(sentences[-1]) >= MAX_SENTENCE_TAGS:
+        if tag.name == "stop":
             sentences.append([])
-    return [s for s in sentences if s]
+    return [s for s in sentences if any(tag.name != "stop" for tag in s)]

@@ -112,6 +112,8 @@ class RationaleGrader:
         settings = [cfg.min_words, cfg.max_words]
         if cfg.predicates == "relational" or cfg.sufficient or cfg.bounds != RelationBounds():
             settings += [cfg.sufficient, *astuple(cfg.bounds)]
+        if not cfg.strict:
+            settings.append("lenient")
         if cfg.url is not None:
             settings += [cfg.model, cfg.temperature, cfg.top_p, cfg.top_k, cfg.max_tokens]
         if cfg.grammar:

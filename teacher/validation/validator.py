@@ -17,7 +17,9 @@ from teacher.validation.claim_extraction import extract_claims
 if TYPE_CHECKING:
     from conf.schema import TeacherConfig
 
-VALIDATOR_VERSION = "8"
+VALIDATOR_VERSION = "9"
+MAX_QUOTED = 80
+"""Maximum number of characters of a sentence in a reason."""
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")
 WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")
 """A word; hyphens and apostrophes join words, so "top-left" counts as one."""
@@ -52,7 +54,8 @@ def validate_rationale(
     text: str, predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
 ) -> Validation:
     """Check a rationale against its item, and collect every reason to reject it."""
-    reasons = [f"number: {text[start:stop]!r}" for start, stop in find_numbers(text)]
+    numbers = [*find_numbers(text)]
+    reasons = [f"number: {text[start:stop]!r}" for start, stop in numbers]
     words = len(WORD.findall(text))
     if words < cfg.min_words:
         reasons.append("too short")
@@ -65,6 +68,11 @@ def validate_rationale(
         reasons.append(f"wrong answer: {answer}")
     claims = extract_claims(text, predicates)
     reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
+    if cfg.strict:
+        for start, stop in (c.span for c in claims if c.kind == "unreadable"):
+            # A number has a reason of its own.
+            if not any(start <= number < stop for number, _ in numbers):
+                reasons.append(f"unreadable: {text[start : min(stop, start + MAX_QUOTED)]!r}")
     return Validation(tuple(reasons), sections, answer, claims)
 
 

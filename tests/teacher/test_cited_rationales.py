@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -103,7 +104,9 @@ def change(section: str, sentence: dict[str, Any]) -> Callable[[Cited], None]:
         (change("Candidate analysis", {"text": "{}", "facts": ["B"]}), "candidates out of order"),
         (lambda cited: cited.pop("Outcome"), "not a cited rationale"),
         (lambda cited: cited.update(Extra=[]), "not a cited rationale"),
-        (change("Outcome", {"text": "{x} {}", "facts": ["r1"]}), "outside slots"),
+        (change("Outcome", {"text": "{x} {}", "facts": ["r1"]}), "not a cited rationale"),
+        (change("Outcome", {"text": "so it is", "facts": ["r1"]}), "not a cited rationale"),
+        (change("Outcome", {"text": f"so {'so ' * 20}{{}}", "facts": ["r1"]}), "not a cited"),
     ],
 )
 def test_response_that_states_more_than_its_facts_is_refused(
@@ -117,6 +120,16 @@ def test_response_that_states_more_than_its_facts_is_refused(
         compose_rationale(json.dumps(cited), facts, "A")
     with pytest.raises(CitationError, match="not JSON"):
         compose_rationale("Sure! {", facts, "A")
+
+
+def test_the_schema_allows_no_sentence_without_a_slot() -> None:
+    """A server that honours the schema then cannot return one."""
+    for sentences in cited_schema()["properties"].values():
+        pattern = re.compile(sentences["items"]["properties"]["text"]["pattern"])
+        for text in ("{}", "so {} and {}", "{}{}{}", f"{'a' * 40}{{}}{'a' * 40}"):
+            assert pattern.search(text)
+        for text in ("", "it follows", "{}{}{}{}", "{", "{a}", "{}}", f"{'a' * 41}{{}}"):
+            assert not pattern.search(text)
 
 
 def test_server_is_asked_for_cited_rationales(

