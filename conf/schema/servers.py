@@ -220,5 +220,5 @@ class TeacherConfig(ServersConfig):
         if self.form == "cited" and self.grammar:
             yield (
                 f"{group}form=cited and {group}grammar=true: cited responses have a JSON schema of "
-                "their own; leave out grammar"
+                f"their own; leave out grammar, or set {group}form=free"
             )
