@@ -19,7 +19,7 @@ from conf.proxies import proxy_hint
 from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageCommand
 from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
 from evaluation.generators.response_schema import build_record_schema
-from models.fingerprints import processor_digest, weights_digest
+from models.fingerprints import find_commit, processor_digest, weights_digest
 from models.student.chat_requests import (
     build_messages,
     find_difference,
@@ -79,8 +79,9 @@ class ServedModel:
             )
         weights = product_folder(folder, "student") if folder else None
         self._processor_source = str(weights or student.model)
-        # Of the servers that report where weights come from, vLLM reports token ids too.
-        self._compares = origin["root"] is not None
+        # vLLM, which takes clips and reports token ids, is the server that reports where weights
+        # come from.
+        self._is_vllm = self._compares = origin["root"] is not None
         source = origin["parent"] or origin["root"]
         if source is None or not Path(source).is_dir():
             log.info(
@@ -187,7 +188,8 @@ class ServedModel:
         if processor is not None and not takes_clips(processor):
             return with_images
         messages, extra = with_video(blank)
-        if blank.clip and not await pool.takes(messages, max_tokens=1, extra_body=extra):
+        is_asked = blank.clip and not self._is_vllm
+        if is_asked and not await pool.takes(messages, max_tokens=1, extra_body=extra):
             log.warning(
                 "the server takes no videos in vLLM's format: the frames of a prefix are sent as "
                 "images, each after its time, which is another prompt than that of a local model"
@@ -205,11 +207,13 @@ class ServedModel:
             from models.compat import write_clips_as_released
             from models.loading import pin_sizes
 
-            origin = {"revision": student.revision, "trust_remote_code": student.trust_remote_code}
-            processor = AutoProcessor.from_pretrained(
-                source, **({} if Path(source).is_dir() else origin)
-            )
-        except (ImportError, OSError, ValueError, KeyError) as error:
+            origin = {"trust_remote_code": student.trust_remote_code}
+            if not Path(source).is_dir():
+                # Loading would ask a hub that does not answer again and again.
+                origin["revision"] = find_commit(source, student.revision)
+            processor = AutoProcessor.from_pretrained(source, **origin)
+        except Exception as error:
+            # The hub's client raises the errors of whichever HTTP library is installed.
             reason = str(error).partition("\n")[0]
             log.info("prompts are not compared with a local model's, which is missing: %s", reason)
             return None

@@ -202,6 +202,8 @@ def test_a_server_that_refuses_clips_gets_their_frames_as_images(
         return {"status": 400, "message": "video input is not supported"} if clip else FULL
 
     server = start_server(refuse)
+    # vLLM reports where weights come from.
+    server.root = None
     responder(config_of(server, concurrency=1), frames)(items, lambda _: None)
     assert "the server takes no videos" in caplog.text
     requests = server.requests[-len(items) :]

@@ -170,9 +170,9 @@ def test_transformers_alone_computes_the_same_logits(
     compat.keep_differentiable(model)
     encoded = encode(sample, processor, 1500)
     assert ids[0].tolist() == encoded.input_ids
-    types = torch.tensor([encoded.mm_token_type_ids])
+    types = {name: torch.tensor([values]) for name, values in encoded.token_types.items()}
     with torch.no_grad():
-        expected = model(input_ids=ids, mm_token_type_ids=types, **encoded.media).logits
+        expected = model(input_ids=ids, **types, **encoded.media).logits
     torch.testing.assert_close(logits, expected, atol=1e-4, rtol=1e-4)
 
 
