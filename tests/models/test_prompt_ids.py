@@ -13,7 +13,7 @@ from data.records import FPS
 from models.compat import write_clips_as_released
 from models.student.collator import Encoded, encode
 from models.student.prompts import Clip, Sample, build_sample, selection_sample
-from tests.models.families import (
+from tests.families import (
     QWEN3_5_TEMPLATE,
     QWEN3_VL_TEMPLATE,
     QWEN3_VL_THINKING_TEMPLATE,

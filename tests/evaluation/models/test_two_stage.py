@@ -34,7 +34,7 @@ from evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
 from tests.evaluation.metrics.reference import matrix_metrics
 from tests.evaluation.models import released
 from tests.evaluation.models.conftest import NO_LORA, STUDENT, check_resumed, new_run, tear
-from tests.families import sentence_encoder
+from tests.saved_retrievers import sentence_encoder
 from tests.user_errors import raises_user_error
 
 SERVED = StudentConfig(name="any", model="any", image_size=96, max_new_tokens=40)

@@ -21,7 +21,8 @@ from data import store
 from data.store import load_rows, save_rows, with_checksum
 from models.parameter_counts import check_parameter_counts, count_parameters
 from models.retriever.embedder import load_retriever
-from tests.families import qwen2_5_vl, sentence_encoder
+from tests.families import save_family
+from tests.saved_retrievers import sentence_encoder
 from tests.user_errors import raises_user_error
 from train import contrastive
 
@@ -136,7 +137,7 @@ def test_a_multi_vector_base_with_modules_after_its_backbone_is_refused(
 
 
 def test_a_multi_vector_base_of_another_family_is_refused(contrastive_settings, tmp_path) -> None:
-    qwen2_5_vl(tmp_path / "base")
+    save_family("qwen2_5_vl", [], tmp_path / "base")
     late = train_adapters_over(contrastive_settings, tmp_path / "base")
     late.retriever.late = LateConfig(width=8)
     assert_refused(late, tmp_path / "run", "qwen2_5_vl", "retriever.late=null")
@@ -176,7 +177,7 @@ def test_the_processor_of_another_model_is_refused(
     contrastive_settings, saved_base, tmp_path
 ) -> None:
     other = tmp_path / "other"
-    qwen2_5_vl(other)
+    save_family("qwen2_5_vl", [], other)
     for file in ("processor_config.json", "tokenizer.json", "tokenizer_config.json"):
         shutil.copy(Path(saved_base) / file, other)
     settings = train_adapters_over(contrastive_settings, other)
@@ -187,7 +188,7 @@ def test_the_weights_of_another_model_are_refused(
     contrastive_settings, saved_base, tmp_path
 ) -> None:
     other = tmp_path / "other"
-    qwen2_5_vl(other)
+    save_family("qwen2_5_vl", [], other)
     shutil.copy(Path(saved_base) / "model.safetensors", other)
     settings = train_adapters_over(contrastive_settings, other)
     assert_refused(settings, tmp_path / "run", str(other))

@@ -22,7 +22,7 @@ from models import loading
 from models.student.chat_format import find_end_token, write_prompt
 from models.student.collator import IGNORED, Collator, encode
 from models.student.prompts import Sample, selection_sample
-from tests.models.families import FAMILIES, IMAGE_SIZE, save_family
+from tests.families import FAMILIES, IMAGE_SIZE, save_family
 from tests.train.common.test_resume import check_same_weights
 from train import export, sft
 from train.student.dataset import tokenizer_corpus
