@@ -152,7 +152,7 @@ def prepare_processor(backbone: Transformer, cfg: RetrieverConfig, source: str) 
     """Let the processor of a retriever's backbone give frames one size, and read inputs whole.
     Raise UserError if it is the processor of another model."""
     processor, kind, own = backbone.processor, backbone.config.model_type, {}
-    if kind.startswith("qwen") and "message" in backbone.modality_config:
+    if kind.startswith("qwen") and hasattr(backbone.config, "vision_config"):
         check_processor("retriever", source, backbone.config, processor)
         write_clips_as_released(processor)
         pin_sizes(processor, cfg.image_size, cfg.frames)

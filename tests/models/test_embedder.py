@@ -15,9 +15,9 @@ from conf.schema.benchmark import POOLS
 from data.items.database import UniqueFrames
 from data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
 from models.compat import keep_differentiable
-from models.parameter_counts import count_parameters
 from models.retriever import embedder
 from models.retriever.inputs import frame_input, query_input
+from models.towers import count_parameters
 from tests.user_errors import raises_user_error
 from train.common.audit import audit_retriever
 from train.retriever.evaluator import (

@@ -16,9 +16,9 @@ from transformers import AutoModelForImageTextToText, AutoProcessor
 from conf.compose import compose
 from conf.schema import SftCommand
 from models import compat, loading
-from models.parameter_counts import check_parameter_counts, count_parameters
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
+from models.towers import check_parameter_counts, count_parameters
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 from train.student.trainer import token_mean

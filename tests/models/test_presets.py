@@ -34,11 +34,10 @@ from conf.schema import LoraConfig, SftCommand, StudentConfig, TeacherConfig
 from data.frames.frame_cache import FrameReader
 from data.records import FPS, sample_prefix_frames
 from models import loading
-from models.parameter_counts import check_parameter_counts, count_parameters
 from models.student.collator import Collator, encode
 from models.student.prompts import Clip, Sample, build_response, build_sample, selection_sample
+from models.towers import check_parameter_counts, count_parameters
 from teacher.narrate import ensure_rationales
-from teacher.validation.claim_extraction import MAX_SENTENCE_TAGS
 from tests.user_errors import raises_user_error
 from train.common.audit import audit_student
 from train.student.dataset import supervised_items
@@ -318,9 +317,9 @@ def test_the_longest_rationale_fits_and_the_audit_needs_no_weights(
     supervised = supervised_items(micro_store, items, rationales, regime, teacher)["reasoning"]
     longest = max(supervised, key=lambda s: len(s.text))
     words = longest.rationale.split()
-    more = " ".join((words * MAX_SENTENCE_TAGS)[: MAX_SENTENCE_TAGS - len(words)])
+    more = " ".join((words * 250)[: 250 - len(words)])
     rationale = f"{more}\n{longest.rationale}"
-    assert len(rationale.split()) == MAX_SENTENCE_TAGS
+    assert len(rationale.split()) == 250
     target = build_response(rationale, longest.matches, longest.item.letter, "reasoning", regime)
     frames = FrameReader(micro_store, cfg.image_size)
     sample = selection_sample(longest.item, "reasoning", regime, frames, cfg.frames, target)

@@ -16,11 +16,11 @@ from conf.schema import RetrieverConfig, StudentConfig
 from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
 from models.checks import check_widths
-from models.parameter_counts import check_parameter_counts, count_parameters
 from models.retriever.inputs import Retriever, model_inputs, preprocess
 from models.retriever.multi_vector import find_scored_tokens
 from models.student.collator import IGNORED, Collator
 from models.student.prompts import Sample
+from models.towers import check_parameter_counts, count_parameters
 
 
 def audit_student(

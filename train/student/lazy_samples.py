@@ -13,6 +13,9 @@ from transformers import ProcessorMixin
 from models.student.collator import encode
 from models.student.prompts import Sample, build_sample
 
+LABEL_TOKENS = 6
+"""Number of text tokens before each image or pair of video frames."""
+
 
 @dataclass(frozen=True)
 class LazySample:
@@ -72,11 +75,11 @@ class StudentDataset(Dataset):
 
 
 def count_picture_tokens(processor: ProcessorMixin, image_size: int) -> int:
-    """Return the number of tokens of an image of `image_size` px in a prompt."""
+    """Return the number of tokens of an image of `image_size` px in a prompt, with its label."""
     image = np.zeros((image_size, image_size, 3), np.uint8)
     prompts = [build_sample("", ["text", *images], None) for images in ([], [image])]
     without, with_image = (len(encode(p, processor, None).input_ids) for p in prompts)
-    return with_image - without
+    return with_image - without + LABEL_TOKENS
 
 
 def seeded_rng(*keys: int | str) -> np.random.Generator:

@@ -149,6 +149,7 @@ class Writer(nn.Module):
     """A model that generates given texts."""
 
     config = Qwen3VLConfig()
+    generation_config = None
 
     def __init__(self, processor: ProcessorMixin, texts: list[str]) -> None:
         super().__init__()

@@ -19,8 +19,8 @@ from conf.errors import UserError
 from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
 from data import store
 from data.store import load_rows, save_rows, with_checksum
-from models.parameter_counts import check_parameter_counts, count_parameters
 from models.retriever.embedder import load_retriever
+from models.towers import check_parameter_counts, count_parameters
 from tests.families import save_family
 from tests.saved_retrievers import sentence_encoder
 from tests.user_errors import raises_user_error
