@@ -108,7 +108,10 @@ def plan_retriever(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]
         *overrides(settings, folder),
         f"retriever.image_size={retriever.image_size}",
         f"retriever.frames={retriever.frames}",
+        f"retriever.max_length={retriever.max_length}",
         f"retriever.widths={retriever.widths}",
+        f'retriever.query_instruction="{retriever.query_instruction}"',
+        f'retriever.frame_instruction="{retriever.frame_instruction}"',
     ]
     plan = {"trainer": "contrastive", "fsdp": False, "checkpoint": None, "failing_rank": None}
     return {**plan, "overrides": command, "folder": folder}
@@ -147,9 +150,10 @@ def check_same_weights(
 ) -> None:
     weights = [load_file(f / name) for f in (one, two)]
     assert weights[0].keys() == weights[1].keys()
+    # Where a gradient is near 0, Adam scales its rounding up: to 1% of a step of the learning rate.
     for name, weight in weights[0].items():
         # Ranks sum gradients in another order, which changes the rounding in fp32.
-        torch.testing.assert_close(weight, weights[1][name], atol=5e-6, rtol=1e-5)
+        torch.testing.assert_close(weight, weights[1][name], atol=2e-5, rtol=1e-5)
 
 
 def error_lines(ended: subprocess.CompletedProcess[str]) -> list[str]:
