@@ -7,6 +7,7 @@ Qwen do. Otherwise its frames go in as images, each after its time as text.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 from transformers import ProcessorMixin, Qwen2_5_VLProcessor, Qwen3VLProcessor
@@ -32,7 +33,7 @@ def write_prompt(sample: Sample, processor: ProcessorMixin, thinking: bool) -> s
     Without `thinking`, a prompt of a model that always thinks ends with an empty thought.
     """
     content = sample.content
-    if sample.images and not _keeps_order(processor):
+    if sample.images and not _keeps_order(processor, str(processor.chat_template)):
         texts = [p["text"] if p["type"] == "text" else processor.image_token for p in content]
         content = [{"type": "text", "text": "".join(texts)}]
     # A variable that the template does not use would be passed on to the processor.
@@ -52,6 +53,12 @@ def find_end_token(processor: ProcessorMixin) -> int:
 
     It need not be the tokenizer's `eos_token`: Gemma ends a turn with `<end_of_turn>`.
     """
+    return _find_end_token(processor, str(processor.chat_template))
+
+
+# Every sample of a training needs the end token and the order, which take longer than its text.
+@lru_cache(maxsize=8)
+def _find_end_token(processor: ProcessorMixin, _template: str) -> int:
     response = "response"
     turn = {"role": "assistant", "content": [{"type": "text", "text": response}]}
     text = _render(processor, [{"type": "text", "text": "prompt"}], turn)
@@ -61,7 +68,8 @@ def find_end_token(processor: ProcessorMixin) -> int:
     return next((token for token in ids if token in special), tokenizer.eos_token_id)
 
 
-def _keeps_order(processor: ProcessorMixin) -> bool:
+@lru_cache(maxsize=8)
+def _keeps_order(processor: ProcessorMixin, _template: str) -> bool:
     """Return whether the template writes texts and images in the order of a message's parts."""
     text = _render(processor, [{"type": "text", "text": "first"}, {"type": "image"}])
     return text.find("first") < text.find(processor.image_token)
