@@ -9,7 +9,7 @@
         embeddings/          cache of embeddings of frames and queries
         rationales.jsonl     every response of a teacher
         rationales.parquet   accepted rationales of the last narration
-        observer-1/          results of simulated observers
+        observer-2/          results of simulated observers
         checked.json         sizes and times of the files at the last check
 
 The manifest does not cover the last six, which may change after the build.

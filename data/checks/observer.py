@@ -10,8 +10,9 @@ the errors of the frames in which an object is visible, since its last contact i
 object with fewer than two such frames is known exactly. Objects that no frame of the prefix shows
 take part in the simulation, but their places are not compared.
 
-From the exact state, the observer that simulates is right, except where objects touch at the end of
-the prefix: Bullet keeps contacts from step to step, and a simulation that starts there may stray.
+From the exact state, the observer that simulates is right. It starts at the last frame of the
+prefix in which no objects touch: Bullet keeps contacts from step to step, a stored state lacks
+them, and a simulation from within a contact may stray.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from conf.runs import lock_file
 from conf.schema import WorldConfig
 from conf.schema.settings import from_dict
 from data.items.futures.simulation import scene_states, simulate_futures
+from data.oracle.contacts import touching_pairs
 from data.oracle.displacement import DIAGONAL, MODEL_SIZE, visible_positions
 from data.parallel import Workers, batched
 from data.records import Scene, SelectionItem, sample_prefix_frames
@@ -43,7 +45,7 @@ ERRORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 DRAWS = 8
 """Number of draws of the errors for each item."""
 OBSERVERS = SIMULATES, EXTRAPOLATES = "simulates", "extrapolates"
-OBSERVER_FOLDER = "observer-1"
+OBSERVER_FOLDER = "observer-2"
 """Folder of a store with the results. Its number rises when the results would change."""
 CHUNK = 25
 """Number of items in one file of results."""
@@ -136,9 +138,13 @@ def observe_item(
     shown = sample_prefix_frames(item.prefix_start, stop, config["prefix_frames"])
     unit = np.array([sample_fit_errors(scene, shown, rng) for _ in range(draws)])
     scaled = np.concatenate([np.zeros((1, *unit.shape[1:])), *(e * unit for e in errors)])
-    states = scene_states(scene)[stop] + ground_errors(scene, stop, scaled, camera)
-    branches = [Branch(own) for own in states.astype(float)]
-    motions = simulate_futures(scene, stop, item.target_frame, branches, world)
+    exact = scene_states(scene).astype(float)
+    states = exact[stop] + ground_errors(scene, stop, scaled, camera)
+    apart = last_frame_apart(scene, stop)
+    motions = [
+        *simulate_futures(scene, apart, item.target_frame, [Branch(exact[apart])], world),
+        *simulate_futures(scene, stop, item.target_frame, [*map(Branch, states[1:])], world),
+    ]
     seconds = (item.target_frame - stop) / scene.fps
     predictions = {
         SIMULATES: np.stack([motion.positions[-1] for motion in motions]),
@@ -153,6 +159,12 @@ def observe_item(
         credit = nearest[:, item.answer] / nearest.sum(axis=1)
         right[observer] = np.append(credit[:1].repeat(draws), credit[1:]).reshape(-1, draws)
     return right
+
+
+def last_frame_apart(scene: Scene, stop: int) -> int:
+    """Return the last frame up to `stop` in which no objects touch, or the scene's first frame."""
+    frames = range(stop, 0, -1)
+    return next((frame for frame in frames if not touching_pairs(scene, frame, frame)), 0)
 
 
 def sample_fit_errors(scene: Scene, shown: Sequence[int], rng: np.random.Generator) -> np.ndarray:
