@@ -56,27 +56,27 @@ class AddedInPlace(LoraVariant):
         return result.to(scaled.dtype).addmm_(scaled, b.to(scaled.dtype))
 
 
-class RowsLinear(Linear):
-    """A linear layer with adapters that flattens its input to (rows, features): the base layer's
-    output is then not a view, and autograd allows changing it in place without a copy."""
+class Rows:
+    """Mixin for a linear layer with adapters that flattens its input to (rows, features): the base
+    layer's output is then not a view, and autograd allows changing it in place without a copy."""
 
     def forward(self, x: torch.Tensor, *args: Any, **settings: Any) -> torch.Tensor:
-        rows = super().forward(x.flatten(0, -2), *args, **settings)
-        return rows.unflatten(0, x.shape[:-1])
-
-
-class RowsLinear4bit(Linear4bit):
-    """`RowsLinear` for a 4-bit layer. It uses the `forward` of unquantised layers, which copies
-    nothing."""
-
-    def forward(self, x: torch.Tensor, *args: Any, **settings: Any) -> torch.Tensor:
+        # Unlike that of 4-bit layers, the `forward` of unquantised layers copies nothing.
         rows = Linear.forward(self, x.flatten(0, -2), *args, **settings)
         return rows.unflatten(0, x.shape[:-1])
 
     def _cast_input_dtype(self, x: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-        # With autocast a cast is useless, because autocast would undo it.
+        # Autocast would undo the cast to the adapters' type, and each layer would keep a copy.
         enabled = torch.is_autocast_enabled(x.device.type)
         return x if enabled else super()._cast_input_dtype(x, dtype)
+
+
+class RowsLinear(Rows, Linear):
+    """An unquantised layer."""
+
+
+class RowsLinear4bit(Rows, Linear4bit):
+    """A 4-bit layer."""
 
 
 FUSED = {nn.Conv3d: PatchProduct, Linear: RowsLinear, Linear4bit: RowsLinear4bit}

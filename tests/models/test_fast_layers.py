@@ -12,7 +12,7 @@ from torch import nn
 
 from conf.schema import LoraConfig
 from models import loading
-from models.fast_layers import AddedInPlace, PatchProduct, use_fast_layers
+from models.fast_layers import AddedInPlace, PatchProduct, RowsLinear, use_fast_layers
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
 from tests.tiny_models import randomize_adapters
@@ -77,6 +77,33 @@ def test_fused_operations_round_no_more_in_bf16(student) -> None:
     plain = difference()
     use_fast_layers(model)
     assert difference() <= max(2 * plain, 2e-2 * exact.item())
+
+
+def test_layers_of_a_bf16_base_keep_their_input_once_and_cast_no_activation() -> None:
+    """Linear layers with the same input, as those of queries and keys, save it once together."""
+    projections = nn.ModuleDict({name: nn.Linear(32, 48) for name in ("q_proj", "k_proj")})
+    config = peft.LoraConfig(r=4, target_modules=["q_proj", "k_proj"])
+    adapted = peft.get_peft_model(nn.Sequential(projections).bfloat16(), config)
+    use_fast_layers(adapted)
+    layers = [m for m in adapted.modules() if isinstance(m, RowsLinear)]
+    assert len(layers) == 2
+    assert all(layer.lora_A["default"].weight.dtype == torch.float32 for layer in layers)
+    x = torch.randn(2, 5, 32, dtype=torch.bfloat16, requires_grad=True)
+    saved: list[torch.Tensor] = []
+
+    def keep(tensor: torch.Tensor) -> torch.Tensor:
+        saved.append(tensor)
+        return tensor
+
+    with (
+        torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor),
+        torch.autocast("cpu", torch.bfloat16),
+    ):
+        outputs = [layer(x) for layer in layers]
+    assert {output.dtype for output in outputs} == {torch.bfloat16}
+    rows = [tensor for tensor in saved if tensor.numel() == x.numel()]
+    assert {tensor.data_ptr() for tensor in rows} == {x.data_ptr()}
+    assert len({tensor.dtype for tensor in saved if len(tensor) == 10}) == 1
 
 
 def test_saved_weights_are_unchanged_and_give_the_same_logits(student, tmp_path) -> None:
