@@ -56,7 +56,7 @@ file in `PARTS` is a hash of its job's inputs."""
 def main(cfg: BuildCommand, run: Run) -> dict[str, float]:
     if cfg.frames != "none":
         check_renderer(cfg.benchmark, Path(cfg.store))
-    workers = Workers(cfg.workers)
+    workers = Workers(cfg.workers, cfg.parallel)
     store = ensure_items(cfg.benchmark, Path(cfg.store), workers, cfg.strict, cfg.verify)
     if cfg.frames != "none":
         prerender_frames(store, cfg.frames, workers)

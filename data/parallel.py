@@ -1,4 +1,4 @@
-"""Runs jobs in worker processes with joblib.
+"""Runs jobs in worker processes of this machine or of a Ray cluster, with joblib.
 
 A job writes its files atomically, so that another worker can repeat the job of a worker that died.
 """
@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from conf.errors import UserError
+from conf.errors import UserError, import_extra
 
 log = logging.getLogger(__name__)
 
@@ -33,9 +33,16 @@ MAX_DEATHS = 3
 
 @dataclass(frozen=True)
 class Workers:
-    """A pool of `count` worker processes."""
+    """A pool of worker processes.
+
+    Attributes:
+        count: Number of processes.
+        engine: `loky` uses this machine. `ray` uses the cluster at the environment variable
+            RAY_ADDRESS, or starts one on this machine if the variable is not set.
+    """
 
     count: int
+    engine: str = "loky"
 
     def run(
         self,
@@ -53,8 +60,6 @@ class Workers:
             done: What has been done besides `jobs`, in units.
             sizes: Units of each job; one each by default.
         """
-        from joblib.externals.loky import BrokenProcessPool
-
         remaining, sizes = dict(jobs), sizes or dict.fromkeys(jobs, 1)
         total = done + sum(sizes[name] for name in jobs)
         with tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=1.0) as bar:
@@ -66,7 +71,7 @@ class Workers:
                         bar.update(sizes[name])
                         deaths = 0
                         yield name, result
-                except BrokenProcessPool as error:
+                except _death_errors(self.engine) as error:
                     deaths += 1
                     if deaths > MAX_DEATHS:
                         raise UserError(
@@ -92,9 +97,14 @@ class Workers:
     def _results(self, jobs: Mapping[Name, Job]) -> Iterator[tuple[Name, Any]]:
         from joblib import Parallel, delayed
 
-        # A worker that asked for its parent could start too late, after the parent was killed.
-        watch = partial(_exit_with_parent, os.getpid())
-        parallel = Parallel(self.count, return_as="generator_unordered", initializer=watch)
+        if self.engine == "ray":
+            _connect_to_ray(self.count)
+            # Ray's backend cannot return results one by one.
+            parallel = Parallel(self.count, backend="ray")
+        else:
+            # A worker that asked for its parent could start too late, after the parent was killed.
+            watch = partial(_exit_with_parent, os.getpid())
+            parallel = Parallel(self.count, return_as="generator_unordered", initializer=watch)
         # Loky restarts a worker whose memory grows; workers grow because they cache scenes.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs")
         # A caller may stop before the last result.
@@ -110,6 +120,26 @@ def batched(elements: list[Element], size: int) -> Iterator[list[Element]]:
 
 def _run_job(name: Name, job: Job) -> tuple[Name, Any]:
     return name, job()
+
+
+def _death_errors(engine: str) -> tuple[type[Exception], ...]:
+    if engine == "ray":
+        from ray.exceptions import RayActorError, WorkerCrashedError
+
+        return RayActorError, WorkerCrashedError
+    from joblib.externals.loky import BrokenProcessPool
+
+    return (BrokenProcessPool,)
+
+
+def _connect_to_ray(count: int) -> None:
+    ray = import_extra("ray", "parallel=ray")
+    from ray.util.joblib import register_ray
+
+    if not ray.is_initialized():
+        local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": count}
+        ray.init(log_to_driver=False, include_dashboard=False, **local)
+        register_ray()
 
 
 def _exit_with_parent(parent: int) -> None:

@@ -65,6 +65,8 @@ class BuildCommand(CommandConfig):
     verify: bool = False
     """Hash every file of a built benchmark. Otherwise, only files whose size or modification time
     differs from the last check are hashed."""
+    parallel: str = setting("loky", ("loky", "ray"))
+    """loky runs the work in processes of this machine, ray on a Ray cluster."""
 
 
 @dataclass

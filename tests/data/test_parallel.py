@@ -1,4 +1,4 @@
-"""Worker pools finish every job, even if a worker dies."""
+"""Worker pools finish every job, on this machine and on a Ray cluster, even if a worker dies."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ def kill_worker(number: int) -> None:
 
 
 @pytest.mark.slow
-def test_jobs_of_a_killed_worker_are_retried(tmp_path) -> None:
+@pytest.mark.parametrize("engine", ["loky", "ray"])
+def test_jobs_of_a_killed_worker_are_retried(tmp_path, engine) -> None:
     jobs = {str(k): partial(square, k) for k in range(20)}
     jobs["7"] = partial(square, 7, tmp_path / "marker")
-    results = dict(Workers(2).run(jobs, "squaring", "number"))
+    results = dict(Workers(2, engine).run(jobs, "squaring", "number"))
     assert (tmp_path / "marker").exists()
     assert results == {str(k): k * k for k in range(20)}
 
