@@ -18,9 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.nn import Module
-from torch.nn.functional import dropout
 from transformers import AttentionInterface, AttentionMaskInterface, PreTrainedModel
-from transformers.integrations.sdpa_attention import repeat_kv, sdpa_attention_forward
+from transformers.integrations.sdpa_attention import sdpa_attention_forward
 from transformers.masking_utils import eager_mask
 from transformers.utils import is_flash_attn_2_available, is_flash_attn_3_available
 
@@ -66,28 +65,77 @@ def attend_by_matmul(
     """Compute attention by matrix products, from (B, H, Q, D) queries to (B, G, K, D) keys and
     values, where H is a multiple of G. Return (B, Q, H, D).
 
-    Transformers' eager attention keeps the softmax of the scores twice for the backward pass, in
-    fp32 and in bf16. This function keeps only the latter, which takes a third of the memory.
-
     Args:
         attention_mask: (B, 1, Q, K) mask to add to the scores, which masks at least all later keys
             of each query; None for bidirectional attention.
     """
-    repeats = query.shape[1] // key.shape[1]
-    query, key = query * settings["scaling"], repeat_kv(key, repeats).transpose(2, 3)
-    value = repeat_kv(value, repeats)
-    rate = settings.get("dropout", 0.0)
-    if attention_mask is None:
-        weights = dropout((query @ key).softmax(dim=-1), rate)
-        return (weights @ value).transpose(1, 2).contiguous(), None
-    parts, earlier = [], key.shape[3] - query.shape[2]
-    for start in range(0, query.shape[2], MATMUL_BLOCK):
-        rows = slice(start, start + MATMUL_BLOCK)
-        seen = slice(0, earlier + min(start + MATMUL_BLOCK, query.shape[2]))
-        scores = query[:, :, rows] @ key[..., seen]
-        scores.add_(attention_mask[:, :, rows, seen])
-        parts.append(dropout(scores.softmax(dim=-1), rate) @ value[:, :, seen])
-    return torch.cat(parts, dim=2).transpose(1, 2).contiguous(), None
+    if settings.get("dropout"):
+        return sdpa_attention_forward(module, query, key, value, attention_mask, **settings)
+    device = query.device.type
+    if torch.is_autocast_enabled(device):
+        dtype = torch.get_autocast_dtype(device)
+        query, key, value = query.to(dtype), key.to(dtype), value.to(dtype)
+    return ProductAttention.apply(query, key, value, attention_mask, settings["scaling"]), None
+
+
+class ProductAttention(torch.autograd.Function):
+    """Attention by matrix products of blocks of queries with the keys that they can see.
+
+    The backward pass adds up the gradients of keys and values in place. Autograd would fill a
+    tensor of their full size for each block. Only the softmax of the scores is kept, in the type of
+    the queries.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scaling: float
+    ) -> Tensor:
+        (batch, heads, length, size), groups = query.shape, key.shape[1]
+        keys, values = key.flatten(0, 1).contiguous(), value.flatten(0, 1).contiguous()
+        # Queries of heads with the same keys are the rows of one product.
+        queries = query.unflatten(1, (groups, -1)) * scaling
+        attended = query.new_empty(batch, length, heads, size)
+        blocks, weights = seen_keys(length, keys.shape[1], mask is not None), []
+        for rows, seen in blocks:
+            block = queries[:, :, :, rows]
+            scores = torch.bmm(block.flatten(2, 3).flatten(0, 1), keys[:, seen].mT)
+            if mask is not None:
+                scores.view(*block.shape[:-1], -1).add_(mask[:, None, :, rows, seen])
+            weights.append(scores.softmax(dim=-1))
+            found = torch.bmm(weights[-1], values[:, seen]).view(block.shape)
+            attended[:, rows].unflatten(2, (groups, -1)).copy_(found.permute(0, 3, 1, 2, 4))
+        ctx.save_for_backward(queries, keys, values, *weights)
+        ctx.blocks, ctx.scaling = blocks, scaling
+        return attended
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        queries, keys, values, *weights = ctx.saved_tensors
+        of_queries = torch.empty_like(queries)
+        of_keys, of_values = torch.zeros_like(keys), torch.zeros_like(values)
+        gradient = gradient.unflatten(2, queries.shape[1:3]).permute(0, 2, 3, 1, 4)
+        for (rows, seen), weight in zip(ctx.blocks, weights, strict=True):
+            block = queries[:, :, :, rows]
+            own = gradient[:, :, :, rows].flatten(2, 3).flatten(0, 1)
+            of_values[:, seen].baddbmm_(weight.mT, own)
+            of_weights = torch.bmm(own, values[:, seen].mT)
+            of_scores = torch._softmax_backward_data(of_weights, weight, -1, weight.dtype)
+            of_keys[:, seen].baddbmm_(of_scores.mT, block.flatten(2, 3).flatten(0, 1))
+            found = torch.bmm(of_scores, keys[:, seen]).view(block.shape)
+            of_queries[:, :, :, rows] = found.mul_(ctx.scaling)
+        shape = queries.shape[0], -1, *keys.shape[1:]
+        return of_queries.flatten(1, 2), of_keys.view(shape), of_values.view(shape), None, None
+
+
+def seen_keys(queries: int, keys: int, is_causal: bool) -> list[tuple[slice, slice]]:
+    """Return blocks of queries, and the keys that each block can see. The last queries are those of
+    the last keys."""
+    if not is_causal:
+        return [(slice(queries), slice(keys))]
+    starts = range(0, queries, MATMUL_BLOCK)
+    rows = [slice(start, min(start + MATMUL_BLOCK, queries)) for start in starts]
+    return [(row, slice(keys - queries + row.stop)) for row in rows]
 
 
 def matmul_mask(*args: Any, dtype: torch.dtype, **settings: Any) -> Tensor | None:

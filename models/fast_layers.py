@@ -1,9 +1,9 @@
 """Faster layers for training a Qwen3-VL. Up to rounding, they give the same results.
 
 The convolution over patches, which do not overlap, is one matrix product: several times as fast.
-Adapters scale the narrow output of A, and add its product with B in place to the base layer's
-output. peft scales and adds B's wide output, keeps the intermediate results, and first copies the
-output of a 4-bit layer.
+Adapters scale B's weights, and add the product of A's narrow output with them in place to the base
+layer's output. peft scales and adds B's wide output, keeps the intermediate results, and first
+copies the output of a 4-bit layer.
 """
 
 from __future__ import annotations
@@ -49,11 +49,10 @@ class AddedInPlace(LoraVariant):
     def forward(
         module: LoraLayer, active_adapter: str, x: torch.Tensor, result: torch.Tensor, **_: Any
     ) -> torch.Tensor:
-        dropped = module.lora_dropout[active_adapter](x)
-        scaled = module.lora_A[active_adapter](dropped) * module.scaling[active_adapter]
-        b = module.lora_B[active_adapter].weight.T
+        narrow = module.lora_A[active_adapter](module.lora_dropout[active_adapter](x))
+        scaled = module.lora_B[active_adapter].weight.T * module.scaling[active_adapter]
         # Without autocast, the base may be in bf16 and its adapters in fp32.
-        return result.to(scaled.dtype).addmm_(scaled, b.to(scaled.dtype))
+        return result.to(narrow.dtype).addmm_(narrow, scaled.to(narrow.dtype))
 
 
 class Rows:
