@@ -10,7 +10,7 @@ import pytest
 from benchmarks.speed import hours
 from tests.user_errors import raises_user_error
 
-FAST = hours.Rate("sft", "qwen3_vl_8b", "nf4", 10.0, "a card", "2026-01-31")
+FAST = hours.Rate("sft", "qwen3_vl_8b", "nf4", 10.0, "a card", "2026-01-31", "torch 2.14.0")
 COT = "train.sft +exp=cot"
 
 
@@ -29,7 +29,7 @@ def test_a_run_trains_on_the_papers_samples_in_each_epoch(runs) -> None:
 def test_hours_are_samples_divided_by_the_rate(runs) -> None:
     table = hours.format_table(list(runs.values()), [FAST])
     cot = next(line for line in table.splitlines() if line.startswith(f"{COT} "))
-    assert f"{2 * 9_368 * 3 / 10 / 3600:.1f}  a card, 2026-01-31" in cot
+    assert f"{2 * 9_368 * 3 / 10 / 3600:.1f}  a card, 2026-01-31, torch 2.14.0" in cot
     (missing,) = [line for line in table.splitlines() if "train.contrastive" in line]
     assert missing.startswith("No rate is measured for train.contrastive: ")
     assert "python -m benchmarks.speed.contrastive qwen3_vl_emb_8b --quantization nf4" in missing

@@ -13,13 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import pandas as pd
+import psutil
 import torch
 from tqdm import tqdm
 from transformers import (
@@ -36,6 +37,7 @@ from benchmarks.speed import hours
 from conf.errors import SettingsError, UserError
 from conf.runs import Run
 from conf.schema import TrainConfig
+from models.precision import resolve_precision
 from models.tiny_qwen3_vl import SPECIAL_TOKENS, build_processor
 from train.common.arguments import common_arguments
 
@@ -47,6 +49,18 @@ TRAINING_ONLY = {
     "load_best_model_at_end": False, "disable_tqdm": True,
 }  # fmt: skip
 """Arguments of a trainer that disable evaluations, checkpoints and the progress bar."""
+MALLOC = {
+    "MALLOC_MMAP_THRESHOLD_": str(1 << 30),
+    "MALLOC_TRIM_THRESHOLD_": str((1 << 31) - 1),
+    "MALLOC_TOP_PAD_": str(64 << 20),
+}
+"""Environment variables with the effect of `models.compat.keep_freed_memory`."""
+AVX2 = {
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+}
+"""Environment variables that hold the libraries to a processor without bf16 and AVX-512."""
 CONFIGS = Path(__file__).parents[2] / "tests/models/configs"
 """The configurations of the released models."""
 
@@ -57,6 +71,8 @@ class Measurements:
 
     rate: float
     """Samples or queries per second after the first step; the time to load inputs is included."""
+    cpu: float
+    """CPU seconds of the process and its workers per sample or query, after the first step."""
     peak: float
     """Peak memory (GiB) of tensors on the GPU, or of the process on a CPU."""
     losses: list[float]
@@ -64,15 +80,19 @@ class Measurements:
 
 
 class Clock(TrainerCallback):
-    """Records the end time of each step."""
+    """Records the end time of each step, and the CPU seconds up to then."""
 
     def __init__(self) -> None:
         self.ends: list[float] = []
+        self.cpu: list[float] = []
 
     def on_step_end(self, *_: Any, **__: Any) -> None:
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         self.ends.append(time.perf_counter())
+        process = psutil.Process()
+        times = [p.cpu_times() for p in (process, *process.children(recursive=True))]
+        self.cpu.append(sum(t.user + t.system for t in times))
 
 
 def train(trainer: Trainer, batch: int) -> Measurements:
@@ -87,9 +107,10 @@ def train(trainer: Trainer, batch: int) -> Measurements:
     reset_peak_memory()
     trainer.train()
     peak = peak_memory() / 2**30
-    seconds = [end - start for start, end in pairwise(clock.ends)]
+    seconds, samples = clock.ends[-1] - clock.ends[0], batch * (len(clock.ends) - 1)
+    cpu = clock.cpu[-1] - clock.cpu[0]
     losses = [entry["loss"] for entry in trainer.state.log_history if "loss" in entry]
-    return Measurements(batch * len(seconds) / sum(seconds), peak, losses)
+    return Measurements(samples / seconds, cpu / samples, peak, losses)
 
 
 def timing_arguments(train: TrainConfig, folder: Path) -> dict[str, Any]:
@@ -111,14 +132,30 @@ def run_in_process(
 def add_arguments(parser: argparse.ArgumentParser, steps: int, variants: Sequence[str]) -> None:
     """Add the options of every comparison."""
     parser.add_argument("preset", nargs="?", default="tiny", help="tiny or a released preset")
-    parser.add_argument("--quantization", choices=["nf4", "none"], default="nf4")
+    parser.add_argument(
+        "--quantization", choices=["nf4", "none"], help="default: none for tiny, nf4 for others"
+    )
     parser.add_argument("--precision", default="auto", help="bf16, fp32 or auto")
+    parser.add_argument(
+        "--avx2", action="store_true", help="fp32, without the instructions of newer processors"
+    )
     parser.add_argument(
         "--steps", type=positive_int, default=steps, help="steps to time, after the first"
     )
     parser.add_argument("--rounds", type=positive_int, default=3)
     parser.add_argument("--store", default="store", help="folder of the built benchmarks")
     parser.add_argument("--only", nargs="*", choices=list(variants), help="variants to measure")
+
+
+def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Parse the options of a comparison, and set its precision and quantisation."""
+    args = parser.parse_args()
+    if args.avx2:
+        os.environ.update(AVX2)
+        args.precision = "fp32"
+    args.precision = resolve_precision(args.precision)
+    args.quantization = args.quantization or ("none" if args.preset == "tiny" else "nf4")
+    return args
 
 
 def compare(
@@ -131,16 +168,17 @@ def compare(
 ) -> None:
     """Measure each variant once per round, and print the medians over the rounds.
 
-    For rates and memory, the medians of the ratios to a reference variant are printed too. A
-    variant that runs out of memory or cannot be trained with its settings is left out. On a GPU,
-    the rate of our trainer with a released preset is appended to `hours.RATES`.
+    The ratios to a reference variant of the same round are printed too: their median and, for
+    rates, the lowest and the highest. A variant that runs out of memory or cannot be trained with
+    its settings is left out. On a GPU, the rate of our trainer with a released preset is appended
+    to `hours.RATES`.
 
     Args:
         benchmark: Module of `benchmarks.speed` that measures.
         measure: Measures a variant by its name.
         reference: Name of the reference variant.
         unit: What a rate counts, such as samples.
-        args: Parsed options of `add_arguments`.
+        args: Options of `parse_arguments`.
     """
     rows, failures = [], {}
     for number, name in tqdm(list(product(range(args.rounds), names)), unit="training"):
@@ -153,21 +191,25 @@ def compare(
         except UserError as error:
             failures[name] = str(error)
         else:
-            rows.append((name, number, found.rate, found.peak, found.losses[-1]))
+            measures = found.rate, found.cpu, found.peak
+            rows.append((name, number, *measures, found.losses[-1]))
     for name, failure in failures.items():
         print(f"{name}: {failure}")
-    table = pd.DataFrame(rows, columns=["variant", "round", f"{unit}/s", "peak GiB", "loss"])
+    rate = f"{unit}/s"
+    columns = ["variant", "round", rate, "CPU s", "peak GiB", "loss"]
+    table = pd.DataFrame(rows, columns=columns)
     table = table[~table["variant"].isin(failures)].set_index(["round", "variant"])
     medians = table.groupby("variant", sort=False).median()
     if reference in medians.index:
         ratios = table / table.xs(reference, level="variant").reindex(table.index, level="round")
-        medians = medians.join(
-            ratios.groupby("variant").median().drop(columns="loss"), rsuffix=", ratio"
-        )
-    print(medians.to_string(float_format="{:.4f}".format), flush=True)
+        of_variants = ratios.drop(columns="loss").groupby("variant")
+        medians = medians.join(of_variants.median(), rsuffix=", ratio")
+        spread = of_variants[rate].agg(["min", "max"]).add_prefix(f"{rate}, ratio, ")
+        medians = medians.join(spread)
+    print(medians.to_string(float_format="{:.3f}".format), flush=True)
     if OURS in medians.index and args.preset != "tiny" and torch.cuda.is_available():
-        rate, card = medians.loc[OURS, f"{unit}/s"], torch.cuda.get_device_name()
-        hours.add_rate(benchmark, args.preset, args.quantization, rate, card)
+        card, measured = torch.cuda.get_device_name(), medians.loc[OURS, rate]
+        hours.add_rate(benchmark, args.preset, args.quantization, measured, card)
 
 
 def write_random_base(preset: str, texts: list[str], image_size: int, folder: Path) -> None:

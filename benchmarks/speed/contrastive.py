@@ -4,15 +4,16 @@
     python -m benchmarks.speed.contrastive --batch 32 128 512   # with several batch sizes
     python -m benchmarks.speed.contrastive qwen3_vl_emb_8b      # a released size, on a GPU
 
-Every variant trains on the same batches of queries of `benchmark=small`, in a process of its own.
-The script prints medians over the rounds and the ratios to plain sentence-transformers. On a GPU,
-the rate of our trainer with the preset's settings is recorded for benchmarks.speed.hours. The tiny
-retriever has adapters over the 4-bit tiny base. A released size has random weights, so that nothing
-is downloaded.
+Every variant trains on the same batches of queries, in a process of its own. The script prints
+medians over the rounds and the ratios to our trainer with the preset's settings, whose rate on a
+GPU is recorded for benchmarks.speed.hours. A released size has random weights, so that nothing is
+downloaded.
 
-Plain sentence-transformers uses the library's trainer, collator and losses. Like our trainer, it
-reads the pixels of one batch at a time. In one variant, its mini-batches have a maximum number of
-tokens; another has this project's attention and memory settings.
+Plain sentence-transformers uses the library's trainer, collator and losses: by default its cached
+loss with mini-batches of 32, which embeds a batch twice. Like our trainer, it reads the pixels of
+one batch at a time. The other variants have each setting that could make it faster: the loss that
+embeds a batch once, the MALLOC_* environment variables, which have the effect of our trainer's
+calls of mallopt, and this project's attention.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,13 @@ from sentence_transformers.sentence_transformer.data_collator import SentenceTra
 from sentence_transformers.sentence_transformer.losses import (
     CachedMultipleNegativesRankingLoss,
     MatryoshkaLoss,
+    MultipleNegativesRankingLoss,
 )
 from transformers import Trainer, set_seed
 
 from benchmarks.arguments import positive_int
 from benchmarks.speed import comparison
-from benchmarks.speed.comparison import OURS, SEED, Measurements, timing_arguments
+from benchmarks.speed.comparison import MALLOC, OURS, SEED, Measurements, timing_arguments
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.runs import Run
@@ -44,14 +46,11 @@ from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
 from models import compat
 from models.fast_layers import use_fast_layers
-from models.precision import resolve_precision
 from models.retriever import embedder
 from models.retriever.inputs import Retriever, frame_input, query_input
 from train.retriever.batches import QueryBatchSampler
 from train.retriever.trainer import NUMBER, numbered_rows
 from train.retriever.trainer_setup import build_trainer
-
-TINY = ["retriever=tiny", "train.mini_batch=16", "train.reuse_features=false"]
 
 
 @dataclass(frozen=True)
@@ -62,55 +61,64 @@ class Variant:
     """Settings of `train` that differ from the preset."""
     plain: bool = False
     """Train with plain sentence-transformers instead of our trainer."""
-    tokens: int | None = None
-    """Maximum tokens of a plain mini-batch; by default, `train.mini_batch` limits its inputs."""
-    our_settings: bool = False
-    """Give plain sentence-transformers this project's attention and memory settings."""
+    cached: bool = False
+    """Use the loss of sentence-transformers that embeds a batch twice, in mini-batches."""
+    our_attention: bool = False
+    """Give plain sentence-transformers this project's attention."""
+    environment: dict[str, str] = field(default_factory=dict)
 
 
-PLAIN = "plain sentence-transformers"
+DEFAULT = "plain, default settings"
+CACHED = ("mini_batch=32",)
 VARIANTS = {
-    PLAIN: Variant(plain=True),
-    "plain, by tokens": Variant(plain=True, tokens=3072),
-    "plain, our attention and memory settings": Variant(plain=True, our_settings=True),
     OURS: Variant(),
-    "ours, inputs loaded in advance": Variant(("workers=2",)),
-    "ours, vision features reused": Variant(("reuse_features=true",)),
-    "ours, both": Variant(("workers=2", "reuse_features=true")),
+    "ours, mini-batch 16": Variant(("mini_batch=16", "reuse_features=false")),
+    "ours, mini-batch 16, features reused": Variant(("mini_batch=16", "reuse_features=true")),
+    DEFAULT: Variant(CACHED, plain=True, cached=True),
+    "plain, cached, MALLOC_*": Variant(CACHED, plain=True, cached=True, environment=MALLOC),
+    "plain, one pass": Variant(plain=True),
+    "plain, one pass, MALLOC_*": Variant(plain=True, environment=MALLOC),
+    "plain, one pass, MALLOC_*, our attention": Variant(
+        plain=True, our_attention=True, environment=MALLOC
+    ),
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument(
-        "--batch", type=positive_int, nargs="+", default=[128], help="queries per step"
+        "--batch", type=positive_int, nargs="+", help="queries per step, by default the preset's"
     )
-    parser.add_argument("--benchmark", default="small")
+    parser.add_argument("--benchmark", default="tiny")
     comparison.add_arguments(parser, steps=3, variants=VARIANTS)
-    args = parser.parse_args()
+    args = comparison.parse_arguments(parser)
     overrides = [
-        *(TINY if args.preset == "tiny" else [f"retriever={args.preset}"]),
-        f"benchmark={args.benchmark}", f"store={args.store}", "train.hard_negatives=1",
+        f"retriever={args.preset}", f"benchmark={args.benchmark}", f"store={args.store}",
         f"retriever.quantization={args.quantization}",
-        f"train.precision={resolve_precision(args.precision)}",
+        f"train.precision={args.precision}",
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         if args.preset != "tiny":
             comparison.run_in_process(write_base, overrides, args.preset, Path(folder))
             overrides.append(f"retriever.model={folder}")
-        for batch in args.batch:
-            print(f"\nbatches of {batch} queries")
-            settings = [*overrides, f"train.batch={batch}"]
+        for batch in args.batch or [None]:
+            print(f"\nbatches of {batch or 'the preset'}")
+            settings = [*overrides, *([f"train.batch={batch}"] if batch else [])]
             comparison.compare(
                 "contrastive",
-                lambda name, settings=settings: comparison.run_in_process(
-                    measure, settings, VARIANTS[name], args.steps
+                lambda name, settings=settings: measure_in_process(
+                    settings, VARIANTS[name], args.steps
                 ),
                 args.only or list(VARIANTS),
-                PLAIN,
+                OURS,
                 "queries",
                 args,
             )
+
+
+def measure_in_process(overrides: list[str], variant: Variant, steps: int) -> Measurements:
+    environment = variant.environment
+    return comparison.run_in_process(measure, overrides, variant, steps, environment=environment)
 
 
 def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
@@ -118,8 +126,7 @@ def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
     changes = [f"train.{change}" for change in variant.overrides]
     overrides = [*overrides, *changes, f"train.max_steps={steps + 1}"]
     cfg = compose("train.contrastive", ContrastiveCommand, overrides)
-    ours = variant.our_settings or not variant.plain
-    if ours:
+    if not variant.plain:
         compat.keep_freed_memory()
     set_seed(SEED)
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
@@ -127,10 +134,10 @@ def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
     frames = FrameReader(store, cfg.retriever.image_size)
     with tempfile.TemporaryDirectory() as folder:
         model = embedder.load_retriever(cfg.retriever, cfg.train.precision, [], Path(folder))
-        if not ours:
+        if variant.plain and not variant.our_attention:
             model[0].model.set_attn_implementation("sdpa")
         if variant.plain:
-            trainer = build_plain_trainer(cfg, model, queries, frames, Path(folder), variant.tokens)
+            trainer = build_plain_trainer(cfg, model, queries, frames, Path(folder), variant.cached)
         else:
             use_fast_layers(model)
             run, batch = Run("benchmark", Path(folder)), cfg.train.batch
@@ -145,7 +152,7 @@ def build_plain_trainer(
     queries: list[RetrievalQuery],
     frames: FrameReader,
     folder: Path,
-    tokens: int | None,
+    cached: bool,
 ) -> Trainer:
     """Return a trainer with the library's collator and losses."""
     columns = ["query", "target", *(f"negative_{k}" for k in range(cfg.train.hard_negatives))]
@@ -155,11 +162,11 @@ def build_plain_trainer(
         prompts=prompts | {"query": model.prompts["query"]},
     )
     collator.load = lambda number: load_columns(queries[number], columns, frames, cfg)
-    ranking = CachedMultipleNegativesRankingLoss(
-        model,
-        scale=cfg.train.scale,
-        mini_batch_size=cfg.train.mini_batch,
-        mini_batch_num_tokens=tokens,
+    scale, size = cfg.train.scale, cfg.train.mini_batch
+    ranking = (
+        CachedMultipleNegativesRankingLoss(model, scale=scale, mini_batch_size=size)
+        if cached
+        else MultipleNegativesRankingLoss(model, scale=scale)
     )
     sampler = QueryBatchSampler(queries, cfg.train.hard_negatives, cfg.train.batch, SEED)
     return SentenceTransformerTrainer(

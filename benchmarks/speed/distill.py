@@ -56,7 +56,7 @@ def main() -> None:
         "--tokens", type=positive_int, default=200, help="maximum length of a response"
     )
     comparison.add_arguments(parser, steps=3, variants=[SFT, DISTILL, SAMPLING])
-    args = parser.parse_args()
+    args = comparison.parse_arguments(parser)
     overrides = [*list_overrides(args), f"student.max_new_tokens={args.tokens}"]
     with tempfile.TemporaryDirectory() as folder:
         if args.preset != "tiny":
@@ -117,12 +117,12 @@ def measure_sampling(
     comparison.reset_peak_memory()
     for start in range(0, len(prompts), batch):
         if start == batch:
-            began = time.perf_counter()
+            began, cpu = time.perf_counter(), time.process_time()
         part = prompts[start : start + batch]
         sampler.sample(student, [p.student for p in part], [p.seed for p in part])
-    seconds = time.perf_counter() - began
-    peak = comparison.peak_memory() / 2**30
-    return Measurements((len(prompts) - batch) / seconds, peak, [float("nan")])
+    count, seconds = len(prompts) - batch, time.perf_counter() - began
+    cpu, peak = time.process_time() - cpu, comparison.peak_memory() / 2**30
+    return Measurements(count / seconds, cpu / count, peak, [float("nan")])
 
 
 if __name__ == "__main__":

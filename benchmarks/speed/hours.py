@@ -20,6 +20,7 @@ import argparse
 import json
 from dataclasses import asdict, dataclass
 from datetime import date
+from importlib.metadata import version
 from pathlib import Path
 
 from conf.compose import compose
@@ -29,6 +30,8 @@ from conf.schema import ContrastiveCommand, SftCommand
 from data.items.cells import family_quotas
 
 RATES = Path(__file__).with_name("rates.jsonl")
+LIBRARIES = ("torch", "transformers", "sentence-transformers")
+"""Libraries whose versions are recorded with a rate."""
 REGIMES = ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout")
 
 
@@ -42,6 +45,8 @@ class Rate:
     rate: float
     card: str
     date: str
+    versions: str
+    """Of the libraries, such as `torch 2.14.0, transformers 5.23.0`."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,7 @@ def format_table(runs: list[TrainingRun], rates: list[Rate]) -> str:
         lines += [head] if known and not lines else []
         lines += [
             f"{run.name:<40}{run.samples:>9,.0f}{rate.rate:>10.2f}"
-            f"{run.samples / rate.rate / 3600:>8.1f}  {card}, {rate.date}"
+            f"{run.samples / rate.rate / 3600:>8.1f}  {card}, {rate.date}, {rate.versions}"
             for card, rate in known.items()
         ]
         if not known:
@@ -131,8 +136,10 @@ def read_rates(path: Path) -> list[Rate]:
 def add_rate(
     benchmark: str, preset: str, quantization: str, rate: float, card: str, path: Path = RATES
 ) -> None:
-    """Append a rate to the file, with today's date."""
-    line = Rate(benchmark, preset, quantization, round(rate, 4), card, date.today().isoformat())
+    """Append a rate to the file, with today's date and the versions of the libraries."""
+    versions = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
+    today = date.today().isoformat()
+    line = Rate(benchmark, preset, quantization, round(rate, 4), card, today, versions)
     with path.open("a") as file:
         file.write(json.dumps(asdict(line)) + "\n")
 

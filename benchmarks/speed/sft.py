@@ -37,7 +37,7 @@ from torch.utils.data import Subset
 from transformers import ProcessorMixin, Trainer, set_seed
 
 from benchmarks.speed import comparison
-from benchmarks.speed.comparison import OURS, SEED, Measurements, timing_arguments
+from benchmarks.speed.comparison import MALLOC, OURS, SEED, Measurements, timing_arguments
 from conf.compose import compose
 from conf.failures import report_failures
 from conf.runs import Run
@@ -46,7 +46,6 @@ from data.build import ensure_benchmark
 from models import compat, loading
 from models.attention import flash_attention
 from models.fast_layers import use_fast_layers
-from models.precision import resolve_precision
 from models.student.collator import Collator, encode, pad
 from models.student.prompts import Sample
 from teacher.narrate import ensure_rationales
@@ -54,13 +53,6 @@ from train.student.dataset import load_datasets, tokenizer_corpus
 from train.student.length_sampler import LengthSampler
 from train.student.trainer import token_mean
 from train.student.trainer_setup import build_trainer
-
-MALLOC = {
-    "MALLOC_MMAP_THRESHOLD_": str(1 << 30),
-    "MALLOC_TRIM_THRESHOLD_": str((1 << 31) - 1),
-    "MALLOC_TOP_PAD_": str(64 << 20),
-}
-"""Environment variables with the effect of `models.compat.keep_freed_memory`."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +73,12 @@ KEPT, RECOMPUTED = "gradient_checkpointing=false", "gradient_checkpointing=true"
 TRL_SETTINGS = ("workers=0", "micro_batch=8", KEPT)
 VARIANTS = {
     OURS: Variant(),
+    "ours, without reused features": Variant(("reuse_features=false",)),
     "ours, activations kept": Variant((KEPT,)),
     "ours, activations recomputed": Variant((RECOMPUTED,)),
     "ours, micro-batch 1": Variant(("micro_batch=1",)),
     "ours, micro-batch 4": Variant(("micro_batch=4",)),
     "ours, micro-batch 8": Variant(("micro_batch=8",)),
-    "ours, vision features reused": Variant(("reuse_features=true",)),
     "ours, 4 workers": Variant(("workers=4",)),
     DEFAULT: Variant((*TRL_SETTINGS, RECOMPUTED), trl=True),
     "TRL, kept": Variant(TRL_SETTINGS, trl=True),
@@ -94,6 +86,9 @@ VARIANTS = {
     "TRL, kept, 4 workers": Variant((*TRL_SETTINGS, "workers=4"), trl=True),
     "TRL, kept, flash attention": Variant(TRL_SETTINGS, trl=True, flash=True),
     "TRL, kept, MALLOC_*": Variant(TRL_SETTINGS, trl=True, environment=MALLOC),
+    "TRL, kept, 4, MALLOC_*": Variant(
+        (*TRL_SETTINGS, "micro_batch=4"), trl=True, environment=MALLOC
+    ),
 }
 """Variants by name. "kept": activations are not recomputed. "4": micro-batches of 4, not 8."""
 
@@ -102,7 +97,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--losses", action="store_true", help="compare losses instead")
     comparison.add_arguments(parser, steps=8, variants=VARIANTS)
-    args = parser.parse_args()
+    args = comparison.parse_arguments(parser)
     has_trl = importlib.util.find_spec("trl") is not None
     if args.losses and not has_trl:
         parser.error("--losses needs TRL: pip install -e '.[rl]'")
@@ -132,7 +127,7 @@ def list_overrides(args: argparse.Namespace) -> list[str]:
     return [
         "+exp=cot", "train.generated_items=0", f"student={args.preset}", f"store={args.store}",
         f"student.quantization={args.quantization}",
-        f"train.precision={resolve_precision(args.precision)}",
+        f"train.precision={args.precision}",
     ]  # fmt: skip
 
 
