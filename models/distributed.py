@@ -162,3 +162,13 @@ def split_batch(batch: int, micro_batch: int = 1, key: str = "train.batch") -> i
 def is_sharded() -> bool:
     """Return whether the launcher shards the model over the ranks (FSDP)."""
     return os.environ.get("ACCELERATE_USE_FSDP") == "true"
+
+
+def lacks_weights() -> bool:
+    """Return whether this rank gets the weights of a model that is sharded from the main rank, and
+    loads none itself. The first rank of a machine loads them, as transformers expects."""
+    return (
+        is_sharded()
+        and os.environ.get("FSDP_CPU_RAM_EFFICIENT_LOADING") == "true"
+        and os.environ["LOCAL_RANK"] != "0"
+    )

@@ -37,7 +37,8 @@ from conf.runs import Run
 command, settings, folder = sys.argv[1:]
 cfg = pickle.loads(Path(settings).read_bytes())
 main = importlib.import_module(f"evaluation.{command}").main
-main.__wrapped__(cfg, Run("run", Path(folder)))
+sampling = ("student.temperature", "student.top_k")
+main.__wrapped__(cfg, Run("run", Path(folder), sampling))
 """
 
 
@@ -101,7 +102,9 @@ def test_two_ranks_embed_what_one_process_embeds(
         "retrieve": RetrieveCommand(**shared, retriever=clip, model=str(trained_retriever)),
         "similarity": SimilarityCommand(**shared, retriever=clip, limit=9),
         "two_stage": TwoStageCommand(
-            **shared, model=str(trained_student), student=STUDENT,
+            **shared, model=str(trained_student),
+            # With random weights, greedy decoding gives every response the same text.
+            student=replace(STUDENT, temperature=1.0, top_k=50),
             routes=["predict_caption", "predict_image"],
             matcher=EmbedderConfig(
                 retriever=clip, batch=7, train=ContrastiveTrainConfig(precision="fp32")
