@@ -11,7 +11,7 @@ import platform
 import re
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -191,12 +191,13 @@ def other_settings_error(subject: str, changes: Sequence[str]) -> SettingsError:
 
 @contextmanager
 def lock_folder(folder: Path, busy: str) -> Iterator[None]:
-    """Hold an exclusive lock on a folder during the block; the lock is the file `.lock` in it.
+    """Hold an exclusive lock on a folder during the block; the lock is the file `.lock` in it. The
+    main rank holds it for all ranks.
 
     Raises:
         UserError: Another process holds the lock; `busy` is the message.
     """
-    with lock_file(folder / LOCK, busy):
+    with nullcontext() if rank() > 0 else lock_file(folder / LOCK, busy):
         yield
 
 

@@ -6,27 +6,30 @@ from __future__ import annotations
 import logging
 
 from conf.entry import Run, command
+from conf.runs import rank
 from conf.schema import RetrieveCommand
 
 log = logging.getLogger(__name__)
 
 
-@command("evaluation.retrieve", RetrieveCommand)
+@command("evaluation.retrieve", RetrieveCommand, ranks=True)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     from evaluation.embedders.embedder import open_retriever
     from evaluation.metrics import results
     from evaluation.reporting import tables
     from evaluation.retrieval import exact_search, standard_test
+    from models.distributed import end_ranks
 
     preset, store, embedders = open_retriever(cfg, run)
     queries, database = standard_test.load_test(store, cfg.pool)
     frame_names = [f.name for f in database]
     twins = [q.factual_twin.name for q in queries if q.factual_twin]
+    embedded = [(e.name, e.embed_queries(queries), e.embed_frames(database)) for e in embedders]
+    end_ranks()
+    if rank() > 0:
+        return {}
     rows, ranks = [], {}
-    for embedder in embedders:
-        query_embeddings = embedder.embed_queries(queries)
-        frame_embeddings = embedder.embed_frames(database)
-        name = embedder.name
+    for name, query_embeddings, frame_embeddings in embedded:
         log.info("ranking %s frames with %s", f"{len(frame_names):,}", name)
         ranks[name] = standard_test.rank_targets(
             preset,

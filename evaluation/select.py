@@ -42,8 +42,10 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         check_available("student", student.model)
 
     from data.build import ensure_benchmark
+    from models.distributed import end_ranks, main_first
 
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    with main_first():
+        store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.frames.frame_cache import FrameReader
     from evaluation.generators import response_log
@@ -52,7 +54,6 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from evaluation.metrics.results import variant_name
     from evaluation.metrics.selection import Choices, build_selection_report
     from evaluation.reporting.selection_report import write_report
-    from models.distributed import end_ranks
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = FrameReader(store, student.image_size)

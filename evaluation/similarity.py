@@ -7,12 +7,13 @@ import logging
 
 from conf.entry import Run, command
 from conf.files import write_json_lines
+from conf.runs import rank
 from conf.schema import SimilarityCommand
 
 log = logging.getLogger(__name__)
 
 
-@command("evaluation.similarity", SimilarityCommand)
+@command("evaluation.similarity", SimilarityCommand, ranks=True)
 def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from data.records import FrameRef
     from evaluation.embedders.embedder import open_retriever
@@ -26,15 +27,17 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from evaluation.reporting.selection_report import write_report
     from evaluation.retrieval import candidate_similarity
     from evaluation.select import select_items
+    from models.distributed import end_ranks
 
     preset, store, embedders = open_retriever(cfg, run)
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     candidates = {FrameRef(c.scene_id, c.frame) for item in items for c in item.candidates}
+    embedded = [(e.name, e.embed_queries(items), e.embed_frames(candidates)) for e in embedders]
+    end_ranks()
+    if rank() > 0:
+        return {}
     choices, score_rows = [], []
-    for embedder in embedders:
-        name = embedder.name
-        queries = embedder.embed_queries(items)
-        embeddings = embedder.embed_frames(candidates)
+    for name, queries, embeddings in embedded:
         log.info("scoring %s items with %s", f"{len(items):,}", name)
         scores = candidate_similarity.score_candidates(items, queries, embeddings, preset)
         credits = credit_choices(scores, [item.answer for item in items])

@@ -10,13 +10,14 @@ from pathlib import Path
 from conf.entry import Run, command
 from conf.errors import UserError
 from conf.files import write_json_lines
+from conf.runs import rank
 from conf.schema import ContrastiveCommand, SftCommand, TwoStageCommand
 from conf.schema.evaluation import ROUTES
 
 log = logging.getLogger(__name__)
 
 
-@command("evaluation.two_stage", TwoStageCommand)
+@command("evaluation.two_stage", TwoStageCommand, ranks=True)
 def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     from models.trained_runs import resolve_model
 
@@ -29,8 +30,10 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     check_routes(routes, folder, trained.train.regime, matcher_settings)
 
     from data.build import ensure_benchmark
+    from models.distributed import end_ranks, main_first, share_from_main
 
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    with main_first():
+        store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
     from data.frames.frame_cache import FrameReader
     from evaluation.embedders.embedder import open_embedders
@@ -60,6 +63,7 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         mode: {r.item_id: text_matching.future_text(r.text) for r in mode_responses}
         for mode, mode_responses in responses.items()
     }
+    texts = share_from_main(texts)
     # The matcher needs the memory that the model occupies.
     del model
 
@@ -67,6 +71,8 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     for key, route in zip(routes, chosen, strict=True):
         log.info("matching %s with %s", route.title, matcher.name)
         ranks = text_matching.rank_by_text(route, matcher, texts, queries, database)
+        if ranks is None:
+            continue
         title = f"{name} {route.title}, {matcher.name.removeprefix(results.UNTRAINED).strip()}"
         route_rows = results.retrieval_results(store.name, title, ranks, queries, cfg.seed)
         rows += route_rows
@@ -80,6 +86,9 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
         measures = route_rows[0].measures
         metrics |= {f"{key}_{m}": v.value for m, v in measures.items() if m != "tie_rate"}
 
+    end_ranks()
+    if rank() > 0:
+        return {}
     rows += standard_test.score_scene_alone(store.name, queries, database, cfg.seed)
     text_counts = {mode: text_matching.count_texts(found) for mode, found in responses.items()}
     extra = [tables.parsing_table(text_counts)]

@@ -14,6 +14,8 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
   tower then passes all frames in one call, with `cu_seq_lens_q` and `max_length_q`.
 - `train.common.training_loop` calls `Trainer._load_from_checkpoint`, which also reads the parts of
   an FSDP checkpoint.
+- `models.loading` leaves the weights of an FSDP rank without values if transformers and accelerate
+  distribute those of the main rank (FSDP_CPU_RAM_EFFICIENT_LOADING).
 - `models.retriever.multi_vector` loads with `MultiVectorEncoder._load_with_module_classes`, and a
   forward pre-hook casts `token_embeddings` in the inputs of the projection.
 - `train.retriever.trainer` overrides `_load_from_checkpoint`, `_load_best_model`,

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
+from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
 from conf.errors import UserError
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 
 Input, Output = TypeVar("Input"), TypeVar("Output")
 
+STEP_TIMEOUT = timedelta(hours=2)
+"""How long a rank waits for the others in a training step. Between two steps, the main rank saves
+and evaluates, which can take longer than 10 minutes, torch's default on GPUs."""
+
 
 @contextmanager
 def main_first() -> Iterator[None]:
@@ -32,24 +37,22 @@ def main_first() -> Iterator[None]:
         return
     from torch import distributed
 
-    with _patient_group() as group:
-        if rank() > 0:
-            distributed.barrier(group)
-        yield
-        if rank() == 0:
-            distributed.barrier(group)
+    group = _patient_group()
+    if rank() > 0:
+        distributed.barrier(group)
+    yield
+    if rank() == 0:
+        distributed.barrier(group)
 
 
-@contextmanager
-def _patient_group() -> Iterator[distributed.ProcessGroup]:
-    """Yield a group of all ranks whose operations may wait for days. The timeout of the default
-    group suits training steps."""
+@cache
+def _patient_group() -> distributed.ProcessGroup:
+    """Return a group of all ranks for tensors on CPUs, whose operations may wait for days. All
+    ranks make the first call together."""
     from torch import distributed
 
     _get_state()
-    group = distributed.new_group(backend="gloo", timeout=timedelta(days=30))
-    yield group
-    distributed.destroy_process_group(group)
+    return distributed.new_group(backend="gloo", timeout=timedelta(days=30))
 
 
 def map_over_ranks(
@@ -62,13 +65,12 @@ def map_over_ranks(
         return
     from torch import distributed
 
-    with _patient_group() as group:
-        for first in range(0, len(inputs), world_size()):
-            own = inputs[first + rank() : first + rank() + 1]
-            results: list[list[Output]] = [[] for _ in range(world_size())]
-            distributed.all_gather_object(results, [*map(function, own)], group)
-            for result in results:
-                yield from result
+    for first in range(0, len(inputs), world_size()):
+        own = inputs[first + rank() : first + rank() + 1]
+        results: list[list[Output]] = [[] for _ in range(world_size())]
+        distributed.all_gather_object(results, [*map(function, own)], _patient_group())
+        for result in results:
+            yield from result
 
 
 def share_from_main(value: Input) -> Input:
@@ -78,14 +80,17 @@ def share_from_main(value: Input) -> Input:
     from torch import distributed
 
     shared = [value]
-    with _patient_group() as group:
-        distributed.broadcast_object_list(shared, 0, group)
+    distributed.broadcast_object_list(shared, 0, _patient_group())
     return shared[0]
 
 
 def rank_device() -> torch.device:
-    """Return this rank's GPU, or the CPU."""
-    return _get_state().device
+    """Return this rank's GPU with its number, or the CPU."""
+    import torch
+
+    # The state makes the rank's GPU the current one.
+    device = _get_state().device
+    return torch.device("cuda", torch.cuda.current_device()) if device.type == "cuda" else device
 
 
 def _get_state() -> PartialState:
@@ -93,11 +98,11 @@ def _get_state() -> PartialState:
     import torch
     from accelerate import PartialState
 
-    return PartialState(cpu=not torch.cuda.is_available())
+    return PartialState(cpu=not torch.cuda.is_available(), timeout=STEP_TIMEOUT)
 
 
 def average_gradients(parameters: Iterable[Parameter]) -> None:
-    """Replace the gradients by their means over all ranks.
+    """Replace the gradients of parameters on the CPU by their means over all ranks.
 
     A gradient that only some ranks have is 0 on the others; one that no rank has stays None, so
     that the optimizer leaves its parameter unchanged.
@@ -107,15 +112,13 @@ def average_gradients(parameters: Iterable[Parameter]) -> None:
     import torch
     from torch import distributed
 
-    _get_state()
-    parameters = [*parameters]
-    device = parameters[0].device
-    present = torch.tensor([float(p.grad is not None) for p in parameters], device=device)
-    distributed.all_reduce(present)
+    parameters, group = [*parameters], _patient_group()
+    present = torch.tensor([float(p.grad is not None) for p in parameters])
+    distributed.all_reduce(present, group=group)
     trained = [p for p, ranks in zip(parameters, present.tolist(), strict=True) if ranks]
     gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in trained]
     joined = torch.cat([g.flatten() for g in gradients])
-    distributed.all_reduce(joined)
+    distributed.all_reduce(joined, group=group)
     means = (joined / world_size()).split([p.numel() for p in trained])
     for parameter, mean in zip(trained, means, strict=True):
         parameter.grad = mean.view_as(parameter)
@@ -127,8 +130,9 @@ def end_ranks() -> None:
     if world_size() > 1:
         from torch import distributed
 
-        distributed.barrier()
+        distributed.barrier(_patient_group())
         distributed.destroy_process_group()
+        _patient_group.cache_clear()
 
 
 def split_batch(batch: int, micro_batch: int = 1, key: str = "train.batch") -> int:
@@ -158,3 +162,13 @@ def split_batch(batch: int, micro_batch: int = 1, key: str = "train.batch") -> i
 def is_sharded() -> bool:
     """Return whether the launcher shards the model over the ranks (FSDP)."""
     return os.environ.get("ACCELERATE_USE_FSDP") == "true"
+
+
+def lacks_weights() -> bool:
+    """Return whether this rank gets the weights of a model that is sharded from the main rank, and
+    loads none itself. The first rank of a machine loads them, as transformers expects."""
+    return (
+        is_sharded()
+        and os.environ.get("FSDP_CPU_RAM_EFFICIENT_LOADING") == "true"
+        and os.environ["LOCAL_RANK"] != "0"
+    )

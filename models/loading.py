@@ -40,6 +40,7 @@ from models.checks import (
     first_line,
 )
 from models.compat import keep_differentiable, write_clips_as_released
+from models.distributed import is_sharded, lacks_weights, rank_device
 from models.student.chat_format import TIMED_PROCESSORS
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.towers import choose_lora_targets, find_unquantized
@@ -61,12 +62,13 @@ warnings.filterwarnings("ignore", "`is_gradient_checkpointing`", FutureWarning)
 
 
 def load_base(
-    cfg: StudentConfig, precision: str, corpus: Corpus
+    cfg: StudentConfig, precision: str, corpus: Corpus, sharded: bool = False
 ) -> tuple[PreTrainedModel, ProcessorMixin]:
     """Load the base that a preset names and its processor, or build them from its architecture.
 
     Args:
         corpus: Only called if the base is built.
+        sharded: As in `weight_options`.
 
     Raises:
         UserError: The model is neither a local folder nor in the hub's cache and cannot be
@@ -88,7 +90,10 @@ def load_base(
         code = {"trust_remote_code": cfg.trust_remote_code}
         kept = find_unquantized(AutoModelForImageTextToText, config, **code)
         model, info = AutoModelForImageTextToText.from_pretrained(
-            cfg.model, **weight_options(cfg, precision, kept), **origin, output_loading_info=True
+            cfg.model,
+            **weight_options(cfg, precision, kept, sharded),
+            **origin,
+            output_loading_info=True,
         )
         check_complete(cfg.model, info["missing_keys"])
     write_clips_as_released(processor)
@@ -99,7 +104,10 @@ def load_base(
 
 
 def weight_options(
-    cfg: StudentConfig | RetrieverConfig, precision: str, unquantized: Sequence[str]
+    cfg: StudentConfig | RetrieverConfig,
+    precision: str,
+    unquantized: Sequence[str],
+    sharded: bool = False,
 ) -> dict[str, Any]:
     """Return the arguments of `from_pretrained` for the weights of a preset.
 
@@ -109,13 +117,24 @@ def weight_options(
 
     Args:
         unquantized: Names of modules that are not quantised (see `models.towers`).
+        sharded: Whether the model will be sharded. Its unquantised weights are then loaded by one
+            rank only: on the others they have no values (device meta), until the trainer
+            distributes them.
     """
     trains_all = cfg.quantization == "none" and cfg.lora.rank == 0
     dtype = torch.float32 if trains_all else DTYPES[precision]
     options: dict[str, Any] = {"dtype": dtype, "use_safetensors": True}
     if cfg.quantization == "nf4":
         options["quantization_config"] = nf4_config(dtype, unquantized)
-    return options
+    elif sharded:
+        return options | ({"device_map": {"": "meta"}} if lacks_weights() else {})
+    return options | place_weights()
+
+
+def place_weights() -> dict[str, Any]:
+    """Return the arguments of `from_pretrained` that load weights straight onto this rank's GPU, if
+    there is one."""
+    return {"device_map": {"": rank_device()}} if torch.cuda.is_available() else {}
 
 
 def nf4_config(compute: torch.dtype, unquantized: Sequence[str]) -> BitsAndBytesConfig:
@@ -168,11 +187,22 @@ def load_student(
     cfg: StudentConfig, precision: str, corpus: Corpus
 ) -> tuple[nn.Module, ProcessorMixin]:
     """Load a student for training: its base, with new adapters if the preset has adapters."""
-    base, processor = load_base(cfg, precision, corpus)
+    base, processor = load_base(cfg, precision, corpus, is_sharded())
     prepare_for_training(base)
-    if cfg.lora.rank:
-        return name_base(add_adapters(base, cfg.lora), cfg), processor
-    return base, processor
+    model = name_base(add_adapters(base, cfg.lora), cfg) if cfg.lora.rank else base
+    if lacks_weights():
+        allocate_trained(model)
+    return model, processor
+
+
+def allocate_trained(model: nn.Module) -> None:
+    """Give the trained weights without values (device meta) memory on the CPU, which stays unused:
+    accelerate tells an optimizer's weights apart by their addresses."""
+    for module in model.modules():
+        for name, weight in module.named_parameters(recurse=False):
+            if weight.is_meta and weight.requires_grad:
+                setattr(module, name, nn.Parameter(torch.empty_like(weight, device="cpu")))
+    model.tie_weights()
 
 
 def prepare_for_training(base: PreTrainedModel) -> None:
@@ -301,7 +331,7 @@ def load_trained(
             check_adapters(folder, base, cfg.lora.rank, cfg.model)
             return for_inference(peft.PeftModel.from_pretrained(base, folder)), processor
     if (folder / EXPORT).exists():
-        return load_merged(folder)
+        return load_merged(folder, cfg.max_length)
     whole = replace(
         cfg, model=str(folder), architecture=None, quantization="none", lora=LoraConfig(rank=0)
     )
@@ -309,8 +339,11 @@ def load_trained(
     return for_inference(model), processor
 
 
-def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
+def load_merged(folder: Path, max_length: int) -> tuple[PreTrainedModel, ProcessorMixin]:
     """Load a student that `train.export` merged into its base, with transformers' classes only.
+
+    Args:
+        max_length: As in `choose_attention`.
 
     Raises:
         UserError: The folder is damaged.
@@ -318,10 +351,16 @@ def load_merged(folder: Path) -> tuple[PreTrainedModel, ProcessorMixin]:
     with explain_damage(folder):
         processor = AutoProcessor.from_pretrained(folder)
         model = AutoModelForImageTextToText.from_pretrained(
-            folder, dtype="auto", use_safetensors=True
+            folder, dtype="auto", use_safetensors=True, **place_weights()
         )
+    choose_attention(model, precision_of(model), max_length)
     processor.tokenizer.padding_side = "left"
     return for_inference(model), processor
+
+
+def precision_of(model: PreTrainedModel) -> str:
+    """Return the precision of a model's weights, bf16 or fp32."""
+    return next(name for name, dtype in DTYPES.items() if dtype == model.dtype)
 
 
 def merge_adapters(
@@ -341,9 +380,9 @@ def merge_adapters(
 
 
 def for_inference(model: nn.Module) -> nn.Module:
-    """Set a model to evaluation mode on the GPU, if there is one. Without quantisation, models are
-    loaded on the CPU."""
-    return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    """Set a model to evaluation mode on this rank's device. A model that was built from an
+    architecture is on the CPU."""
+    return model.to(rank_device()).eval()
 
 
 def save_student(

@@ -43,8 +43,9 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     keep_freed_memory()
     if is_sharded():
         raise UserError(
-            "a retriever cannot be trained with FSDP, because sentence-transformers cannot load a "
-            "sharded checkpoint: replace --use_fsdp by --multi_gpu, which works on CPUs too",
+            "a retriever cannot be trained with FSDP, because sentence-transformers evaluates in "
+            "torch's inference mode, after which sharded weights cannot be trained: replace "
+            "--use_fsdp by --multi_gpu, which works on CPUs too",
             code="unsupported-with-fsdp",
         )
     # Check the batch and the base now, because building the benchmark may take long.

@@ -5,7 +5,8 @@
 A file holds the embeddings of one kind of input (frame, query or text) that were made with the same
 settings. It records these settings, and the key in its name is their hash. Each batch is committed,
 so that a killed evaluation resumes after the last batch. All files can be deleted at any time. In a
-store that this user may not write, new embeddings are kept in a temporary file.
+store that this user may not write, new embeddings are kept in a temporary file. The ranks of a
+launcher share the batches, and the main rank alone has the files.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import json
 import logging
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,7 +24,9 @@ from tqdm import tqdm
 
 from conf.errors import UserError
 from conf.files import is_writable
+from conf.runs import rank
 from data.parallel import batched
+from models.distributed import map_over_ranks, share_from_main
 from models.fingerprints import settings_key
 
 log = logging.getLogger(__name__)
@@ -60,7 +63,10 @@ class EmbeddingCache:
             self._db.executescript(SCHEMA)
 
     def _connect(self, root: Path) -> sqlite3.Connection:
-        """Open the file, or a temporary copy of it if it cannot be written."""
+        """Open the file, or a temporary copy of it if it cannot be written. A rank other than the
+        main rank opens an empty temporary file."""
+        if rank() > 0:
+            return sqlite3.connect("")
         if is_writable(root) and is_writable(self.path):
             root.mkdir(parents=True, exist_ok=True)
             return sqlite3.connect(self.path, timeout=60)
@@ -78,27 +84,36 @@ class EmbeddingCache:
         """Embed the `inputs` that the cache lacks, `batch` at a time.
 
         Args:
-            inputs: The inputs by name, in the order in which they are embedded.
+            inputs: The inputs by name, in the order in which they are embedded. All ranks must have
+                the same.
             embed: Returns the fp32 embeddings (inputs, entries) of some inputs.
 
         Raises:
             UserError: An embedding is non-finite, or the file is damaged.
         """
         present = {name for (name,) in self._query("SELECT name FROM embedding")}
-        missing = [name for name in inputs if name not in present]
+        missing = share_from_main([name for name in inputs if name not in present])
         if not missing:
             return
-        with self._explain_damage(), self._db:
-            self._db.execute("INSERT OR IGNORE INTO about VALUES (?)", [self._settings])
-        done = len(inputs) - len(missing)
-        with tqdm(total=len(inputs), initial=done, desc="embedding", unit=self.kind) as bar:
-            for names in batched(missing, batch):
-                rows = embed([inputs[name] for name in names])
+        self._write("INSERT OR IGNORE INTO about VALUES (?)", [[self._settings]])
+        batches = [*batched(missing, batch)]
+        embedded = map_over_ranks(lambda names: embed([inputs[name] for name in names]), batches)
+        bar = tqdm(
+            total=len(inputs), initial=len(inputs) - len(missing), desc="embedding",
+            unit=self.kind, disable=rank() > 0,
+        )  # fmt: skip
+        with bar:
+            for names, rows in zip(batches, embedded, strict=True):
                 self._check_finite(rows, names)
                 pairs = zip(names, map(np.ndarray.tobytes, rows.astype(np.float32)), strict=True)
-                with self._explain_damage(), self._db:
-                    self._db.executemany("INSERT OR REPLACE INTO embedding VALUES (?, ?)", pairs)
+                self._write("INSERT OR REPLACE INTO embedding VALUES (?, ?)", pairs)
                 bar.update(len(names))
+
+    def _write(self, statement: str, rows: Iterable[Sequence[Any]]) -> None:
+        """Execute a statement for each row, all in one transaction. The main rank writes."""
+        if rank() == 0:
+            with self._explain_damage(), self._db:
+                self._db.executemany(statement, rows)
 
     def parts(self, names: Sequence[str]) -> Iterator[np.ndarray]:
         """Yield the embeddings of `names` in parts (rows, entries). The order of the rows is not

@@ -20,7 +20,7 @@ from conf.schema import RetrieverConfig
 from data.frames.frame_cache import FrameReader
 from data.records import FrameRef, sample_prefix_frames
 from evaluation.embedders.embedder import Query
-from models.loading import DTYPES, explain_unloadable
+from models.loading import DTYPES, explain_unloadable, for_inference, place_weights
 
 EmbedClips = Callable[[list[np.ndarray]], np.ndarray]
 
@@ -154,7 +154,7 @@ def load_complete(
         dtype=DTYPES[precision],
         output_loading_info=True,
         ignore_mismatched_sizes=True,
-        **{"use_safetensors": True, **options},
+        **{"use_safetensors": True, **place_weights(), **options},
     )
     mismatched = (name for name, *_ in loading_info["mismatched_keys"])
     if missing := sorted({*loading_info["missing_keys"], *mismatched}):
@@ -164,7 +164,7 @@ def load_complete(
             "model, or set the model that the preset names",
             code="incomplete-model",
         )
-    return model.eval().to("cuda" if torch.cuda.is_available() else "cpu")
+    return for_inference(model)
 
 
 def check_tokenizer(preset: RetrieverConfig, config: Any, tokenizer: Any) -> None:

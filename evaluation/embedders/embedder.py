@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from conf.runs import Run
+from conf.runs import Run, rank
 from conf.schema import ContrastiveCommand, EmbedderConfig, RetrieverConfig
 from conf.schema.evaluation import EmbeddingCommand
 from data.build import ensure_benchmark
@@ -25,6 +25,7 @@ from data.store import Store
 from evaluation.embedders.cache import EmbeddingCache
 from evaluation.metrics.results import UNTRAINED
 from models.checks import check_widths
+from models.distributed import main_first
 from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
 from models.precision import resolve_precision
 from models.resolved_settings import check_base
@@ -59,8 +60,8 @@ class Embedder:
     """A retriever that is evaluated. Its encoder is loaded when an embedding is missing.
 
     The `embed_` methods embed the inputs that the store's cache lacks, `batch` at a time, and
-    return the cache. They raise UserError if memory runs out, or if an embedding is non-finite or
-    has fewer entries than the widest width.
+    return the cache, from which only the main rank can read. They raise UserError if memory runs
+    out, or if an embedding is non-finite or has fewer entries than the widest width.
 
     Attributes:
         saved: Folder of the trained retriever; None for the preset's model as it was released.
@@ -144,7 +145,8 @@ class Embedder:
         folder = self.store.folder / EMBEDDINGS
         embeddings = EmbeddingCache(folder, kind, self.settings() | settings)
         embeddings.complete(inputs, embed, self.batch)
-        self._check_widths(embeddings.width)
+        if rank() == 0:
+            self._check_widths(embeddings.width)
         return embeddings
 
     def _check_widths(self, entries: int) -> None:
@@ -181,7 +183,8 @@ def open_retriever(
     folder, trained = resolve_model(
         cfg, cfg.benchmark, ContrastiveCommand, "retriever", run.overrides
     )
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
+    with main_first():
+        store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     embedders = open_embedders(folder, trained, store, run.folder, cfg.batch)
     return trained.retriever, store, embedders
 

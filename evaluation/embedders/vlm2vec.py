@@ -11,7 +11,8 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 from conf.errors import UserError
 from conf.schema import RetrieverConfig
 from models.checks import check_processor
-from models.loading import DTYPES, explain_unloadable, pin_sizes
+from models.distributed import rank_device
+from models.loading import DTYPES, explain_unloadable, pin_sizes, place_weights
 from models.retriever.embedder import PROCESSING
 
 TEMPLATE = (
@@ -35,7 +36,12 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
     with explain_unloadable("retriever", preset.model):
         backbone = Transformer(
             preset.model,
-            model_kwargs={"dtype": DTYPES[precision], "use_safetensors": True, **origin},
+            model_kwargs={
+                "dtype": DTYPES[precision],
+                "use_safetensors": True,
+                **origin,
+                **place_weights(),
+            },
             processor_kwargs=origin,
             config_kwargs=origin,
             processing_kwargs=PROCESSING,
@@ -53,10 +59,9 @@ def load_vlm2vec(preset: RetrieverConfig, precision: str) -> SentenceTransformer
     backbone.processor.tokenizer.padding_side = "left"
     backbone.register_forward_pre_hook(use_text_positions)
     pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
-    device = "cuda" if torch.cuda.is_available() else "cpu"
     prompts = {"query": preset.query_instruction, "document": preset.frame_instruction}
     modules = [backbone, pooling, Normalize()]
-    return SentenceTransformer(modules=modules, device=device, prompts=prompts)
+    return SentenceTransformer(modules=modules, device=str(rank_device()), prompts=prompts)
 
 
 def use_text_positions(module: Any, args: tuple[dict[str, Any]]) -> None:

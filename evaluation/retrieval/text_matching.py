@@ -17,7 +17,7 @@ import numpy as np
 
 from conf.errors import UserError
 from conf.files import is_writable
-from conf.runs import lock_folder
+from conf.runs import lock_folder, rank
 from conf.schema import StudentConfig, TwoStageCommand
 from data.records import FrameRef, RetrievalQuery
 from data.store import Store
@@ -85,7 +85,7 @@ def collect_texts(
     own: Path,
 ) -> dict[str, list[ModelResponse]]:
     """Return a model's responses by mode, in the modes that the routes need: to every frame of the
-    database in caption mode, to every query in the other modes.
+    database in caption mode, to every query in the other modes. Only the main rank returns them.
 
     They are kept in the store; in the folder `own`, if the store cannot be written.
 
@@ -153,8 +153,9 @@ def rank_by_text(
     texts: Mapping[str, Texts],
     queries: Sequence[RetrievalQuery],
     database: Sequence[FrameRef],
-) -> Ranks:
-    """Rank the database for every query by its text.
+) -> Ranks | None:
+    """Rank the database for every query by its text. The ranks of a launcher share the embedding;
+    only the main rank returns ranks.
 
     A query is a miss if its text is empty or, on a route with captions, its target's caption is.
 
@@ -178,17 +179,15 @@ def rank_by_text(
     text_of = list(compress(text_of, valid))
     targets = [query.target.name for query in compress(queries, valid)]
 
-    query_rows = matcher.embed_texts(text_of).rows(text_of)
-    if route.captions:
-        present = [captions[name] for name in names if captions[name]]
-        embeddings = matcher.embed_texts(present)
-        target_rows = embeddings.rows([captions[target] for target in targets])
-        # Frames with the same caption tie, and each of them counts.
-        parts = [embeddings.rows(present)]
-    else:
-        embeddings = matcher.embed_frames(database)
-        target_rows, parts = embeddings.rows(targets), embeddings.parts(names)
-    ranks = rank_targets(matcher.preset, query_rows, target_rows, parts)
+    present = [captions[name] for name in names if captions[name]]
+    embedded = matcher.embed_texts(text_of)
+    embeddings = matcher.embed_texts(present) if route.captions else matcher.embed_frames(database)
+    if rank() > 0:
+        return None
+    target_rows = embeddings.rows([captions[target] for target in targets])
+    # Frames with the same caption tie, and each of them counts.
+    parts = [embeddings.rows(present)] if route.captions else embeddings.parts(present)
+    ranks = rank_targets(matcher.preset, embedded.rows(text_of), target_rows, parts)
     above, tied = np.zeros((2, len(ranks.widths), len(queries)), np.int64)
     above[:, valid], tied[:, valid] = ranks.above, ranks.tied
     return replace(ranks, above=above, tied=tied, found=np.array(valid), frames=len(names))

@@ -14,7 +14,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors.torch import load_file
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
@@ -34,13 +33,15 @@ from models.checks import (
     check_processor,
 )
 from models.compat import keep_differentiable, write_clips_as_released
-from models.distributed import main_first
+from models.distributed import main_first, rank_device
 from models.loading import (
     explain_damage,
     explain_unloadable,
     lora_config,
     name_base,
     pin_sizes,
+    place_weights,
+    precision_of,
     weight_options,
 )
 from models.retriever.inputs import Retriever, query_form
@@ -119,7 +120,7 @@ def load_retriever(
 
 def _load_base(cfg: RetrieverConfig, source: str, precision: str) -> Retriever:
     """Load a saved retriever with its own modules, or a model with those of this project."""
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = str(rank_device())
     origin = {"revision": cfg.revision, "trust_remote_code": cfg.trust_remote_code}
     kept: list[str] = []
     if cfg.quantization == "nf4":
@@ -222,7 +223,10 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
 def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
     """Load a retriever that `train.export` merged, in the precision of its weights and with
     sentence-transformers' classes only. Raises UserError if it cannot be read."""
-    return _load_saved(folder, cfg, model_kwargs={"dtype": "auto", "use_safetensors": True})
+    weights = {"dtype": "auto", "use_safetensors": True, **place_weights()}
+    model = _load_saved(folder, cfg, model_kwargs=weights)
+    choose_attention(model[0].model, precision_of(model[0].model), cfg.max_length)
+    return model
 
 
 def _load_saved(folder: Path, cfg: RetrieverConfig, **options: Any) -> Retriever:

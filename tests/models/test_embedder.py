@@ -14,6 +14,7 @@ from conf.schema import LateConfig, LoraConfig
 from conf.schema.benchmark import POOLS
 from data.items.database import UniqueFrames
 from data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
+from models.attention import BY_FRAME
 from models.compat import keep_differentiable
 from models.retriever import embedder
 from models.retriever.inputs import frame_input, query_input
@@ -136,6 +137,18 @@ def test_adapters_and_projection_are_trained_in_fp32_over_a_bf16_base(
     assert next(model[0].parameters()).dtype == torch.bfloat16
     query = [query_input(micro_store.retrieval("train")[0], frames, cfg)]
     assert torch.as_tensor(model.encode_query(query)[0]).isfinite().all()
+
+
+def test_a_merged_export_has_the_attention_of_its_base(
+    micro_store, retriever_cfg, tmp_path
+) -> None:
+    model = load(micro_store, retriever_cfg, tmp_path / "base")
+    model.save_pretrained(str(tmp_path / "merged"), create_model_card=False)
+    merged = embedder.load_merged(tmp_path / "merged", retriever_cfg)
+    for tower in ("text_config", "vision_config"):
+        ours, theirs = (getattr(m[0].model.config, tower) for m in (merged, model))
+        assert ours._attn_implementation == theirs._attn_implementation
+    assert merged[0].model.config.vision_config._attn_implementation == BY_FRAME
 
 
 def test_a_missing_base_is_not_called_a_damaged_run(retriever_cfg, tmp_path) -> None:

@@ -88,6 +88,34 @@ def test_a_saved_student_gives_the_same_logits(nf4_cfg, micro_store, frames, tmp
     torch.testing.assert_close(one, two, atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("precision", ["bf16", "fp32"])
+def test_a_merged_export_has_the_attention_of_its_base(nf4_cfg, tmp_path, precision) -> None:
+    plain = replace(nf4_cfg, quantization="none")
+    base, processor = loading.load_base(plain, precision, list)
+    loading.write_model(base, processor, tmp_path)
+    merged, _ = loading.load_merged(tmp_path, plain.max_length)
+    assert merged.dtype == base.dtype == loading.DTYPES[precision]
+    for tower in ("text_config", "vision_config"):
+        ours, theirs = (getattr(model.config, tower) for model in (merged, base))
+        assert ours._attn_implementation == theirs._attn_implementation != "sdpa"
+
+
+@pytest.mark.parametrize("local_rank", ["0", "1"])
+def test_one_rank_of_a_sharded_training_loads_the_weights(nf4_cfg, monkeypatch, local_rank) -> None:
+    """An evaluation that accelerate starts in the same way has all weights."""
+    for name in ("ACCELERATE_USE_FSDP", "FSDP_CPU_RAM_EFFICIENT_LOADING"):
+        monkeypatch.setenv(name, "true")
+    monkeypatch.setenv("LOCAL_RANK", local_rank)
+    plain = replace(nf4_cfg, quantization="none")
+    model, _ = loading.load_student(plain, "fp32", list)
+    for weight in model.parameters():
+        # accelerate needs the trained weights of all ranks.
+        has_values = weight.requires_grad or local_rank == "0"
+        assert weight.device.type == ("cpu" if has_values else "meta")
+    base, _ = loading.load_base(plain, "fp32", list)
+    assert {weight.device.type for weight in base.parameters()} == {"cpu"}
+
+
 def test_adapters_are_saved_without_a_look_at_the_hub(nf4_cfg, tmp_path, monkeypatch) -> None:
     def look_up(*_: object) -> None:
         raise AssertionError("a save needs no network")

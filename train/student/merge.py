@@ -72,7 +72,9 @@ class StudentMerge:
 
     def merged_outputs(self, folder: Path, items: Items) -> ModelOutputs:
         """Return the outputs of the merged student in a folder."""
-        return self._outputs(*loading.load_merged(folder), items, autocast=False)
+        return self._outputs(
+            *loading.load_merged(folder, self.settings.student.max_length), items, False
+        )
 
     @torch.inference_mode()
     def _outputs(
