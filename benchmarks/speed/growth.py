@@ -43,7 +43,6 @@ from data.parallel import Workers
 from data.store import open_store
 from teacher.narrate import JOURNAL_FILE, narrate_store
 
-PAPER_SCENES = 10_000
 BUILD_PARTS = {
     "make_scenes": "scenes",
     "make_items_and_queries": "items and queries",
@@ -99,10 +98,12 @@ def build_scenes(scenes: int, args: argparse.Namespace) -> Seconds:
 
 
 def scale_preset(scenes: int) -> BenchmarkConfig:
-    """Return the dynapix preset for another number of scenes. The quotas and the sizes of the
-    standard test and of the databases change in proportion."""
+    """Return the dynapix preset for another number of scenes. The test scenes, the quotas and the
+    sizes of the databases change in proportion."""
     cfg = compose("data.build", BuildCommand, ["benchmark=dynapix"]).benchmark
-    cfg.name, cfg.scenes, share = f"growth-{scenes}", scenes, scenes / PAPER_SCENES
+    share = scenes / cfg.scenes
+    cfg.name, cfg.scenes = f"growth-{scenes}", scenes
+    cfg.test_scenes = round(share * cfg.test_scenes)
 
     def scaled(quota: Quota) -> Quota:
         return Quota(round(share * quota.train), round(share * quota.test))
@@ -112,7 +113,7 @@ def scale_preset(scenes: int) -> BenchmarkConfig:
             quotas[name] = scaled(quota)
     cfg.selection.matched = scaled(cfg.selection.matched)
     cfg.retrieval.counterfactual = scaled(cfg.retrieval.counterfactual)
-    for key in ("standard", "database", "source", "counterfactual_source"):
+    for key in ("database", "source", "counterfactual_source"):
         setattr(cfg.retrieval, key, round(share * getattr(cfg.retrieval, key)))
     return cfg
 
