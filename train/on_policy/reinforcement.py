@@ -13,8 +13,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -32,19 +33,21 @@ from data.frames.frame_cache import FrameReader
 from data.records import SelectionItem
 from data.store import Store
 from models.distributed import split_batch
-from models.student.collator import Collator
+from models.student.collator import pad
 from models.student.prompts import Sample, selection_sample
 from teacher.predicates.facts import RelationalPredicates
 from teacher.vocabulary import describe_item
 from train.common.arguments import common_arguments
 from train.common.callbacks import EpochCallback
 from train.common.held_out import check_not_empty
-from train.on_policy.sampling import ResponseSampler
+from train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
 from train.on_policy.served_sampling import build_sampler
 from train.rewards import REWARDS, JudgedResponse, judge_response
 from train.student.dataset import split_items
 from train.student.lazy_samples import seeded_rng
 
+PROMPT = "encoded"
+"""Key of the encoded prompt in a row of the dataset."""
 ROW = "row"
 """Key of the index of a response among those that were sampled together."""
 
@@ -67,18 +70,16 @@ def load_items(
         UserError: there are none.
     """
     frames = FrameReader(store, trained.student.image_size)
+    regime, count = trained.train.regime, trained.student.frames
 
     def with_predicates(items: Sequence[SelectionItem]) -> list[ItemToJudge]:
         found = []
         for item in items:
             predicates = describe_item(item, store, trained.teacher)
             if predicates is not None:
-                found.append(ItemToJudge(item, predicates, lambda item=item: prompt(item)))
+                prompt = partial(selection_sample, item, "reasoning", regime, frames, count)
+                found.append(ItemToJudge(item, predicates, prompt))
         return found
-
-    def prompt(item: SelectionItem) -> Sample:
-        regime, count = trained.train.regime, trained.student.frames
-        return selection_sample(item, "reasoning", regime, frames, count)
 
     split = split_items(store, cfg.validation_items, seed, cfg.hold_out)
     training, validation = map(with_predicates, split)
@@ -87,13 +88,33 @@ def load_items(
     return training, validation
 
 
-def make_rows(items: Sequence[ItemToJudge], split: str) -> Dataset:
-    """Return the rows of TRL's dataset: the index of each item. TRL needs a prompt, but the prompts
-    are rendered later."""
-    ids = [entry.item.item_id for entry in items]
-    return Dataset.from_dict(
-        {"prompt": ids, "index": list(range(len(ids))), "split": [split] * len(ids)}
-    )
+class PromptRows(Dataset):
+    """TRL's dataset: a row per item of a split, whose prompt is rendered and encoded when it is
+    read. Rows of an item that are read together share its prompt.
+
+    The index ~k, which is negative, returns row k without its prompt: TRL reads the rows of a step
+    for each of its micro-batches, but uses them once.
+
+    Args:
+        name: Name of the split.
+        encode: Encodes a prompt.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        items: Sequence[ItemToJudge],
+        encode: Callable[[Sample], EncodedPrompt],
+    ) -> None:
+        # TRL needs a text as the prompt.
+        super().__init__(Dataset.from_dict({"prompt": [e.item.item_id for e in items]}).data)
+        self._name, self._items, self._encode = name, items, encode
+
+    def __getitems__(self, indices: list[int]) -> list[dict[str, Any]]:
+        read = [k for k in dict.fromkeys(indices) if k >= 0]
+        prompts = {k: self._encode(self._items[k].render()) for k in read}
+        rows = [{"split": self._name, "index": max(k, ~k), PROMPT: prompts.get(k)} for k in indices]
+        return [{"prompt": self._items[row["index"]].item.item_id, **row} for row in rows]
 
 
 def make_reward(name: str) -> Callable[..., list[float]]:
@@ -108,7 +129,15 @@ def make_reward(name: str) -> Callable[..., list[float]]:
 
 class EpochSampler(RepeatSampler):
     """TRL's sampler with an order of its own in each epoch. TRL's continues one order of random
-    numbers, which a resumed run would begin again."""
+    numbers, which a resumed run would begin again.
+
+    Where it repeats the indices k of a step, it returns ~k.
+    """
+
+    def __iter__(self) -> Iterator[int]:
+        step = self.batch_size * self.mini_repeat_count
+        for position, index in enumerate(super().__iter__()):
+            yield index if position // step % self.repeat_count == 0 else ~index
 
     def set_epoch(self, epoch: int) -> None:
         self.generator.manual_seed(self.seed + epoch)
@@ -120,7 +149,6 @@ class MediaGRPOTrainer(GRPOTrainer):
     Args:
         items: The items by split, train and eval.
         response_sampler: Samples the responses.
-        collator: Makes the model's inputs.
     """
 
     def __init__(
@@ -129,7 +157,6 @@ class MediaGRPOTrainer(GRPOTrainer):
         *args: Any,
         items: Mapping[str, Sequence[ItemToJudge]],
         response_sampler: ResponseSampler,
-        collator: Collator,
         **settings: Any,
     ) -> None:
         trained = {p: p.data for p in model.parameters() if p.requires_grad}
@@ -140,10 +167,9 @@ class MediaGRPOTrainer(GRPOTrainer):
         for parameter, data in trained.items():
             parameter.data = data
         self._items, self.response_sampler = items, response_sampler
-        self._collator = collator
         self._batch_items: list[ItemToJudge] = []
-        self._prompts: list[Sample] = []
-        self._inputs: list[Sample] = []
+        self._prompts: list[EncodedPrompt] = []
+        self._inputs: list[EncodedPrompt] = []
         self._differ = torch.empty(0, dtype=torch.bool)
 
     def _send_telemetry(self) -> None:
@@ -171,7 +197,7 @@ class MediaGRPOTrainer(GRPOTrainer):
         Responses to an item whose rewards are all equal do not count in the mean over tokens.
         """
         self._batch_items = [self._items[row["split"]][row["index"]] for row in inputs]
-        self._prompts = [entry.render() for entry in self._batch_items]
+        self._prompts = [row[PROMPT] for row in inputs]
         output = super()._generate_and_score_completions(inputs)
         first = self.accelerator.process_index * len(inputs)
         counted = self._differ[first : first + len(inputs), None]
@@ -213,11 +239,7 @@ class MediaGRPOTrainer(GRPOTrainer):
         ]
         if training:
             self.response_sampler.check_parsed([j.letter for j in judged], self.accelerator)
-        batch = self._collator(self._prompts)
-        prompt_ids = [
-            ids[mask.bool()].tolist()
-            for ids, mask in zip(batch["input_ids"], batch["attention_mask"], strict=True)
-        ]
+        prompt_ids = [prompt.encoded.input_ids for prompt in self._prompts]
         ids = [list(t.ids) for t in texts]
         return {"prompt_ids": prompt_ids, "completion_ids": ids, "logprobs": None, "judged": judged}
 
@@ -239,15 +261,15 @@ class MediaGRPOTrainer(GRPOTrainer):
     ) -> tuple[Tensor, Tensor, None]:
         """Return the logarithms of the probabilities of the responses' tokens, and the entropies,
         (B, `logits_to_keep`). The pixels are those of the prompts."""
-        batch = self._collator(self._inputs)
+        batch = pad([prompt.encoded for prompt in self._inputs], self._tokenizer.pad_token_id)
         length = input_ids.shape[1] - logits_to_keep
-        # TRL pads prompts on the left, as the collator does, and responses on the right.
+        # TRL pads prompts on the left, as `pad` does, and responses on the right.
         inputs = {}
         for name, value in batch.items():
             if name.endswith("type_ids"):
                 inputs[name] = torch.zeros_like(input_ids)
                 inputs[name][:, length - value.shape[1] : length] = value.to(input_ids.device)
-            elif name not in ("input_ids", "attention_mask"):
+            elif name not in ("input_ids", "attention_mask", "labels"):
                 inputs[name] = value.to(input_ids.device)
         with self.accelerator.autocast():
             logits = model(
@@ -320,6 +342,7 @@ def build_trainer(
             f"train.batch={train.batch} is more than the {len(training)} training items: lower it",
             code="batch-too-large",
         )
+    encode = partial(encode_prompt, processor=processor, max_length=student.max_length)
     names = [name for name in REWARDS if getattr(train.rewards, name)]
     arguments = GRPOConfig(
         **common_arguments(train, run, cfg.seed, checkpoint),
@@ -338,12 +361,11 @@ def build_trainer(
         model=model,
         args=arguments,
         reward_funcs=[make_reward(name) for name in names],
-        train_dataset=make_rows(training, "train"),
-        eval_dataset=make_rows(validation, "eval"),
+        train_dataset=PromptRows("train", training, encode),
+        eval_dataset=PromptRows("eval", validation, encode),
         processing_class=processor,
         items={"train": training, "eval": validation},
         response_sampler=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
-        collator=Collator(processor, student.max_length),
     )
     trainer.add_callback(EpochCallback(trainer))
     return trainer

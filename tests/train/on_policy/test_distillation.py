@@ -100,7 +100,8 @@ def test_responses_do_not_depend_on_how_many_are_sampled_at_once(
     model, processor = loading.load_student(cfg, "fp32", list)
     rationales = ensure_rationales(micro_store, trained.teacher)
     training, _ = paired_prompts.load_datasets(settings, trained, micro_store, rationales)
-    prompts = [training[k].student for k in range(5)]
+    samples = [training[k].student for k in range(5)]
+    prompts = [sampling.encode_prompt(s, processor, cfg.max_length) for s in samples]
     found = []
     for size in (None, 2):
         train_settings = replace(settings.train, sampling_batch=size)
@@ -123,7 +124,9 @@ def test_datasets_can_be_sent_to_worker_processes(settings, student, micro_store
     assert ours.student.content == theirs.student.content
 
 
-LESS_MEMORY = {"micro_batch": 1, "sampling_batch": 3, "gradient_checkpointing": True}
+LESS_MEMORY = {
+    "micro_batch": 1, "sampling_batch": 3, "gradient_checkpointing": True, "workers": 1
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("changes", [{}, LESS_MEMORY], ids=["same", "less memory"])

@@ -15,6 +15,7 @@ from conf.entry import Run
 from conf.runs import open_run
 from conf.schema import ReinforceCommand, ReinforceTrainConfig, RewardWeights, SftCommand
 from data.store import Store
+from models.student.collator import Collator
 from models.trained_runs import read_trained_settings
 from tests.user_errors import raises_user_error
 from train import reinforce, sft
@@ -62,7 +63,7 @@ def short_rewards(monkeypatch) -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"micro_batch": 1, "sampling_batch": 3, "gradient_checkpointing": True}],
+    [{}, {"micro_batch": 1, "sampling_batch": 3, "gradient_checkpointing": True, "workers": 1}],
     ids=["same", "less memory"],
 )
 def test_a_killed_run_samples_the_same_responses(
@@ -94,11 +95,12 @@ def test_a_killed_run_samples_the_same_responses(
 
 
 def test_probabilities_are_those_of_the_student_trainer(
-    settings, tmp_path, monkeypatch, short_rewards
+    settings, processor, tmp_path, monkeypatch, short_rewards
 ) -> None:
     """The summed logarithms of a response's probabilities are minus its cross entropy."""
     checked = []
     compute = reinforcement.MediaGRPOTrainer._get_per_token_logps_and_entropies
+    collate = Collator(processor, None)
 
     def compared(self, model, input_ids, attention_mask, logits_to_keep, *rest, **settings):
         logs, entropies, _ = compute(
@@ -106,12 +108,12 @@ def test_probabilities_are_those_of_the_student_trainer(
         )
         mask = attention_mask[:, -logits_to_keep:].bool()
         samples = [
-            replace(sample, response="", response_ids=tuple(ids[kept].tolist()))
-            for sample, ids, kept in zip(
+            replace(prompt.sample, response="", response_ids=tuple(ids[kept].tolist()))
+            for prompt, ids, kept in zip(
                 self._inputs, input_ids[:, -logits_to_keep:], mask, strict=True
             )
         ]
-        batch = self._collator(samples)
+        batch = collate(samples)
         labels = batch.pop("labels")
         with torch.no_grad():
             losses = token_losses(model(**batch, use_cache=False).logits, labels)
@@ -125,6 +127,22 @@ def test_probabilities_are_those_of_the_student_trainer(
     train = replace(settings.train, max_steps=1, evaluations=1)
     run_reinforce(replace(settings, train=train), tmp_path / "run")
     assert sum(checked) >= 8
+
+
+def test_a_step_encodes_each_prompt_once(settings, tmp_path, monkeypatch, short_rewards) -> None:
+    encoded: list[str] = []
+    encode = sampling.encode
+
+    def counted(sample, *rest):
+        encoded.append(sample.sample_id)
+        return encode(sample, *rest)
+
+    monkeypatch.setattr(sampling, "encode", counted)
+    train = replace(settings.train, max_steps=3, evaluations=1, micro_batch=1)
+    run_reinforce(replace(settings, train=train), tmp_path / "run")
+    # Two evaluations of one item, and the two items of each step; the data loader reads the next.
+    assert len(encoded) == 2 * 1 + (3 + 1) * 2
+    assert len(set(encoded)) == 1 + 4 * 2
 
 
 def test_a_run_resumes_in_its_second_epoch(settings, tmp_path, monkeypatch, short_rewards) -> None:

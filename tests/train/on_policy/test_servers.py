@@ -36,6 +36,7 @@ from tests.user_errors import raises_user_error
 from train import distill
 from train.common.journal import read_journal
 from train.on_policy.paired_prompts import load_datasets
+from train.on_policy.sampling import encode_prompt
 from train.on_policy.served_sampling import build_sampler
 from train.on_policy.teachers import ServerTeacher
 
@@ -123,7 +124,7 @@ def test_a_student_is_distilled_from_a_server(teacher, settings, tmp_path) -> No
 
 def distance_from_greedy(model, processor, prompts, texts) -> float:
     """Return how far a response's token is at most from the token with the largest logit."""
-    answered = [replace(p, response_ids=t.ids) for p, t in zip(prompts, texts, strict=True)]
+    answered = [replace(p.sample, response_ids=t.ids) for p, t in zip(prompts, texts, strict=True)]
     batch = Collator(processor, None)(answered)
     tokens = batch.pop("labels")[:, 1:]
     with torch.no_grad():
@@ -144,7 +145,7 @@ def test_vllm_samples_from_the_current_adapters(
     model.eval()
     rationales = ensure_rationales(micro_store, trained.teacher)
     training, _ = load_datasets(settings, trained, micro_store, rationales)
-    prompts = [training[k].student for k in range(6)]
+    prompts = [encode_prompt(training[k].student, processor, 4000) for k in range(6)]
     servers = SamplingServerConfig(url=vllm.url, unreachable_timeout=60)
     sampler = build_sampler(processor, cfg, train, servers, tmp_path)
     found = []
@@ -245,7 +246,8 @@ def test_servers_that_cannot_sample_are_named(
     servers = SamplingServerConfig(url=server.url, unreachable_timeout=5)
     sampler = build_sampler(processor, trained.student, settings.train, servers, tmp_path)
     with raises_user_error(code, contains=message):
-        sampler.sample(model, samples, range(len(samples)))
+        prompts = [encode_prompt(s, processor, 4000) for s in samples]
+        sampler.sample(model, prompts, range(len(prompts)))
     server.stop()
     whole = replace(trained.student, lora=LoraConfig(rank=0))
     with raises_user_error("no-adapters", contains="student.lora.rank is 0"):
