@@ -26,6 +26,7 @@ from models.student.prompts import Sample
 from models.student.responses import GeneratedText
 from train.common.audit import audit_student
 from train.common.callbacks import EpochCallback
+from train.on_policy.mismatch import Mismatch
 from train.on_policy.paired_prompts import PairedPrompts
 from train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
 from train.on_policy.served_sampling import build_sampler
@@ -41,6 +42,8 @@ log = logging.getLogger(__name__)
 
 TEACHER = "teacher_inputs"
 """Key of the teacher's inputs in a batch."""
+SAMPLED = "sampled_log_probabilities"
+"""Key of the sampler's log-probabilities (N,) of the supervised tokens in a batch."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ class DistillationTrainer(StudentTrainer):
         teacher: Measures the divergence.
         response_sampler: Samples the responses.
         pad_id: Token id of the padding.
+        temperature: Temperature of the sampling.
     """
 
     def __init__(
@@ -75,12 +79,15 @@ class DistillationTrainer(StudentTrainer):
         teacher: Teacher,
         response_sampler: ResponseSampler,
         pad_id: int,
+        temperature: float,
         **settings: Any,
     ) -> None:
         super().__init__(*args, compute_loss_func=self._mean_divergence, **settings)
         self._teacher, self.response_sampler = teacher, response_sampler
-        self._pad_id = pad_id
+        self._pad_id, self._temperature = pad_id, temperature
         self._teacher_inputs: Any = None
+        self._sampled_logs = torch.zeros(0)
+        self._mismatch = Mismatch()
         self._sampled: list[tuple[bool, bool, int]] = []
 
     def get_batch_samples(
@@ -124,6 +131,7 @@ class DistillationTrainer(StudentTrainer):
         **settings: Any,
     ) -> Any:
         self._teacher_inputs = inputs.pop(TEACHER, None)
+        self._sampled_logs = inputs.pop(SAMPLED, None)
         return super().compute_loss(model, inputs, return_outputs, **settings)
 
     def _mean_divergence(
@@ -135,6 +143,11 @@ class DistillationTrainer(StudentTrainer):
             return token_mean(outputs, labels, num_items_in_batch)
         supervised = labels[:, 1:] != IGNORED
         logits, tokens = outputs.logits[:, :-1][supervised], labels[:, 1:][supervised]
+        with torch.no_grad():
+            scaled = logits.float() / self._temperature
+            chosen = scaled.gather(1, tokens[:, None])[:, 0]
+            self._mismatch.add(chosen - scaled.logsumexp(dim=-1) - self._sampled_logs)
+            del scaled
         total = self._teacher.measure(self._teacher_inputs, logits, tokens).sum()
         return total / (supervised.sum() if num_items_in_batch is None else num_items_in_batch)
 
@@ -149,6 +162,7 @@ class DistillationTrainer(StudentTrainer):
                 "sampled_accuracy": right / max(count, 1),
                 "sampled_parse_rate": parsed / max(count, 1),
                 "sampled_length": tokens / max(count, 1),
+                **self._mismatch.take(self.accelerator),
             }
             self._sampled = []
         super().log(logs, *args, **settings)
@@ -171,8 +185,15 @@ def answer_student(
         append_response(e.encoded, t.ids, t.ids)
         for e, t in zip(batch["encoded"], texts, strict=True)
     ]
-    inputs = make_batch(answered, [p.supervised for p in prompts], pad_id)
-    return {**inputs, "sample_ids": [p.student.sample_id for p in prompts]}
+    supervised = [p.supervised for p in prompts]
+    logs = [
+        x for t, kept in zip(texts, supervised, strict=True) if kept for x in t.log_probabilities
+    ]
+    return {
+        **make_batch(answered, supervised, pad_id),
+        SAMPLED: torch.tensor(logs),
+        "sample_ids": [p.student.sample_id for p in prompts],
+    }
 
 
 def build_trainer(
@@ -220,4 +241,5 @@ def build_trainer(
         teacher=teacher,
         response_sampler=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
         pad_id=processor.tokenizer.pad_token_id,
+        temperature=train.temperature,
     )

@@ -145,7 +145,7 @@ class ServedSampler(ResponseSampler):
 
     async def _request(self, pool: ServerPool, prompt: EncodedPrompt, seed: int) -> GeneratedText:
         fields = sampling_fields(self._sampling, self._sampling.max_new_tokens)
-        fields["extra_body"]["return_token_ids"] = True
+        fields["logprobs"] = fields["extra_body"]["return_token_ids"] = True
         shown = prompt.sample
         if takes_clips(self._processor):
             fields["extra_body"] |= qwen_fields(self._sampling, shown.clip)
@@ -172,15 +172,15 @@ class ServedSampler(ResponseSampler):
             )
 
     def _read(self, response: Response) -> GeneratedText:
-        ids = response.token_ids
-        if not ids:
+        ids, logs = response.token_ids, response.log_probabilities
+        if not ids or len(logs) != len(ids):
             raise UserError(
-                "the servers of sampling_server.url return no token ids: use vLLM, whose responses "
-                "contain them",
+                "the servers of sampling_server.url return no token ids, or not their "
+                "log-probabilities: use vLLM, whose responses contain both",
                 code="no-token-ids",
             )
         text = self._processor.tokenizer.decode(ids, skip_special_tokens=True)
-        return GeneratedText(text, response.flaw == TRUNCATED, ids)
+        return GeneratedText(text, response.flaw == TRUNCATED, ids, logs)
 
 
 @contextmanager

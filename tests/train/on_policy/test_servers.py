@@ -176,10 +176,13 @@ def test_vllm_samples_from_the_current_adapters(
 def test_a_student_is_distilled_from_responses_of_a_server(vllm, settings, tmp_path) -> None:
     run = Run("run", tmp_path)
     servers = SamplingServerConfig(url=vllm.url, unreachable_timeout=60)
-    distill.main.__wrapped__(replace(settings, sampling_server=servers), run)
+    train = replace(settings.train, temperature=0.7)
+    distill.main.__wrapped__(replace(settings, train=train, sampling_server=servers), run)
     losses = [r for r in read_journal(run.folder) if "loss" in r]
     assert len(losses) == 2
     assert all(r["loss"] > 0 and r["sampled_length"] == 8 for r in losses)
+    # The server's log-probabilities are those after temperature.
+    assert all(r["mismatch_max"] < 0.02 for r in losses)
     assert not (run.folder / "sampled_adapters").exists()
 
 
@@ -215,16 +218,20 @@ def test_unsuitable_servers_are_named(processor, samples, texts, code, message) 
 
 class FixedHandler(JsonHandler):
     """A server that loads no adapters (404), whose responses have no token ids, or that has other
-    token ids of the prompt."""
+    token ids of the prompt. `scored` is the number of tokens with log-probabilities."""
 
-    loads, ids = True, None
+    loads, ids, scored = True, None, 2
 
     def post(self, body: dict) -> None:
         if self.path.endswith("/load_lora_adapter"):
             self.respond(200 if self.loads else 404, {})
             return
         message = {"role": "assistant", "content": "Answer: A"}
-        choice = {"index": 0, "message": message, "finish_reason": "stop", "token_ids": self.ids}
+        scored = [{"token": "", "logprob": -1.0, "top_logprobs": []} for _ in self.ids or ()]
+        choice = {
+            "index": 0, "message": message, "finish_reason": "stop", "token_ids": self.ids,
+            "logprobs": {"content": scored[: self.scored]},
+        }  # fmt: skip
         body = {"id": "0", "object": "chat.completion", "choices": [choice]}
         self.respond(200, {**body, "prompt_token_ids": self.ids})
 
@@ -234,6 +241,7 @@ class FixedHandler(JsonHandler):
     [
         (False, None, "no-adapters", "adapter_rank=RANK"),
         (True, None, "no-token-ids", "return no token ids"),
+        (True, [5, 6, 7], "no-token-ids", "or not their log-probabilities"),
         (True, [5, 6], "other-prompts", "at token 0 of the first prompt, this process has"),
     ],
 )
