@@ -5,7 +5,7 @@ TRL 1.16 passes images to the model, but no videos with true times (huggingface/
 fixed here: `MediaGRPOTrainer` computes the probabilities of responses with the project's own
 inputs, and keeps the adapters in fp32. It also keeps the order of the items when a run resumes in a
 later epoch, leaves items whose responses have equal rewards out of the mean, and stops at a
-non-finite loss.
+non-finite loss. Its importance weights and its reference need no pass and no adapters of their own.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from conf.errors import UserError
 from conf.runs import Run
 from conf.schema import ReinforceCommand, ReinforceTrainConfig, SftCommand, StudentConfig
 from data.frames.frame_cache import FrameReader
+from data.parallel import batched
 from data.records import SelectionItem
 from data.store import Store
 from models.distributed import split_batch
@@ -40,6 +41,7 @@ from teacher.vocabulary import describe_item
 from train.common.arguments import common_arguments
 from train.common.callbacks import EpochCallback
 from train.common.held_out import check_not_empty
+from train.on_policy.mismatch import Mismatch
 from train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
 from train.on_policy.served_sampling import build_sampler
 from train.rewards import REWARDS, JudgedResponse, judge_response
@@ -143,12 +145,40 @@ class EpochSampler(RepeatSampler):
         self.generator.manual_seed(self.seed + epoch)
 
 
+class StartingStudent:
+    """A student as it was before its training: the reference of the divergence. It shares all
+    weights but the trained ones.
+
+    TRL's own reference is a second set of adapters, which every checkpoint and product would
+    contain, or without adapters a base from the hub.
+    """
+
+    def __init__(self, model: nn.Module) -> None:
+        self._model = model
+        self._start = {p: p.detach().clone() for p in model.parameters() if p.requires_grad}
+
+    def __call__(self, **inputs: Any) -> Any:
+        current, training = {p: p.data for p in self._start}, self._model.training
+        self._set(self._start)
+        try:
+            return self._model.eval()(**inputs)
+        finally:
+            self._set(current)
+            self._model.train(training)
+
+    def _set(self, weights: Mapping[nn.Parameter, Tensor]) -> None:
+        for parameter, data in weights.items():
+            parameter.data = data
+
+
 class MediaGRPOTrainer(GRPOTrainer):
     """A GRPOTrainer for prompts with clips.
 
     Args:
         items: The items by split, train and eval.
         response_sampler: Samples the responses.
+        beta: See `ReinforceTrainConfig`; that of TRL's arguments is 0.
+        importance_cap: See `ReinforceTrainConfig`.
     """
 
     def __init__(
@@ -157,6 +187,8 @@ class MediaGRPOTrainer(GRPOTrainer):
         *args: Any,
         items: Mapping[str, Sequence[ItemToJudge]],
         response_sampler: ResponseSampler,
+        beta: float,
+        importance_cap: float | None,
         **settings: Any,
     ) -> None:
         trained = {p: p.data for p in model.parameters() if p.requires_grad}
@@ -166,10 +198,15 @@ class MediaGRPOTrainer(GRPOTrainer):
             super().__init__(model, *args, rollout_func=self._respond, **settings)
         for parameter, data in trained.items():
             parameter.data = data
+        self.beta = beta
+        if beta:
+            self.ref_model = StartingStudent(model)
         self._items, self.response_sampler = items, response_sampler
         self._batch_items: list[ItemToJudge] = []
         self._prompts: list[EncodedPrompt] = []
         self._inputs: list[EncodedPrompt] = []
+        self._loss_inputs: dict[str, Any] | None = None
+        self._importance_cap, self._mismatch = importance_cap, Mismatch(importance_cap)
         self._differ = torch.empty(0, dtype=torch.bool)
 
     def _send_telemetry(self) -> None:
@@ -197,14 +234,15 @@ class MediaGRPOTrainer(GRPOTrainer):
         Responses to an item whose rewards are all equal do not count in the mean over tokens.
         """
         self._batch_items = [self._items[row["split"]][row["index"]] for row in inputs]
-        self._prompts = [row[PROMPT] for row in inputs]
+        self._prompts = self._inputs = [row[PROMPT] for row in inputs]
         output = super()._generate_and_score_completions(inputs)
         first = self.accelerator.process_index * len(inputs)
         counted = self._differ[first : first + len(inputs), None]
-        output["completion_mask"] = output["completion_mask"] * counted
+        # Tokens that it masks are read by the model, but not in the loss.
+        output["tool_mask"] = counted.expand_as(output["completion_mask"])
         mode = "train" if self.model.training else "eval"
         self._metrics[mode]["frac_reward_zero_std"][-1] = 1 - self._differ.float().mean().item()
-        total = self.accelerator.gather(output["completion_mask"].sum()).sum()
+        total = self.accelerator.gather((output["completion_mask"] * counted).sum()).sum()
         output["num_items_in_batch"] = total.clamp(min=1)
         # TRL shuffles and splits the tensors of its output by their rows.
         return {**output, ROW: torch.arange(len(inputs), device=self.accelerator.device)}
@@ -241,11 +279,14 @@ class MediaGRPOTrainer(GRPOTrainer):
             self.response_sampler.check_parsed([j.letter for j in judged], self.accelerator)
         prompt_ids = [prompt.encoded.input_ids for prompt in self._prompts]
         ids = [list(t.ids) for t in texts]
-        return {"prompt_ids": prompt_ids, "completion_ids": ids, "logprobs": None, "judged": judged}
+        logs = [list(t.log_probabilities) for t in texts]
+        return {"prompt_ids": prompt_ids, "completion_ids": ids, "logprobs": logs, "judged": judged}
 
     def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> Tensor:
         self._inputs = [self._prompts[row] for row in inputs[ROW].tolist()]
-        loss = super()._compute_loss(model, inputs)
+        self._loss_inputs = dict(inputs)
+        loss = super()._compute_loss(model, self._loss_inputs)
+        self._loss_inputs = None
         if not torch.isfinite(loss):
             self._stop("loss", loss.item())
         return loss
@@ -256,12 +297,51 @@ class MediaGRPOTrainer(GRPOTrainer):
         input_ids: Tensor,
         attention_mask: Tensor,
         logits_to_keep: int,
-        *_: Any,
-        **__: Any,
+        batch_size: int | None = None,
+        **_: Any,
     ) -> tuple[Tensor, Tensor, None]:
         """Return the logarithms of the probabilities of the responses' tokens, and the entropies,
-        (B, `logits_to_keep`). The pixels are those of the prompts."""
-        batch = pad([prompt.encoded for prompt in self._inputs], self._tokenizer.pad_token_id)
+        (B, `logits_to_keep`). The pixels are those of the prompts. A forward pass has up to
+        `batch_size` responses."""
+        size = batch_size or len(input_ids)
+        parts = zip(
+            batched(self._inputs, size),
+            input_ids.split(size),
+            attention_mask.split(size),
+            strict=True,
+        )
+        found = [self._score(model, *part, logits_to_keep) for part in parts]
+        logs, entropies = (torch.cat(values) for values in zip(*found, strict=True))
+        if self._loss_inputs is not None:
+            self._weigh_tokens(self._loss_inputs, logs.detach())
+        return logs, entropies, None
+
+    def _weigh_tokens(self, inputs: dict[str, Any], logs: Tensor) -> None:
+        """Measure how far the sampler's probabilities are from these, and weigh the advantages with
+        the truncated ratio.
+
+        Since each step has one update, the probabilities of the loss are those before the update.
+        TRL would compute them in a pass of its own.
+        """
+        differences = logs - inputs["sampling_per_token_logps"]
+        self._mismatch.add(differences[inputs["completion_mask"].bool()])
+        if self._importance_cap is not None:
+            weights = differences.exp().clamp(max=self._importance_cap)
+            # The loss of VESPO reads the weights, and all others read advantages (B, T) per token.
+            if self.loss_type == "vespo":
+                inputs["importance_sampling_ratio"] = weights
+            else:
+                inputs["advantages"] = inputs["advantages"][:, None] * weights
+
+    def _score(
+        self,
+        model: nn.Module,
+        prompts: Sequence[EncodedPrompt],
+        input_ids: Tensor,
+        attention_mask: Tensor,
+        logits_to_keep: int,
+    ) -> tuple[Tensor, Tensor]:
+        batch = pad([prompt.encoded for prompt in prompts], self._tokenizer.pad_token_id)
         length = input_ids.shape[1] - logits_to_keep
         # TRL pads prompts on the left, as `pad` does, and responses on the right.
         inputs = {}
@@ -283,7 +363,7 @@ class MediaGRPOTrainer(GRPOTrainer):
         chosen = logs.gather(-1, input_ids[:, -logits_to_keep:, None])[..., 0]
         with torch.no_grad():
             entropy = -(logs.exp() * logs).sum(dim=-1)
-        return chosen, entropy, None
+        return chosen, entropy
 
     def prediction_step(
         self, model: nn.Module, inputs: Any, *_: Any, **__: Any
@@ -304,6 +384,8 @@ class MediaGRPOTrainer(GRPOTrainer):
             measures[name] = [value for value in values if not math.isnan(value)]
             if not measures[name]:
                 del measures[name]
+        if "loss" in logs:
+            logs |= self._mismatch.take(self.accelerator)
         super().log(logs, *args, **settings)
         if not math.isfinite(logs.get("grad_norm", 0.0)):
             self._stop("gradient", logs["grad_norm"])
@@ -352,8 +434,8 @@ def build_trainer(
         num_generations=train.responses,
         max_completion_length=student.max_new_tokens,
         temperature=train.temperature,
-        # No reference model: the few steps and the small adapters keep the student close.
-        beta=0.0,
+        loss_type=train.loss_type,
+        epsilon=train.epsilon,
         reward_weights=[getattr(train.rewards, name) for name in names],
         ddp_find_unused_parameters=not student.lora.rank,
     )
@@ -366,6 +448,8 @@ def build_trainer(
         processing_class=processor,
         items={"train": training, "eval": validation},
         response_sampler=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
+        beta=train.beta,
+        importance_cap=train.importance_cap,
     )
     trainer.add_callback(EpochCallback(trainer))
     return trainer
