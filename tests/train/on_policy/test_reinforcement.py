@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from accelerate.data_loader import BatchSamplerShard
 from torch import nn
+from torch.utils.data import BatchSampler
 
 from conf.entry import Run
 from conf.runs import open_run
@@ -147,6 +149,20 @@ def test_a_step_encodes_each_prompt_once(settings, tmp_path, monkeypatch, short_
     # Two evaluations of one item, and the two items of each step; the data loader reads the next.
     assert len(encoded) == 2 * 1 + (3 + 1) * 2
     assert len(set(encoded)) == 1 + 4 * 2
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_each_rank_reads_the_prompts_of_a_step_once(rank) -> None:
+    """Two ranks with two micro-batches of two responses, four to each of two items a step."""
+    sampler = reinforcement.EpochSampler(
+        range(4), mini_repeat_count=4, batch_size=2, repeat_count=2, seed=0
+    )
+    batches = BatchSamplerShard(BatchSampler(sampler, 4, False), 2, rank)
+    read = list(batches)
+    assert len(read) == 2 * 2
+    for used, repeated in (read[:2], read[2:]):
+        assert all(k >= 0 for k in used)
+        assert repeated == [~k for k in used]
 
 
 def test_a_sampler_with_the_trainers_distribution_has_no_mismatch(
