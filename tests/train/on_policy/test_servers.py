@@ -181,8 +181,9 @@ def test_a_student_is_distilled_from_responses_of_a_server(vllm, settings, tmp_p
     losses = [r for r in read_journal(run.folder) if "loss" in r]
     assert len(losses) == 2
     assert all(r["loss"] > 0 and r["sampled_length"] == 8 for r in losses)
-    # The server's log-probabilities are those after temperature.
-    assert all(r["mismatch_max"] < 0.02 for r in losses)
+    # The server's base is not quantised. Log-probabilities before the temperature would differ by
+    # 0.07 in the mean.
+    assert all(0.001 < r["mismatch_mean"] < 0.03 and r["mismatch_max"] < 0.1 for r in losses)
     assert not (run.folder / "sampled_adapters").exists()
 
 
