@@ -91,7 +91,7 @@ class ProductAttention(torch.autograd.Function):
         ctx: Any, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scaling: float
     ) -> Tensor:
         (batch, heads, length, size), groups = query.shape, key.shape[1]
-        keys, values = key.flatten(0, 1).contiguous(), value.flatten(0, 1).contiguous()
+        keys, values = key.flatten(0, 1), value.flatten(0, 1)
         # Queries of heads with the same keys are the rows of one product.
         queries = query.unflatten(1, (groups, -1)) * scaling
         attended = query.new_empty(batch, length, heads, size)

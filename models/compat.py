@@ -26,8 +26,10 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
   `train.on_policy.distillation` overrides `get_batch_samples` and calls `_get_num_items_in_batch`.
 - `train.on_policy.reinforcement` overrides `_generate_and_score_completions`, `_calculate_rewards`,
   `_compute_loss`, `_get_per_token_logps_and_entropies`, `_get_train_sampler`, `_send_telemetry`
-  and `create_model_card` of TRL's GRPOTrainer, uses its `rollout_func` and `_metrics`, and the
-  `generator` of its RepeatSampler.
+  and `create_model_card` of TRL's GRPOTrainer, uses its `rollout_func`, `_metrics` and
+  `_tokenizer`, and the `generator` of its RepeatSampler. It sets `beta` and `ref_model`, adds
+  `tool_mask` to the inputs of the loss, and changes their `advantages` while the loss computes the
+  log-probabilities. Its datasets override `Dataset.__getitems__`.
 - `models.student.kv_cache` subclasses transformers' `DynamicLayer`.
 - `train.tiny_base.trace` records the outputs of `q_norm` and `k_norm` in Qwen3-VL's attention, and
   the keyword `position_embeddings` that it takes.

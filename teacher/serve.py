@@ -182,6 +182,9 @@ def vllm_arguments(
     ranks = [cfg.adapter_rank] if cfg.adapter_rank else []
     if cfg.adapter is not None:
         ranks.append(read_adapter_rank(cfg.adapter))
+    if cfg.adapter_rank:
+        # Otherwise, log-probabilities are those of the model before temperature and biases.
+        arguments += ["--logprobs-mode", "processed_logprobs"]
     if ranks:
         max_rank = next((r for r in LORA_RANKS if r >= max(ranks)), LORA_RANKS[-1])
         arguments += ["--enable-lora", "--max-lora-rank", str(max_rank)]

@@ -44,7 +44,7 @@ from models.fast_layers import use_fast_layers
 from teacher.narrate import ensure_rationales
 from train.on_policy import distillation, sampling
 from train.on_policy.continuation import inherit_settings
-from train.on_policy.paired_prompts import PairedPrompts, load_datasets
+from train.on_policy.paired_prompts import load_datasets
 from train.on_policy.teachers import LocalTeacher
 
 SFT, DISTILL, SAMPLING = "train.sft", "train.distill", "sampling"
@@ -94,9 +94,12 @@ def measure(name: str, overrides: list[str], steps: int) -> Measurements:
     with tempfile.TemporaryDirectory() as folder, unlimited:
         if name == SAMPLING:
             student.to(rank_device())
-            prompts = [training[k] for k in range((steps + 1) * train.batch)]
+            pairs = [training[k] for k in range((steps + 1) * train.batch)]
+            length = trained.student.max_length
+            prompts = [sampling.encode_prompt(p.student, processor, length) for p in pairs]
             sampler = sampling.ResponseSampler(processor, trained.student, train)
-            return measure_sampling(sampler, student, prompts, train.batch)
+            seeds = [p.seed for p in pairs]
+            return measure_sampling(sampler, student, prompts, seeds, train.batch)
         model, _ = loading.load_student(trained.student, train.precision, list)
         model.eval().to(rank_device())
         teacher = LocalTeacher(model, processor, train.beta, train.precision == "bf16")
@@ -110,7 +113,8 @@ def measure(name: str, overrides: list[str], steps: int) -> Measurements:
 def measure_sampling(
     sampler: sampling.ResponseSampler,
     student: nn.Module,
-    prompts: Sequence[PairedPrompts],
+    prompts: Sequence[sampling.EncodedPrompt],
+    seeds: Sequence[int],
     batch: int,
 ) -> Measurements:
     """Sample a response to each prompt, in batches of which the first one is not timed."""
@@ -118,8 +122,8 @@ def measure_sampling(
     for start in range(0, len(prompts), batch):
         if start == batch:
             began, cpu = time.perf_counter(), time.process_time()
-        part = prompts[start : start + batch]
-        sampler.sample(student, [p.student for p in part], [p.seed for p in part])
+        part = slice(start, start + batch)
+        sampler.sample(student, prompts[part], seeds[part])
     count, seconds = len(prompts) - batch, time.perf_counter() - began
     cpu, peak = time.process_time() - cpu, comparison.peak_memory() / 2**30
     return Measurements(count / seconds, cpu / count, peak, [float("nan")])

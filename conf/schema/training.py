@@ -10,6 +10,8 @@ from conf.schema.benchmark import POOLS
 from conf.schema.settings import Settings, check_choices, setting
 
 REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout", "answer_only")
+LOSS_TYPES = ("dapo", "grpo", "bnpo", "dr_grpo", "cispo", "sapo", "luspo", "vespo")
+"""The values of `loss_type` of TRL's GRPOConfig."""
 
 
 @dataclass
@@ -199,6 +201,19 @@ class ReinforceTrainConfig(TrainConfig):
     validation_items: int = setting(16, least=1)
     """Number of items of held-out training scenes on which the rewards are measured."""
     rewards: RewardWeights = field(default_factory=RewardWeights)
+    loss_type: str = setting("dapo", LOSS_TYPES)
+    """Loss of TRL's GRPOTrainer. dapo is the mean over all tokens of a step. With bnpo, the result
+    also depends on `micro_batch`."""
+    beta: float = setting(0.0, least=0)
+    """Weight of the Kullback-Leibler divergence from the student as it was before this training. 0
+    computes no divergence; above 0, a step has one forward pass more."""
+    epsilon: float = setting(0.2, above=0)
+    """Range to which the ratio of a token's probabilities after and before an update is clipped.
+    Since each step has one update, the ratio is 1, and only the scale of loss_type=cispo depends on
+    this."""
+    importance_cap: float | None = setting(None, least=1)
+    """Weight each token by the ratio of its probabilities in training and in sampling, but at most
+    by this number (truncated importance sampling). null weights all tokens equally."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)

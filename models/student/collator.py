@@ -100,9 +100,14 @@ def encode(
             "settings from the run that model names",
             code="sample-too-long",
         )
-    labels = [IGNORED] * len(ids) + trained
-    types = {name: values + [0] * len(response) for name, values in types.items()}
-    return Encoded(ids + response, labels, types, dict(prompt))
+    encoded = Encoded(ids, [IGNORED] * len(ids), types, dict(prompt))
+    return append_response(encoded, response, trained)
+
+
+def append_response(prompt: Encoded, ids: Sequence[int], labels: Sequence[int]) -> Encoded:
+    """Return an encoded prompt with the tokens and the labels of a response."""
+    types = {name: values + [0] * len(ids) for name, values in prompt.token_types.items()}
+    return Encoded([*prompt.input_ids, *ids], [*prompt.labels, *labels], types, prompt.media)
 
 
 def clip_inputs(clip: Clip) -> dict[str, Any]:
@@ -124,11 +129,7 @@ def pair_seconds(clip: Clip) -> float:
 
 
 class Collator:
-    """Makes left-padded batches of conversations: the tensors that the model's `forward` takes.
-
-    Batches with responses also contain `labels` (B, K) for the last K positions, and the indices
-    `logits_to_keep` (K,) of these positions. The logits at position j predict label j + 1.
-    """
+    """Encodes conversations and makes batches of them (see `make_batch`)."""
 
     def __init__(
         self, processor: ProcessorMixin, max_length: int | None, thinking: bool = False
@@ -139,16 +140,31 @@ class Collator:
 
     def __call__(self, samples: Sequence[Sample]) -> dict[str, Any]:
         encoded = [encode(s, self._processor, self._max_length, self._thinking) for s in samples]
-        batch = pad(encoded, self._processor.tokenizer.pad_token_id)
-        labels = batch.pop("labels")
-        if (labels == IGNORED).all():
-            return batch
-        # The logits that predict the first supervised token are at the position before it.
-        start = int((labels != IGNORED).any(dim=0).nonzero()[0]) - 1
-        labels[[not sample.supervised for sample in samples]] = IGNORED
-        batch["labels"] = labels[:, start:]
-        batch["logits_to_keep"] = torch.arange(start, labels.shape[1])
+        supervised = [s.supervised for s in samples]
+        return make_batch(encoded, supervised, self._processor.tokenizer.pad_token_id)
+
+
+def make_batch(
+    encoded: Sequence[Encoded], supervised: Sequence[bool], pad_id: int
+) -> dict[str, Any]:
+    """Return a left-padded batch of conversations: the tensors that the model's `forward` takes.
+
+    Batches with responses also contain `labels` (B, K) for the last K positions, and the indices
+    `logits_to_keep` (K,) of these positions. The logits at position j predict label j + 1.
+
+    Args:
+        supervised: Whether each conversation is trained on.
+    """
+    batch = pad(encoded, pad_id)
+    labels = batch.pop("labels")
+    if (labels == IGNORED).all():
         return batch
+    # The logits that predict the first supervised token are at the position before it.
+    start = int((labels != IGNORED).any(dim=0).nonzero()[0]) - 1
+    labels[[not is_trained for is_trained in supervised]] = IGNORED
+    batch["labels"] = labels[:, start:]
+    batch["logits_to_keep"] = torch.arange(start, labels.shape[1])
+    return batch
 
 
 def pad(encoded: Sequence[Encoded], pad_id: int) -> dict[str, Any]:

@@ -23,8 +23,11 @@ class GeneratedText:
     Attributes:
         truncated: Whether it was cut off at the token limit.
         ids: Its token ids, with the one that ends it; empty if they are not known.
+        log_probabilities: The log-probability (nat) of each of these tokens in the distribution
+            that it was sampled from; empty if they are not known.
     """
 
     text: str
     truncated: bool = False
     ids: tuple[int, ...] = ()
+    log_probabilities: tuple[float, ...] = ()

@@ -26,6 +26,8 @@ class Response:
         token_ids: The token ids of the response, if the request asks for them with vLLM's
             `return_token_ids`; otherwise empty.
         prompt_ids: The same for the prompt.
+        log_probabilities: The log-probability (nat) of each token of the response, if the request
+            asks for them with `logprobs`; otherwise empty.
         constrained: Whether the server constrained the response to a grammar or a schema.
     """
 
@@ -37,6 +39,7 @@ class Response:
     reasoning: str = ""
     token_ids: tuple[int, ...] = ()
     prompt_ids: tuple[int, ...] = ()
+    log_probabilities: tuple[float, ...] = ()
     constrained: bool = False
 
 
@@ -69,6 +72,7 @@ def parse_completion(completion: Any, n: int, is_constrained: bool = False) -> l
         reasoning = _clean(
             getattr(message, "reasoning_content", None) or getattr(message, "reasoning", None)
         )
+        scored = getattr(getattr(choice, "logprobs", None), "content", None) or ()
         if is_constrained and not text and choice.finish_reason != "length":
             text, reasoning = reasoning, ""
         responses.append(
@@ -81,6 +85,7 @@ def parse_completion(completion: Any, n: int, is_constrained: bool = False) -> l
                 reasoning=reasoning,
                 token_ids=tuple(getattr(choice, "token_ids", None) or ()),
                 prompt_ids=tuple(getattr(completion, "prompt_token_ids", None) or ()),
+                log_probabilities=tuple(token.logprob for token in scored),
                 constrained=is_constrained,
             )
         )

@@ -93,7 +93,9 @@ def test_flags_for_frames_and_adapter(tmp_path):
     assert f"--lora-modules adapter={tmp_path} --enable-lora --max-lora-rank 16" in text
     text = " ".join(flags(1, adapter=str(tmp_path), adapter_rank=20))
     assert "--enable-lora --max-lora-rank 32" in text
+    assert "--logprobs-mode processed_logprobs" in text
     assert "--lora-modules" not in " ".join(flags(1, adapter_rank=8))
+    assert "--logprobs-mode" not in flags(1)
     with raises_user_error("missing-adapter"):
         serve.read_adapter_rank(str(tmp_path / "none"))
 

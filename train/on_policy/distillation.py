@@ -8,8 +8,9 @@ frames of the item; the teacher reads its facts as text. No gradient flows throu
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,14 @@ from transformers import ProcessorMixin
 from conf.runs import Run, world_size
 from conf.schema import DistillCommand, SftCommand
 from models.student.answer_parser import parse_choice
-from models.student.collator import IGNORED, Collator, letter_ids
+from models.student.collator import IGNORED, Collator, append_response, letter_ids, make_batch
 from models.student.prompts import Sample
 from models.student.responses import GeneratedText
 from train.common.audit import audit_student
 from train.common.callbacks import EpochCallback
+from train.on_policy.mismatch import Mismatch
 from train.on_policy.paired_prompts import PairedPrompts
-from train.on_policy.sampling import ResponseSampler
+from train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
 from train.on_policy.served_sampling import build_sampler
 from train.on_policy.teachers import Teacher
 from train.student.held_out_answers import HeldOutAnswers
@@ -40,18 +42,22 @@ log = logging.getLogger(__name__)
 
 TEACHER = "teacher_inputs"
 """Key of the teacher's inputs in a batch."""
+SAMPLED = "sampled_log_probabilities"
+"""Key of the sampler's log-probabilities (N,) of the supervised tokens in a batch."""
 
 
 @dataclass(frozen=True)
 class DistillationCollator:
-    """Passes on the prompts of training batches, which get their responses later; validation
-    samples become tensors."""
+    """Encodes the student's prompts of training batches, which get their responses later;
+    validation samples become tensors."""
 
     collate: TrainerCollator
+    encode: Callable[[Sample], EncodedPrompt]
 
     def __call__(self, samples: Sequence[Sample | PairedPrompts]) -> dict[str, Any]:
         if isinstance(samples[0], PairedPrompts):
-            return {"prompts": list(samples)}
+            encoded = [self.encode(prompts.student) for prompts in samples]
+            return {"prompts": list(samples), "encoded": encoded}
         return self.collate(samples)
 
 
@@ -63,7 +69,8 @@ class DistillationTrainer(StudentTrainer):
     Args:
         teacher: Measures the divergence.
         response_sampler: Samples the responses.
-        student_collator: Makes the inputs of the student.
+        pad_id: Token id of the padding.
+        temperature: Temperature of the sampling.
     """
 
     def __init__(
@@ -71,13 +78,16 @@ class DistillationTrainer(StudentTrainer):
         *args: Any,
         teacher: Teacher,
         response_sampler: ResponseSampler,
-        student_collator: TrainerCollator,
+        pad_id: int,
+        temperature: float,
         **settings: Any,
     ) -> None:
         super().__init__(*args, compute_loss_func=self._mean_divergence, **settings)
         self._teacher, self.response_sampler = teacher, response_sampler
-        self._student_collator = student_collator
+        self._pad_id, self._temperature = pad_id, temperature
         self._teacher_inputs: Any = None
+        self._sampled_logs = torch.zeros(0)
+        self._mismatch = Mismatch()
         self._sampled: list[tuple[bool, bool, int]] = []
 
     def get_batch_samples(
@@ -85,21 +95,25 @@ class DistillationTrainer(StudentTrainer):
     ) -> tuple[list, Tensor | int | None]:
         """Sample the responses of a step, and return its micro-batches with them."""
         batches, _ = super().get_batch_samples(epoch_iterator, num_batches, device)
-        parts = [batch["prompts"] for batch in batches]
-        texts = iter(self._sample_responses([p for part in parts for p in part]))
-        pairs = [[add_response(p, next(texts)) for p in part] for part in parts]
-        prepared = self._teacher.prepare([[teacher for _, teacher in part] for part in pairs])
+        prompts = [p for batch in batches for p in batch["prompts"]]
+        encoded = [e for batch in batches for e in batch["encoded"]]
+        remaining = iter(self._sample_responses(prompts, encoded))
+        texts = [[next(remaining) for _ in batch["prompts"]] for batch in batches]
+        pairs = list(zip(batches, texts, strict=True))
+        prepared = self._teacher.prepare([answer_teacher(*pair) for pair in pairs])
         batches = [
-            {**self._student_collator([student for student, _ in part]), TEACHER: inputs}
-            for part, inputs in zip(pairs, prepared, strict=True)
+            {**answer_student(*pair, self._pad_id), TEACHER: inputs}
+            for pair, inputs in zip(pairs, prepared, strict=True)
         ]
         return batches, self._get_num_items_in_batch(batches, device)
 
-    def _sample_responses(self, prompts: Sequence[PairedPrompts]) -> list[GeneratedText]:
+    def _sample_responses(
+        self, prompts: Sequence[PairedPrompts], encoded: Sequence[EncodedPrompt]
+    ) -> list[GeneratedText]:
         texts = []
         if prompts:
-            samples, seeds = [p.student for p in prompts], [p.seed for p in prompts]
-            texts = self.response_sampler.sample(self.model, samples, seeds)
+            seeds = [p.seed for p in prompts]
+            texts = self.response_sampler.sample(self.model, encoded, seeds)
         letters = [parse_choice(t.text, truncated=t.truncated).letter for t in texts]
         counted = [k for k, prompt in enumerate(prompts) if prompt.supervised]
         self._sampled += [
@@ -117,6 +131,7 @@ class DistillationTrainer(StudentTrainer):
         **settings: Any,
     ) -> Any:
         self._teacher_inputs = inputs.pop(TEACHER, None)
+        self._sampled_logs = inputs.pop(SAMPLED, None)
         return super().compute_loss(model, inputs, return_outputs, **settings)
 
     def _mean_divergence(
@@ -128,6 +143,11 @@ class DistillationTrainer(StudentTrainer):
             return token_mean(outputs, labels, num_items_in_batch)
         supervised = labels[:, 1:] != IGNORED
         logits, tokens = outputs.logits[:, :-1][supervised], labels[:, 1:][supervised]
+        with torch.no_grad():
+            scaled = logits.float() / self._temperature
+            chosen = scaled.gather(1, tokens[:, None])[:, 0]
+            self._mismatch.add(chosen - scaled.logsumexp(dim=-1) - self._sampled_logs)
+            del scaled
         total = self._teacher.measure(self._teacher_inputs, logits, tokens).sum()
         return total / (supervised.sum() if num_items_in_batch is None else num_items_in_batch)
 
@@ -142,15 +162,38 @@ class DistillationTrainer(StudentTrainer):
                 "sampled_accuracy": right / max(count, 1),
                 "sampled_parse_rate": parsed / max(count, 1),
                 "sampled_length": tokens / max(count, 1),
+                **self._mismatch.take(self.accelerator),
             }
             self._sampled = []
         super().log(logs, *args, **settings)
 
 
-def add_response(prompts: PairedPrompts, text: GeneratedText) -> tuple[Sample, Sample]:
-    """Return the prompts of student and teacher with the same response."""
-    given = {"response": text.text, "response_ids": text.ids, "supervised": prompts.supervised}
-    return replace(prompts.student, **given), replace(prompts.teacher, **given)
+def answer_teacher(batch: dict[str, Any], texts: Sequence[GeneratedText]) -> list[Sample]:
+    """Return the teacher's prompts of a micro-batch with the student's responses."""
+    return [
+        replace(p.teacher, response=t.text, response_ids=t.ids, supervised=p.supervised)
+        for p, t in zip(batch["prompts"], texts, strict=True)
+    ]
+
+
+def answer_student(
+    batch: dict[str, Any], texts: Sequence[GeneratedText], pad_id: int
+) -> dict[str, Any]:
+    """Return the student's inputs: its encoded prompts of a micro-batch with its responses."""
+    prompts = batch["prompts"]
+    answered = [
+        append_response(e.encoded, t.ids, t.ids)
+        for e, t in zip(batch["encoded"], texts, strict=True)
+    ]
+    supervised = [p.supervised for p in prompts]
+    logs = [
+        x for t, kept in zip(texts, supervised, strict=True) if kept for x in t.log_probabilities
+    ]
+    return {
+        **make_batch(answered, supervised, pad_id),
+        SAMPLED: torch.tensor(logs),
+        "sample_ids": [p.student.sample_id for p in prompts],
+    }
 
 
 def build_trainer(
@@ -185,7 +228,10 @@ def build_trainer(
     return DistillationTrainer(
         model=model,
         args=student_arguments(train, run, cfg.seed, checkpoint, not student.lora.rank),
-        data_collator=DistillationCollator(TrainerCollator(collator, digests=False)),
+        data_collator=DistillationCollator(
+            TrainerCollator(collator, digests=False),
+            partial(encode_prompt, processor=processor, max_length=student.max_length),
+        ),
         train_dataset=training,
         eval_dataset={mode: samples for mode, samples in validation.items() if len(samples)},
         callbacks=[EpochCallback(training, sampler)],
@@ -194,6 +240,6 @@ def build_trainer(
         answers=answers if train.generated_items else None,
         teacher=teacher,
         response_sampler=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
-        # The sampled responses are limited by student.max_new_tokens already.
-        student_collator=TrainerCollator(Collator(processor, None), digests=False),
+        pad_id=processor.tokenizer.pad_token_id,
+        temperature=train.temperature,
     )

@@ -5,7 +5,7 @@ TRL 1.16 passes images to the model, but no videos with true times (huggingface/
 fixed here: `MediaGRPOTrainer` computes the probabilities of responses with the project's own
 inputs, and keeps the adapters in fp32. It also keeps the order of the items when a run resumes in a
 later epoch, leaves items whose responses have equal rewards out of the mean, and stops at a
-non-finite loss.
+non-finite loss. Its importance weights and its reference need no pass and no adapters of their own.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -29,22 +30,26 @@ from conf.errors import UserError
 from conf.runs import Run
 from conf.schema import ReinforceCommand, ReinforceTrainConfig, SftCommand, StudentConfig
 from data.frames.frame_cache import FrameReader
+from data.parallel import batched
 from data.records import SelectionItem
 from data.store import Store
 from models.distributed import split_batch
-from models.student.collator import Collator
+from models.student.collator import pad
 from models.student.prompts import Sample, selection_sample
 from teacher.predicates.facts import RelationalPredicates
 from teacher.vocabulary import describe_item
 from train.common.arguments import common_arguments
 from train.common.callbacks import EpochCallback
 from train.common.held_out import check_not_empty
-from train.on_policy.sampling import ResponseSampler
+from train.on_policy.mismatch import Mismatch
+from train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
 from train.on_policy.served_sampling import build_sampler
 from train.rewards import REWARDS, JudgedResponse, judge_response
 from train.student.dataset import split_items
 from train.student.lazy_samples import seeded_rng
 
+PROMPT = "encoded"
+"""Key of the encoded prompt in a row of the dataset."""
 ROW = "row"
 """Key of the index of a response among those that were sampled together."""
 
@@ -67,18 +72,16 @@ def load_items(
         UserError: there are none.
     """
     frames = FrameReader(store, trained.student.image_size)
+    regime, count = trained.train.regime, trained.student.frames
 
     def with_predicates(items: Sequence[SelectionItem]) -> list[ItemToJudge]:
         found = []
         for item in items:
             predicates = describe_item(item, store, trained.teacher)
             if predicates is not None:
-                found.append(ItemToJudge(item, predicates, lambda item=item: prompt(item)))
+                prompt = partial(selection_sample, item, "reasoning", regime, frames, count)
+                found.append(ItemToJudge(item, predicates, prompt))
         return found
-
-    def prompt(item: SelectionItem) -> Sample:
-        regime, count = trained.train.regime, trained.student.frames
-        return selection_sample(item, "reasoning", regime, frames, count)
 
     split = split_items(store, cfg.validation_items, seed, cfg.hold_out)
     training, validation = map(with_predicates, split)
@@ -87,13 +90,33 @@ def load_items(
     return training, validation
 
 
-def make_rows(items: Sequence[ItemToJudge], split: str) -> Dataset:
-    """Return the rows of TRL's dataset: the index of each item. TRL needs a prompt, but the prompts
-    are rendered later."""
-    ids = [entry.item.item_id for entry in items]
-    return Dataset.from_dict(
-        {"prompt": ids, "index": list(range(len(ids))), "split": [split] * len(ids)}
-    )
+class PromptRows(Dataset):
+    """TRL's dataset: a row per item of a split, whose prompt is rendered and encoded when it is
+    read. Rows of an item that are read together share its prompt.
+
+    The index ~k, which is negative, returns row k without its prompt: TRL reads the rows of a step
+    for each of its micro-batches, but uses them once.
+
+    Args:
+        name: Name of the split.
+        encode: Encodes a prompt.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        items: Sequence[ItemToJudge],
+        encode: Callable[[Sample], EncodedPrompt],
+    ) -> None:
+        # TRL needs a text as the prompt.
+        super().__init__(Dataset.from_dict({"prompt": [e.item.item_id for e in items]}).data)
+        self._name, self._items, self._encode = name, items, encode
+
+    def __getitems__(self, indices: list[int]) -> list[dict[str, Any]]:
+        read = [k for k in dict.fromkeys(indices) if k >= 0]
+        prompts = {k: self._encode(self._items[k].render()) for k in read}
+        rows = [{"split": self._name, "index": max(k, ~k), PROMPT: prompts.get(k)} for k in indices]
+        return [{"prompt": self._items[row["index"]].item.item_id, **row} for row in rows]
 
 
 def make_reward(name: str) -> Callable[..., list[float]]:
@@ -108,10 +131,44 @@ def make_reward(name: str) -> Callable[..., list[float]]:
 
 class EpochSampler(RepeatSampler):
     """TRL's sampler with an order of its own in each epoch. TRL's continues one order of random
-    numbers, which a resumed run would begin again."""
+    numbers, which a resumed run would begin again.
+
+    Where it repeats the indices k of a step, it returns ~k.
+    """
+
+    def __iter__(self) -> Iterator[int]:
+        step = self.batch_size * self.mini_repeat_count
+        for position, index in enumerate(super().__iter__()):
+            yield index if position // step % self.repeat_count == 0 else ~index
 
     def set_epoch(self, epoch: int) -> None:
         self.generator.manual_seed(self.seed + epoch)
+
+
+class StartingStudent:
+    """A student as it was before its training: the reference of the divergence. It shares all
+    weights but the trained ones.
+
+    TRL's own reference is a second set of adapters, which every checkpoint and product would
+    contain, or without adapters a base from the hub.
+    """
+
+    def __init__(self, model: nn.Module) -> None:
+        self._model = model
+        self._start = {p: p.detach().clone() for p in model.parameters() if p.requires_grad}
+
+    def __call__(self, **inputs: Any) -> Any:
+        current, training = {p: p.data for p in self._start}, self._model.training
+        self._set(self._start)
+        try:
+            return self._model.eval()(**inputs)
+        finally:
+            self._set(current)
+            self._model.train(training)
+
+    def _set(self, weights: Mapping[nn.Parameter, Tensor]) -> None:
+        for parameter, data in weights.items():
+            parameter.data = data
 
 
 class MediaGRPOTrainer(GRPOTrainer):
@@ -120,7 +177,8 @@ class MediaGRPOTrainer(GRPOTrainer):
     Args:
         items: The items by split, train and eval.
         response_sampler: Samples the responses.
-        collator: Makes the model's inputs.
+        beta: See `ReinforceTrainConfig`; that of TRL's arguments is 0.
+        importance_cap: See `ReinforceTrainConfig`.
     """
 
     def __init__(
@@ -129,7 +187,8 @@ class MediaGRPOTrainer(GRPOTrainer):
         *args: Any,
         items: Mapping[str, Sequence[ItemToJudge]],
         response_sampler: ResponseSampler,
-        collator: Collator,
+        beta: float,
+        importance_cap: float | None,
         **settings: Any,
     ) -> None:
         trained = {p: p.data for p in model.parameters() if p.requires_grad}
@@ -139,11 +198,15 @@ class MediaGRPOTrainer(GRPOTrainer):
             super().__init__(model, *args, rollout_func=self._respond, **settings)
         for parameter, data in trained.items():
             parameter.data = data
+        self.beta = beta
+        if beta:
+            self.ref_model = StartingStudent(model)
         self._items, self.response_sampler = items, response_sampler
-        self._collator = collator
         self._batch_items: list[ItemToJudge] = []
-        self._prompts: list[Sample] = []
-        self._inputs: list[Sample] = []
+        self._prompts: list[EncodedPrompt] = []
+        self._inputs: list[EncodedPrompt] = []
+        self._loss_inputs: dict[str, Any] | None = None
+        self._importance_cap, self._mismatch = importance_cap, Mismatch(importance_cap)
         self._differ = torch.empty(0, dtype=torch.bool)
 
     def _send_telemetry(self) -> None:
@@ -171,14 +234,15 @@ class MediaGRPOTrainer(GRPOTrainer):
         Responses to an item whose rewards are all equal do not count in the mean over tokens.
         """
         self._batch_items = [self._items[row["split"]][row["index"]] for row in inputs]
-        self._prompts = [entry.render() for entry in self._batch_items]
+        self._prompts = self._inputs = [row[PROMPT] for row in inputs]
         output = super()._generate_and_score_completions(inputs)
         first = self.accelerator.process_index * len(inputs)
         counted = self._differ[first : first + len(inputs), None]
-        output["completion_mask"] = output["completion_mask"] * counted
+        # Tokens that it masks are read by the model, but not in the loss.
+        output["tool_mask"] = counted.expand_as(output["completion_mask"])
         mode = "train" if self.model.training else "eval"
         self._metrics[mode]["frac_reward_zero_std"][-1] = 1 - self._differ.float().mean().item()
-        total = self.accelerator.gather(output["completion_mask"].sum()).sum()
+        total = self.accelerator.gather((output["completion_mask"] * counted).sum()).sum()
         output["num_items_in_batch"] = total.clamp(min=1)
         # TRL shuffles and splits the tensors of its output by their rows.
         return {**output, ROW: torch.arange(len(inputs), device=self.accelerator.device)}
@@ -213,17 +277,16 @@ class MediaGRPOTrainer(GRPOTrainer):
         ]
         if training:
             self.response_sampler.check_parsed([j.letter for j in judged], self.accelerator)
-        batch = self._collator(self._prompts)
-        prompt_ids = [
-            ids[mask.bool()].tolist()
-            for ids, mask in zip(batch["input_ids"], batch["attention_mask"], strict=True)
-        ]
+        prompt_ids = [prompt.encoded.input_ids for prompt in self._prompts]
         ids = [list(t.ids) for t in texts]
-        return {"prompt_ids": prompt_ids, "completion_ids": ids, "logprobs": None, "judged": judged}
+        logs = [list(t.log_probabilities) for t in texts]
+        return {"prompt_ids": prompt_ids, "completion_ids": ids, "logprobs": logs, "judged": judged}
 
     def _compute_loss(self, model: nn.Module, inputs: dict[str, Any]) -> Tensor:
         self._inputs = [self._prompts[row] for row in inputs[ROW].tolist()]
-        loss = super()._compute_loss(model, inputs)
+        self._loss_inputs = dict(inputs)
+        loss = super()._compute_loss(model, self._loss_inputs)
+        self._loss_inputs = None
         if not torch.isfinite(loss):
             self._stop("loss", loss.item())
         return loss
@@ -234,20 +297,59 @@ class MediaGRPOTrainer(GRPOTrainer):
         input_ids: Tensor,
         attention_mask: Tensor,
         logits_to_keep: int,
-        *_: Any,
-        **__: Any,
+        batch_size: int | None = None,
+        **_: Any,
     ) -> tuple[Tensor, Tensor, None]:
         """Return the logarithms of the probabilities of the responses' tokens, and the entropies,
-        (B, `logits_to_keep`). The pixels are those of the prompts."""
-        batch = self._collator(self._inputs)
+        (B, `logits_to_keep`). The pixels are those of the prompts. A forward pass has up to
+        `batch_size` responses."""
+        size = batch_size or len(input_ids)
+        parts = zip(
+            batched(self._inputs, size),
+            input_ids.split(size),
+            attention_mask.split(size),
+            strict=True,
+        )
+        found = [self._score(model, *part, logits_to_keep) for part in parts]
+        logs, entropies = (torch.cat(values) for values in zip(*found, strict=True))
+        if self._loss_inputs is not None:
+            self._weigh_tokens(self._loss_inputs, logs.detach())
+        return logs, entropies, None
+
+    def _weigh_tokens(self, inputs: dict[str, Any], logs: Tensor) -> None:
+        """Measure how far the sampler's probabilities are from these, and weigh the advantages with
+        the truncated ratio.
+
+        Since each step has one update, the probabilities of the loss are those before the update.
+        TRL would compute them in a pass of its own.
+        """
+        differences = logs - inputs["sampling_per_token_logps"]
+        self._mismatch.add(differences[inputs["completion_mask"].bool()])
+        if self._importance_cap is not None:
+            weights = differences.exp().clamp(max=self._importance_cap)
+            # The loss of VESPO reads the weights, and all others read advantages (B, T) per token.
+            if self.loss_type == "vespo":
+                inputs["importance_sampling_ratio"] = weights
+            else:
+                inputs["advantages"] = inputs["advantages"][:, None] * weights
+
+    def _score(
+        self,
+        model: nn.Module,
+        prompts: Sequence[EncodedPrompt],
+        input_ids: Tensor,
+        attention_mask: Tensor,
+        logits_to_keep: int,
+    ) -> tuple[Tensor, Tensor]:
+        batch = pad([prompt.encoded for prompt in prompts], self._tokenizer.pad_token_id)
         length = input_ids.shape[1] - logits_to_keep
-        # TRL pads prompts on the left, as the collator does, and responses on the right.
+        # TRL pads prompts on the left, as `pad` does, and responses on the right.
         inputs = {}
         for name, value in batch.items():
             if name.endswith("type_ids"):
                 inputs[name] = torch.zeros_like(input_ids)
                 inputs[name][:, length - value.shape[1] : length] = value.to(input_ids.device)
-            elif name not in ("input_ids", "attention_mask"):
+            elif name not in ("input_ids", "attention_mask", "labels"):
                 inputs[name] = value.to(input_ids.device)
         with self.accelerator.autocast():
             logits = model(
@@ -261,7 +363,7 @@ class MediaGRPOTrainer(GRPOTrainer):
         chosen = logs.gather(-1, input_ids[:, -logits_to_keep:, None])[..., 0]
         with torch.no_grad():
             entropy = -(logs.exp() * logs).sum(dim=-1)
-        return chosen, entropy, None
+        return chosen, entropy
 
     def prediction_step(
         self, model: nn.Module, inputs: Any, *_: Any, **__: Any
@@ -282,6 +384,8 @@ class MediaGRPOTrainer(GRPOTrainer):
             measures[name] = [value for value in values if not math.isnan(value)]
             if not measures[name]:
                 del measures[name]
+        if "loss" in logs:
+            logs |= self._mismatch.take(self.accelerator)
         super().log(logs, *args, **settings)
         if not math.isfinite(logs.get("grad_norm", 0.0)):
             self._stop("gradient", logs["grad_norm"])
@@ -320,6 +424,7 @@ def build_trainer(
             f"train.batch={train.batch} is more than the {len(training)} training items: lower it",
             code="batch-too-large",
         )
+    encode = partial(encode_prompt, processor=processor, max_length=student.max_length)
     names = [name for name in REWARDS if getattr(train.rewards, name)]
     arguments = GRPOConfig(
         **common_arguments(train, run, cfg.seed, checkpoint),
@@ -329,8 +434,8 @@ def build_trainer(
         num_generations=train.responses,
         max_completion_length=student.max_new_tokens,
         temperature=train.temperature,
-        # No reference model: the few steps and the small adapters keep the student close.
-        beta=0.0,
+        loss_type=train.loss_type,
+        epsilon=train.epsilon,
         reward_weights=[getattr(train.rewards, name) for name in names],
         ddp_find_unused_parameters=not student.lora.rank,
     )
@@ -338,12 +443,13 @@ def build_trainer(
         model=model,
         args=arguments,
         reward_funcs=[make_reward(name) for name in names],
-        train_dataset=make_rows(training, "train"),
-        eval_dataset=make_rows(validation, "eval"),
+        train_dataset=PromptRows("train", training, encode),
+        eval_dataset=PromptRows("eval", validation, encode),
         processing_class=processor,
         items={"train": training, "eval": validation},
         response_sampler=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
-        collator=Collator(processor, student.max_length),
+        beta=train.beta,
+        importance_cap=train.importance_cap,
     )
     trainer.add_callback(EpochCallback(trainer))
     return trainer

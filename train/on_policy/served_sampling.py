@@ -30,12 +30,11 @@ from models.student.chat_requests import (
     qwen_fields,
     sampling_fields,
 )
-from models.student.collator import encode
-from models.student.prompts import Sample, show_frames_as_images
+from models.student.prompts import show_frames_as_images
 from models.student.responses import GeneratedText
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import TRUNCATED, Response
-from train.on_policy.sampling import ResponseSampler
+from train.on_policy.sampling import EncodedPrompt, ResponseSampler
 
 ADAPTER_FOLDER = "sampled_adapters"
 """Folder of a run that contains the adapters of the current step."""
@@ -72,7 +71,7 @@ class ServedSampler(ResponseSampler):
         self._compared = False
 
     def sample(
-        self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]
+        self, model: nn.Module, prompts: Sequence[EncodedPrompt], seeds: Sequence[int]
     ) -> list[GeneratedText]:
         """Return a response to each prompt.
 
@@ -93,7 +92,7 @@ class ServedSampler(ResponseSampler):
                 asyncio.run(self._remove_adapters())
 
     async def _sample(
-        self, model: nn.Module, prompts: Sequence[Sample], seeds: Sequence[int]
+        self, model: nn.Module, prompts: Sequence[EncodedPrompt], seeds: Sequence[int]
     ) -> list[GeneratedText]:
         texts = [GeneratedText("") for _ in prompts]
         with explain_no_response():
@@ -144,14 +143,14 @@ class ServedSampler(ResponseSampler):
             await pool.unload_adapter(folder.name)
             shutil.rmtree(folder)
 
-    async def _request(self, pool: ServerPool, prompt: Sample, seed: int) -> GeneratedText:
+    async def _request(self, pool: ServerPool, prompt: EncodedPrompt, seed: int) -> GeneratedText:
         fields = sampling_fields(self._sampling, self._sampling.max_new_tokens)
-        fields["extra_body"]["return_token_ids"] = True
-        shown = prompt
+        fields["logprobs"] = fields["extra_body"]["return_token_ids"] = True
+        shown = prompt.sample
         if takes_clips(self._processor):
-            fields["extra_body"] |= qwen_fields(self._sampling, prompt.clip)
+            fields["extra_body"] |= qwen_fields(self._sampling, shown.clip)
         else:
-            shown = show_frames_as_images(prompt)
+            shown = show_frames_as_images(shown)
         never = {str(token): -100 for token in self._never}
         [response] = await pool.complete(
             build_messages(shown), **fields, seed=seed, logit_bias=never
@@ -159,13 +158,12 @@ class ServedSampler(ResponseSampler):
         text = self._read(response)
         if response.prompt_ids and not self._compared:
             self._compared = True
-            self._compare(prompt, response.prompt_ids)
+            self._compare(prompt.encoded.input_ids, response.prompt_ids)
         return text
 
-    def _compare(self, prompt: Sample, served: Sequence[int]) -> None:
+    def _compare(self, own: Sequence[int], served: Sequence[int]) -> None:
         """Raise UserError if a server read a prompt as other tokens: the gradients would be those
         of responses to another prompt."""
-        own = encode(prompt, self._processor, None).input_ids
         if difference := find_difference(own, served, self._processor.tokenizer):
             raise UserError(
                 f"the servers of sampling_server.url read prompts differently: {difference}. Start "
@@ -174,15 +172,15 @@ class ServedSampler(ResponseSampler):
             )
 
     def _read(self, response: Response) -> GeneratedText:
-        ids = response.token_ids
-        if not ids:
+        ids, logs = response.token_ids, response.log_probabilities
+        if not ids or len(logs) != len(ids):
             raise UserError(
-                "the servers of sampling_server.url return no token ids: use vLLM, whose responses "
-                "contain them",
+                "the servers of sampling_server.url return no token ids, or not their "
+                "log-probabilities: use vLLM, whose responses contain both",
                 code="no-token-ids",
             )
         text = self._processor.tokenizer.decode(ids, skip_special_tokens=True)
-        return GeneratedText(text, response.flaw == TRUNCATED, ids)
+        return GeneratedText(text, response.flaw == TRUNCATED, ids, logs)
 
 
 @contextmanager

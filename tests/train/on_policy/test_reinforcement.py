@@ -5,16 +5,23 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from accelerate.data_loader import BatchSamplerShard
+from torch import nn
+from torch.utils.data import BatchSampler
 
 from conf.entry import Run
 from conf.runs import open_run
 from conf.schema import ReinforceCommand, ReinforceTrainConfig, RewardWeights, SftCommand
+from conf.schema.training import LOSS_TYPES
 from data.store import Store
+from models.student.collator import Collator
 from models.trained_runs import read_trained_settings
 from tests.user_errors import raises_user_error
 from train import reinforce, sft
@@ -62,7 +69,7 @@ def short_rewards(monkeypatch) -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"micro_batch": 1, "sampling_batch": 3, "gradient_checkpointing": True}],
+    [{}, {"micro_batch": 1, "sampling_batch": 3, "gradient_checkpointing": True, "workers": 1}],
     ids=["same", "less memory"],
 )
 def test_a_killed_run_samples_the_same_responses(
@@ -94,11 +101,12 @@ def test_a_killed_run_samples_the_same_responses(
 
 
 def test_probabilities_are_those_of_the_student_trainer(
-    settings, tmp_path, monkeypatch, short_rewards
+    settings, processor, tmp_path, monkeypatch, short_rewards
 ) -> None:
     """The summed logarithms of a response's probabilities are minus its cross entropy."""
     checked = []
     compute = reinforcement.MediaGRPOTrainer._get_per_token_logps_and_entropies
+    collate = Collator(processor, None)
 
     def compared(self, model, input_ids, attention_mask, logits_to_keep, *rest, **settings):
         logs, entropies, _ = compute(
@@ -106,12 +114,12 @@ def test_probabilities_are_those_of_the_student_trainer(
         )
         mask = attention_mask[:, -logits_to_keep:].bool()
         samples = [
-            replace(sample, response="", response_ids=tuple(ids[kept].tolist()))
-            for sample, ids, kept in zip(
+            replace(prompt.sample, response="", response_ids=tuple(ids[kept].tolist()))
+            for prompt, ids, kept in zip(
                 self._inputs, input_ids[:, -logits_to_keep:], mask, strict=True
             )
         ]
-        batch = self._collator(samples)
+        batch = collate(samples)
         labels = batch.pop("labels")
         with torch.no_grad():
             losses = token_losses(model(**batch, use_cache=False).logits, labels)
@@ -125,6 +133,153 @@ def test_probabilities_are_those_of_the_student_trainer(
     train = replace(settings.train, max_steps=1, evaluations=1)
     run_reinforce(replace(settings, train=train), tmp_path / "run")
     assert sum(checked) >= 8
+
+
+def test_a_step_encodes_each_prompt_once(settings, tmp_path, monkeypatch, short_rewards) -> None:
+    encoded: list[str] = []
+    encode = sampling.encode
+
+    def counted(sample, *rest):
+        encoded.append(sample.sample_id)
+        return encode(sample, *rest)
+
+    monkeypatch.setattr(sampling, "encode", counted)
+    train = replace(settings.train, max_steps=3, evaluations=1, micro_batch=1)
+    run_reinforce(replace(settings, train=train), tmp_path / "run")
+    # Two evaluations of one item, and the two items of each step; the data loader reads the next.
+    assert len(encoded) == 2 * 1 + (3 + 1) * 2
+    assert len(set(encoded)) == 1 + 4 * 2
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_each_rank_reads_the_prompts_of_a_step_once(rank) -> None:
+    """Two ranks with two micro-batches of two responses, four to each of two items a step."""
+    sampler = reinforcement.EpochSampler(
+        range(4), mini_repeat_count=4, batch_size=2, repeat_count=2, seed=0
+    )
+    batches = BatchSamplerShard(BatchSampler(sampler, 4, False), 2, rank)
+    read = list(batches)
+    assert len(read) == 2 * 2
+    for used, repeated in (read[:2], read[2:]):
+        assert all(k >= 0 for k in used)
+        assert repeated == [~k for k in used]
+
+
+def test_a_sampler_with_the_trainers_distribution_has_no_mismatch(
+    settings, tmp_path, monkeypatch, short_rewards
+) -> None:
+    # The trainer's distribution contains the tokens that the sampler suppresses.
+    monkeypatch.setattr(
+        sampling, "SuppressTokensLogitsProcessor", lambda *_, **__: lambda ids, scores: scores
+    )
+    train = replace(settings.train, max_steps=2, evaluations=1, temperature=0.7)
+    folder = run_reinforce(replace(settings, train=train), tmp_path / "run")
+    steps = [r for r in read_journal(folder) if "loss" in r]
+    assert len(steps) == 2
+    assert all(r["mismatch_max"] < 1e-4 for r in steps)
+    assert all(r["mismatch_ratio"] == pytest.approx(1, abs=1e-5) for r in steps)
+    assert all("mismatch_capped" not in r for r in steps)
+
+
+def change_sampled_logs(monkeypatch, change: Callable[[float], float]) -> None:
+    """Apply a function to each log-probability that the sampler returns."""
+    sample = reinforcement.ResponseSampler.sample
+
+    def changed(self, model, prompts, seeds):
+        texts = sample(self, model, prompts, seeds)
+        return [
+            replace(text, log_probabilities=tuple(map(change, text.log_probabilities)))
+            for text in texts
+        ]
+
+    monkeypatch.setattr(reinforcement.ResponseSampler, "sample", changed)
+
+
+def test_the_gradient_is_that_of_truncated_weights(
+    settings, tmp_path, monkeypatch, short_rewards
+) -> None:
+    cap, checked = 1.5, []
+    rng = np.random.default_rng(0)
+    change_sampled_logs(monkeypatch, lambda log: log + rng.normal())
+    compute = reinforcement.MediaGRPOTrainer._compute_loss
+
+    def compared(self, model, inputs):
+        for name in (*LOSS_TYPES[1:], LOSS_TYPES[0]):
+            self.loss_type = name
+            loss = compute(self, model, inputs)
+        ids = torch.cat([inputs["prompt_ids"], inputs["completion_ids"]], dim=1)
+        mask = torch.cat([inputs["prompt_mask"], inputs["completion_mask"]], dim=1)
+        count = inputs["completion_ids"].shape[1]
+        logs, _, _ = self._get_per_token_logps_and_entropies(model, ids, mask, count)
+        ratios = (logs.detach() - inputs["sampling_per_token_logps"]).exp()
+        counted = inputs["completion_mask"] * inputs["tool_mask"]
+        weights = ratios.clamp(max=cap) * inputs["advantages"][:, None] * counted
+        direct = -(weights * logs).sum() / inputs["num_items_in_batch"]
+        trained = [p for p in model.parameters() if p.requires_grad]
+        ours = torch.autograd.grad(loss, trained, retain_graph=True)
+        expected = torch.autograd.grad(direct, trained)
+        torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-6)
+        checked.append((ratios > cap)[inputs["completion_mask"].bool()])
+        return loss
+
+    monkeypatch.setattr(reinforcement.MediaGRPOTrainer, "_compute_loss", compared)
+    train = replace(settings.train, max_steps=1, evaluations=1, importance_cap=cap)
+    folder = run_reinforce(replace(settings, train=train), tmp_path / "run")
+    (step,) = (r for r in read_journal(folder) if "loss" in r)
+    truncated = torch.cat(checked).float().mean().item()
+    assert 0.2 < truncated < 0.5
+    assert step["mismatch_capped"] == pytest.approx(truncated)
+
+
+def test_equal_weights_scale_the_gradient(settings, tmp_path, monkeypatch, short_rewards) -> None:
+    steps = []
+    for shift, cap in ((0, None), (-math.log(4), 2.0), (math.log(4), 2.0)):
+        with monkeypatch.context() as context:
+            change_sampled_logs(context, lambda log, shift=shift: log + shift)
+            train = replace(settings.train, max_steps=1, evaluations=1, importance_cap=cap)
+            folder = run_reinforce(replace(settings, train=train), tmp_path / str(shift))
+        steps += [r for r in read_journal(folder) if "loss" in r]
+    plain, more, less = (r["grad_norm"] for r in steps)
+    assert more == pytest.approx(2 * plain, rel=1e-4)
+    assert less == pytest.approx(plain / 4, rel=1e-2)
+    assert steps[1]["mismatch_ratio"] == pytest.approx(4, rel=1e-2)
+    assert [r.get("mismatch_capped") for r in steps] == [None, 1, 0]
+
+
+def test_the_reference_is_the_student_before_this_training(
+    settings, tmp_path, short_rewards
+) -> None:
+    train = replace(settings.train, beta=0.5)
+    whole = run_reinforce(replace(settings, train=train), tmp_path / "whole")
+    resumed = tmp_path / "resumed"
+    shutil.copytree(whole / "checkpoint-2", resumed / "checkpoint-2")
+    shutil.copy(whole / "metrics.jsonl", resumed)
+    run_reinforce(replace(settings, train=train), resumed)
+    first, second = ([r["kl"] for r in read_journal(f) if "kl" in r] for f in (whole, resumed))
+    assert first[0] == pytest.approx(0, abs=1e-6)
+    assert first[-1] > 1e-6
+    assert first == pytest.approx(second, rel=1e-3)
+    # The product has no second set of adapters.
+    assert len(list((whole / "student").rglob("adapter_model.safetensors"))) == 1
+
+
+def test_a_reference_keeps_the_weights_and_the_mode_of_its_student() -> None:
+    model = nn.Sequential(nn.Linear(2, 2), nn.Dropout(0.5))
+    model[0].bias.requires_grad_(False)
+    model.forward = lambda x: nn.Sequential.forward(model, x)
+    inputs = torch.ones(1, 2)
+    before = model.eval()(inputs)
+    reference = reinforcement.StartingStudent(model.train())
+    with torch.no_grad():
+        model[0].weight.add_(1)
+        assert torch.equal(reference(x=inputs), before)
+        assert model.training
+        assert not torch.equal(model.eval()(inputs), before)
+
+
+def test_loss_types_are_checked() -> None:
+    problems = ReinforceCommand(train=ReinforceTrainConfig(loss_type="ppo")).check()
+    assert any("train.loss_type" in problem for problem in problems)
 
 
 def test_a_run_resumes_in_its_second_epoch(settings, tmp_path, monkeypatch, short_rewards) -> None:

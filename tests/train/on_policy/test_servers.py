@@ -36,6 +36,7 @@ from tests.user_errors import raises_user_error
 from train import distill
 from train.common.journal import read_journal
 from train.on_policy.paired_prompts import load_datasets
+from train.on_policy.sampling import encode_prompt
 from train.on_policy.served_sampling import build_sampler
 from train.on_policy.teachers import ServerTeacher
 
@@ -123,7 +124,7 @@ def test_a_student_is_distilled_from_a_server(teacher, settings, tmp_path) -> No
 
 def distance_from_greedy(model, processor, prompts, texts) -> float:
     """Return how far a response's token is at most from the token with the largest logit."""
-    answered = [replace(p, response_ids=t.ids) for p, t in zip(prompts, texts, strict=True)]
+    answered = [replace(p.sample, response_ids=t.ids) for p, t in zip(prompts, texts, strict=True)]
     batch = Collator(processor, None)(answered)
     tokens = batch.pop("labels")[:, 1:]
     with torch.no_grad():
@@ -144,7 +145,7 @@ def test_vllm_samples_from_the_current_adapters(
     model.eval()
     rationales = ensure_rationales(micro_store, trained.teacher)
     training, _ = load_datasets(settings, trained, micro_store, rationales)
-    prompts = [training[k].student for k in range(6)]
+    prompts = [encode_prompt(training[k].student, processor, 4000) for k in range(6)]
     servers = SamplingServerConfig(url=vllm.url, unreachable_timeout=60)
     sampler = build_sampler(processor, cfg, train, servers, tmp_path)
     found = []
@@ -175,10 +176,14 @@ def test_vllm_samples_from_the_current_adapters(
 def test_a_student_is_distilled_from_responses_of_a_server(vllm, settings, tmp_path) -> None:
     run = Run("run", tmp_path)
     servers = SamplingServerConfig(url=vllm.url, unreachable_timeout=60)
-    distill.main.__wrapped__(replace(settings, sampling_server=servers), run)
+    train = replace(settings.train, temperature=0.7)
+    distill.main.__wrapped__(replace(settings, train=train, sampling_server=servers), run)
     losses = [r for r in read_journal(run.folder) if "loss" in r]
     assert len(losses) == 2
     assert all(r["loss"] > 0 and r["sampled_length"] == 8 for r in losses)
+    # The server's base is not quantised. Log-probabilities before the temperature would differ by
+    # 0.07 in the mean.
+    assert all(0.001 < r["mismatch_mean"] < 0.03 and r["mismatch_max"] < 0.1 for r in losses)
     assert not (run.folder / "sampled_adapters").exists()
 
 
@@ -214,16 +219,20 @@ def test_unsuitable_servers_are_named(processor, samples, texts, code, message) 
 
 class FixedHandler(JsonHandler):
     """A server that loads no adapters (404), whose responses have no token ids, or that has other
-    token ids of the prompt."""
+    token ids of the prompt. `scored` is the number of tokens with log-probabilities."""
 
-    loads, ids = True, None
+    loads, ids, scored = True, None, 2
 
     def post(self, body: dict) -> None:
         if self.path.endswith("/load_lora_adapter"):
             self.respond(200 if self.loads else 404, {})
             return
         message = {"role": "assistant", "content": "Answer: A"}
-        choice = {"index": 0, "message": message, "finish_reason": "stop", "token_ids": self.ids}
+        scored = [{"token": "", "logprob": -1.0, "top_logprobs": []} for _ in self.ids or ()]
+        choice = {
+            "index": 0, "message": message, "finish_reason": "stop", "token_ids": self.ids,
+            "logprobs": {"content": scored[: self.scored]},
+        }  # fmt: skip
         body = {"id": "0", "object": "chat.completion", "choices": [choice]}
         self.respond(200, {**body, "prompt_token_ids": self.ids})
 
@@ -233,6 +242,7 @@ class FixedHandler(JsonHandler):
     [
         (False, None, "no-adapters", "adapter_rank=RANK"),
         (True, None, "no-token-ids", "return no token ids"),
+        (True, [5, 6, 7], "no-token-ids", "or not their log-probabilities"),
         (True, [5, 6], "other-prompts", "at token 0 of the first prompt, this process has"),
     ],
 )
@@ -245,7 +255,8 @@ def test_servers_that_cannot_sample_are_named(
     servers = SamplingServerConfig(url=server.url, unreachable_timeout=5)
     sampler = build_sampler(processor, trained.student, settings.train, servers, tmp_path)
     with raises_user_error(code, contains=message):
-        sampler.sample(model, samples, range(len(samples)))
+        prompts = [encode_prompt(s, processor, 4000) for s in samples]
+        sampler.sample(model, prompts, range(len(prompts)))
     server.stop()
     whole = replace(trained.student, lora=LoraConfig(rank=0))
     with raises_user_error("no-adapters", contains="student.lora.rank is 0"):
