@@ -139,7 +139,7 @@ def _connect_to_ray(count: int) -> None:
     if not ray.is_initialized():
         local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": count}
         ray.init(log_to_driver=False, include_dashboard=False, **local)
-        register_ray()
+    register_ray()
 
 
 def _exit_with_parent(parent: int) -> None:

@@ -177,13 +177,14 @@ def use_ranks(ranks: int, args: argparse.Namespace) -> Seconds:
     """Start an evaluation of the tiny retriever's base, which nothing has embedded, on ranks."""
     seconds: Seconds = {}
     name = compose("evaluation.retrieve", RetrieveCommand, []).benchmark.store_name
-    with tempfile.TemporaryDirectory() as folder, timed(seconds, "retrieval"):
+    with tempfile.TemporaryDirectory() as folder:
         copy, known = Path(folder, "store", name), shutil.ignore_patterns("embeddings*")
         shutil.copytree(Path(args.store, name), copy, ignore=known)
         launcher = ["torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks), "-m"]
         settings = ["retriever=tiny", f"store={folder}/store", f"checkpoints={folder}/runs"]
         command = [sys.executable, "-m", *launcher, "evaluation.retrieve", *settings]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        with timed(seconds, "retrieval"):
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return seconds
 
 
@@ -201,14 +202,14 @@ STAGES = {
 def measure(stage: str, size: int, args: argparse.Namespace) -> list[dict[str, Any]]:
     """Do the work of a stage at one size, and return a row for each of its parts."""
     logging.basicConfig(level=logging.WARNING)
-    with peak_memory() as peak:
+    with watch_memory() as peak:
         seconds = STAGES[stage].measure(size, args)
     named = {"stage": stage, "size": f"{size:,} {STAGES[stage].unit}"}
     return [{**named, "part": p, "seconds": s, "peak GiB": max(peak)} for p, s in seconds.items()]
 
 
 @contextmanager
-def peak_memory() -> Iterator[list[float]]:
+def watch_memory() -> Iterator[list[float]]:
     """Yield a list that gets the resident memory (GiB) of this process and all its children
     together, twice a second until the block ends."""
     finished, sizes, parent = threading.Event(), [0.0], psutil.Process()
