@@ -9,7 +9,9 @@ the tests of the modules below fail for the others.
 Hooks in other modules, which subclass a library's classes or depend on how it passes its inputs:
 
 - `models.fast_layers` swaps the class of peft's `Linear` and `Linear4bit` layers, registers a
-  `LoraVariant` in their `lora_variant`, and overrides `_cast_input_dtype`.
+  `LoraVariant` in their `lora_variant`, and overrides `_cast_input_dtype`. It and
+  `models.retriever.last_token` swap the classes of norms, attention, the last layer and the text
+  tower of transformers' Qwen3-VL.
 - `models.attention` registers a function whose name contains "flash", because Qwen3-VL's vision
   tower then passes all frames in one call, with `cu_seq_lens_q` and `max_length_q`.
 - `train.common.training_loop` calls `Trainer._load_from_checkpoint`, which also reads the parts of

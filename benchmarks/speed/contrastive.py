@@ -21,9 +21,11 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from sentence_transformers import SentenceTransformerTrainer, SentenceTransformerTrainingArguments
 from sentence_transformers.sentence_transformer.data_collator import SentenceTransformerDataCollator
@@ -45,6 +47,7 @@ from data.build import ensure_benchmark
 from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
 from models import compat
+from models.attention import choose_attention
 from models.fast_layers import use_fast_layers
 from models.retriever import embedder
 from models.retriever.inputs import Retriever, frame_input, query_input
@@ -133,9 +136,10 @@ def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
     queries = store.retrieval("train")
     frames = FrameReader(store, cfg.retriever.image_size)
     with tempfile.TemporaryDirectory() as folder:
-        model = embedder.load_retriever(cfg.retriever, cfg.train.precision, [], Path(folder))
-        if variant.plain and not variant.our_attention:
-            model[0].model.set_attn_implementation("sdpa")
+        with keep_plain() if variant.plain else nullcontext():
+            model = embedder.load_retriever(cfg.retriever, cfg.train.precision, [], Path(folder))
+        if variant.our_attention:
+            choose_attention(model[0].model, cfg.train.precision, cfg.retriever.max_length)
         if variant.plain:
             trainer = build_plain_trainer(cfg, model, queries, frames, Path(folder), variant.cached)
         else:
@@ -144,6 +148,11 @@ def measure(overrides: list[str], variant: Variant, steps: int) -> Measurements:
             # Nothing is evaluated, but the trainer requires a held-out query.
             trainer = build_trainer(cfg, run, store, model, queries, queries[:1], batch, None)
         return comparison.train(trainer, cfg.train.batch)
+
+
+def keep_plain() -> AbstractContextManager[Any]:
+    """Let `load_retriever` leave the computation of a model as it is in the libraries."""
+    return patch.object(embedder, "choose_computation", lambda *_: None)
 
 
 def build_plain_trainer(

@@ -45,6 +45,7 @@ from models.loading import (
     weight_options,
 )
 from models.retriever.inputs import Retriever, query_form
+from models.retriever.last_token import compute_last_token
 from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
 from models.student.prompts import list_timestamps
 from models.tiny_qwen3_vl import build_model, build_processor
@@ -103,7 +104,7 @@ def load_retriever(
     model.prompts |= {kind: prompt for kind, prompt in given.items() if prompt is not None}
     # Training rows contain indices instead of texts, of which a model card can show no examples.
     model.model_card_data.generate_widget_examples = False
-    choose_attention(backbone.model, precision, cfg.max_length)
+    choose_computation(model, precision, cfg)
     keep_differentiable(backbone)
     if cfg.lora.rank:
         query_form(model, cfg)
@@ -173,6 +174,12 @@ def prepare_processor(backbone: Transformer, cfg: RetrieverConfig, source: str) 
     }  # fmt: skip
 
 
+def choose_computation(model: Retriever, precision: str, cfg: RetrieverConfig) -> None:
+    """Let a Qwen3-VL compute its embeddings in the fastest way for this machine."""
+    choose_attention(model[0].model, precision, cfg.max_length)
+    compute_last_token(model)
+
+
 def load_adapters(model: Retriever, folder: Path) -> None:
     """Load adapters, and the weights of the modules after the backbone, from a folder."""
     import peft
@@ -216,7 +223,7 @@ def load_trained(cfg: RetrieverConfig, precision: str, folder: Path) -> Retrieve
     model = _load_saved(folder, cfg, model_kwargs=weights, trust_remote_code=cfg.trust_remote_code)
     if cfg.late is not None:
         keep_head_fp32(model)
-    choose_attention(model[0].model, precision, cfg.max_length)
+    choose_computation(model, precision, cfg)
     return model
 
 
@@ -225,7 +232,7 @@ def load_merged(folder: Path, cfg: RetrieverConfig) -> Retriever:
     sentence-transformers' classes only. Raises UserError if it cannot be read."""
     weights = {"dtype": "auto", "use_safetensors": True, **place_weights()}
     model = _load_saved(folder, cfg, model_kwargs=weights)
-    choose_attention(model[0].model, precision_of(model[0].model), cfg.max_length)
+    choose_computation(model, precision_of(model[0].model), cfg)
     return model
 
 

@@ -146,14 +146,17 @@ def test_every_pass_over_the_frames_is_one_call(samples, processor, model, monke
     assert [shape[0] for shape in shapes] == [2 * 4] * layers + [2 * 6] * layers
 
 
-def test_attention_depends_on_precision_and_length(model) -> None:
+def test_attention_depends_on_processor_precision_and_length(model, monkeypatch) -> None:
     text, vision = model.config.text_config, model.config.vision_config
-    for precision, length, expected in (
-        ("bf16", MATMUL_MAX_TOKENS, MATMUL),
-        ("bf16", MATMUL_MAX_TOKENS + 1, "sdpa"),
-        ("fp32", MATMUL_MAX_TOKENS, MATMUL),
-        ("fp32", MATMUL_MAX_TOKENS + 1, "sdpa"),
+    for processor, precision, length, expected in (
+        ("AVX512", "bf16", MATMUL_MAX_TOKENS, MATMUL),
+        ("AVX512", "bf16", MATMUL_MAX_TOKENS + 1, "sdpa"),
+        ("AVX512", "fp32", MATMUL_MAX_TOKENS, MATMUL),
+        ("AVX512", "fp32", MATMUL_MAX_TOKENS + 1, "sdpa"),
+        ("AVX2", "bf16", MATMUL_MAX_TOKENS, MATMUL),
+        ("AVX2", "fp32", MATMUL_MAX_TOKENS, "sdpa"),
     ):
+        monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda name=processor: name)
         choose_attention(model, precision, length)
         assert (text._attn_implementation, vision._attn_implementation) == (expected, BY_FRAME)
 

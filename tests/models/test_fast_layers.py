@@ -9,10 +9,23 @@ import peft
 import pytest
 import torch
 from torch import nn
+from transformers.models.qwen3_vl.modeling_qwen3_vl import (
+    Qwen3VLTextRMSNorm,
+    apply_rotary_pos_emb,
+)
 
 from conf.schema import LoraConfig
 from models import loading
-from models.fast_layers import AddedInPlace, PatchProduct, RowsLinear, use_fast_layers
+from models.fast_layers import (
+    AddedInPlace,
+    FastAttention,
+    FrozenNorm,
+    Normed,
+    NormedRotation,
+    PatchProduct,
+    RowsLinear,
+    use_fast_layers,
+)
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
 from tests.tiny_models import randomize_adapters
@@ -56,7 +69,8 @@ def test_loss_and_every_gradient_are_the_same(student) -> None:
     plain, gradients = loss_and_gradients(model, batch)
     use_fast_layers(model)
     fused, computed = loss_and_gradients(model, batch)
-    assert any(isinstance(module, PatchProduct) for module in model.modules())
+    for kind in (PatchProduct, FastAttention, FrozenNorm):
+        assert any(isinstance(module, kind) for module in model.modules())
     variants = [v for m in model.modules() for v in getattr(m, "lora_variant", {}).values()]
     assert bool(variants) is adapted
     assert all(isinstance(v, AddedInPlace) for v in variants)
@@ -64,6 +78,39 @@ def test_loss_and_every_gradient_are_the_same(student) -> None:
     assert computed.keys() == gradients.keys()
     for name, gradient in gradients.items():
         assert (computed[name] - gradient).norm() <= 1e-4 * gradient.norm(), name
+
+
+def test_norms_and_rotations_equal_those_of_transformers() -> None:
+    """In bf16, they round no more."""
+    torch.manual_seed(0)
+    norm = Qwen3VLTextRMSNorm(6).requires_grad_(False)
+    nn.init.uniform_(norm.weight, 0.5, 2)
+    # A rotation uses the same angles in both halves of a head.
+    cos, sin = (torch.randn(2, 5, 3).repeat(1, 1, 2) for _ in range(2))
+    heads, gradient = torch.randn(2, 5, 4, 6), torch.randn(2, 5, 4, 6)
+
+    def passes(is_ours: bool, rotates: bool, dtype: torch.dtype) -> list[torch.Tensor]:
+        x, own = heads.detach().to(dtype).requires_grad_(), copy.deepcopy(norm).to(dtype)
+        settings = own.weight, own.variance_epsilon
+        positions = cos.to(dtype), sin.to(dtype)
+        if is_ours:
+            y = (NormedRotation if rotates else Normed).apply(
+                x, *settings, *positions[: 2 * rotates]
+            )
+        else:
+            y = own(x)
+            if rotates:
+                y = apply_rotary_pos_emb(y, y, *positions, unsqueeze_dim=2)[0]
+        y.backward(gradient.to(dtype))
+        assert y.dtype == x.grad.dtype == dtype
+        return [y.detach().float(), x.grad.float()]
+
+    for rotates in (False, True):
+        exact, ours = (passes(own, rotates, torch.float32) for own in (False, True))
+        torch.testing.assert_close(ours, exact)
+        library, reduced = (passes(own, rotates, torch.bfloat16) for own in (False, True))
+        for true, one, two in zip(exact, library, reduced, strict=True):
+            assert 0 < (two - true).norm() < 1.2 * (one - true).norm()
 
 
 def test_fused_operations_round_no_more_in_bf16(student) -> None:
