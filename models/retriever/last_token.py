@@ -51,14 +51,12 @@ class LastTokenTower(Qwen3VLTextModel):
         past_key_values: None = None,
         *,
         inputs_embeds: Tensor,
-        attention_mask: Tensor | None,
+        attention_mask: Tensor,
         position_ids: Tensor | None,
         visual_pos_masks: Tensor | None = None,
         **settings: Any,
     ) -> BaseModelOutputWithPast:
         size, length = inputs_embeds.shape[:2]
-        if attention_mask is None:
-            attention_mask = inputs_embeds.new_ones((size, length), dtype=torch.long)
         if position_ids is None:
             # Positions must start after the padding, so that those of the prompt are the same.
             position_ids = (attention_mask.cumsum(dim=1) - 1).clamp(min=0).expand(4, -1, -1)
@@ -82,15 +80,12 @@ class LastTokenTower(Qwen3VLTextModel):
             )
         position_ids = position_ids.expand(-1, size, -1)
         shared = slice(int(padding[0]), int(padding[0]) + count)
-        cache = (
-            super()
-            .forward(
-                inputs_embeds=inputs_embeds[:1, shared],
-                position_ids=position_ids[:, :1, shared],
-                use_cache=True,
-            )
-            .past_key_values
+        prompt = super().forward(
+            inputs_embeds=inputs_embeds[:1, shared],
+            position_ids=position_ids[:, :1, shared],
+            use_cache=True,
         )
+        cache = prompt.past_key_values
         cache.batch_repeat_interleave(size)
         is_rest = attention_mask.new_ones((size, length), dtype=torch.bool)
         is_rest[rows, columns[:, :count]] = False

@@ -108,7 +108,7 @@ def test_recomputed_activations_change_no_gradient(model, cfg, queries, frames) 
 
 def test_padding_on_the_right_is_replaced(model, queries) -> None:
     fast = copy.deepcopy(model)
-    texts = list({q.question for q in queries})[:4]
+    texts = list(dict.fromkeys(q.question for q in queries))[:4]
     expected = results(model, preprocess(model, texts, "query"))
     fast.tokenizer.padding_side = "right"
     compute_last_token(fast)
