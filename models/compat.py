@@ -11,7 +11,8 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
 - `models.fast_layers` swaps the class of peft's `Linear` and `Linear4bit` layers, registers a
   `LoraVariant` in their `lora_variant`, and overrides `_cast_input_dtype`. It and
   `models.retriever.last_token` swap the classes of norms, attention, the last layer and the text
-  tower of transformers' Qwen3-VL.
+  tower of transformers' Qwen3-VL. `models.shared_prompts` gives the text tower a mask of four
+  dimensions, from `create_causal_mask` with an `and_mask_function`.
 - `models.attention` registers a function whose name contains "flash", because Qwen3-VL's vision
   tower then passes all frames in one call, with `cu_seq_lens_q` and `max_length_q`.
 - `train.common.training_loop` calls `Trainer._load_from_checkpoint`, which also reads the parts of

@@ -4,6 +4,7 @@
 - Adapters scale B's weights, and add the product of A's narrow output with them in place to the
   base layer's output. peft scales and adds B's wide output, keeps the intermediate results, and
   first copies the output of a 4-bit layer.
+- The start that samples of a batch share is computed once (see `models.shared_prompts`).
 - Frozen norms, and the rotation of normed queries and keys by their positions, have their own
   gradients. Autograd reads and writes twice as many tensors of the size of the input.
 """
@@ -22,10 +23,13 @@ from torch.nn.functional import linear
 from transformers.modeling_utils import ALL_ATTENTION_FUNCTIONS
 from transformers.models.qwen3_vl.modeling_qwen3_vl import (
     Qwen3VLTextAttention,
+    Qwen3VLTextModel,
     Qwen3VLTextRMSNorm,
     apply_rotary_pos_emb,
     eager_attention_forward,
 )
+
+from models.shared_prompts import SharedPromptTower
 
 
 def use_fast_layers(model: nn.Module) -> None:
@@ -213,4 +217,5 @@ FUSED = {
     Linear4bit: RowsLinear4bit,
     Qwen3VLTextRMSNorm: FrozenNorm,
     Qwen3VLTextAttention: FastAttention,
+    Qwen3VLTextModel: SharedPromptTower,
 }

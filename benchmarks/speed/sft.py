@@ -4,11 +4,12 @@
     python -m benchmarks.speed.sft qwen3_vl_8b    # a released size, on a GPU
     python -m benchmarks.speed.sft --losses
 
-Every variant trains on the same samples of the tiny benchmark in the same order, with the same base
-and hyperparameters, in a process of its own. The script prints medians over the rounds and the
-ratios to our trainer with the preset's settings, whose rate on a GPU is recorded for
-benchmarks.speed.hours. A released size has random weights, so that nothing is downloaded. Losses of
-our trainer and of TRL are not comparable here, because each uses its own convention.
+Every variant trains on the same samples of the tiny benchmark in each step, with the same base and
+hyperparameters, in a process of its own. TRL gets the samples of a step sorted by length. The
+script prints medians over the rounds and the ratios to our trainer with the preset's settings,
+whose rate on a GPU is recorded for benchmarks.speed.hours. A released size has random weights, so
+that nothing is downloaded. Losses of our trainer and of TRL are not comparable here, because each
+uses its own convention.
 
 TRL runs with its default settings, and with each setting that could make it faster. Among these are
 the MALLOC_* environment variables, which have the effect of our trainer's calls of mallopt. TRL
@@ -134,22 +135,29 @@ def list_overrides(args: argparse.Namespace) -> list[str]:
 def compare_losses(overrides: list[str], steps: int) -> None:
     # TRL's loss depends on the micro-batch, so both trainers use the same micro-batch.
     ours = measure_in_process(overrides, Variant(TRL_SETTINGS), steps, True)
-    theirs = measure_in_process(overrides, Variant(TRL_SETTINGS, trl=True), steps)
+    theirs = measure_in_process(overrides, Variant(TRL_SETTINGS, trl=True), steps, True)
     print(f"{'step':>4}{'ours':>12}{'TRL':>12}{'difference':>12}")
     for step, (loss, other) in enumerate(zip(ours.losses, theirs.losses, strict=True), 1):
         print(f"{step:>4}{loss:>12.6f}{other:>12.6f}{abs(loss - other):>12.1e}")
 
 
 def measure_in_process(
-    overrides: list[str], variant: Variant, steps: int, trl_loss: bool = False
+    overrides: list[str], variant: Variant, steps: int, same_micro_batches: bool = False
 ) -> Measurements:
     return comparison.run_in_process(
-        measure, overrides, variant, steps, trl_loss, environment=variant.environment
+        measure, overrides, variant, steps, same_micro_batches, environment=variant.environment
     )
 
 
-def measure(overrides: list[str], variant: Variant, steps: int, trl_loss: bool) -> Measurements:
-    """Train a variant in this process for `steps` steps after the first one."""
+def measure(
+    overrides: list[str], variant: Variant, steps: int, same_micro_batches: bool
+) -> Measurements:
+    """Train a variant in this process for `steps` steps after the first one.
+
+    Args:
+        same_micro_batches: Whether the trainers are to have the same micro-batches and TRL's loss.
+            Otherwise, TRL gets the samples of a step sorted by length, and thus has less padding.
+    """
     changes = [f"train.{change}" for change in variant.overrides]
     cfg = compose("train.sft", SftCommand, [*overrides, *changes, f"train.max_steps={steps + 1}"])
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
@@ -162,17 +170,25 @@ def measure(overrides: list[str], variant: Variant, steps: int, trl_loss: bool) 
     with tempfile.TemporaryDirectory() as folder:
         if variant.trl:
             lengths = training.lengths(processor, cfg.student.image_size)
-            order = LengthSampler(lengths, cfg.train.batch, cfg.seed)
-            samples = Subset(training, list(islice(order, (steps + 1) * cfg.train.batch)))
+            sampler = LengthSampler(lengths, training.item_ids, cfg.train.batch, cfg.seed)
+            order = list(islice(sampler, (steps + 1) * cfg.train.batch))
+            if not same_micro_batches:
+                order = sort_steps(order, lengths, cfg.train.batch)
+            samples = Subset(training, order)
             trainer = build_trl_trainer(cfg, model, processor, samples, Path(folder), variant.flash)
         else:
             use_fast_layers(model)
             run = Run("benchmark", Path(folder))
             trainer = build_trainer(cfg, run, model, processor, training, validation, None)
-            if trl_loss:
+            if same_micro_batches:
                 micro_batches = cfg.train.batch // cfg.train.micro_batch
                 trainer.compute_loss_func = partial(mean_of_means, micro_batches)
         return comparison.train(trainer, cfg.train.batch)
+
+
+def sort_steps(order: list[int], lengths: list[int], batch: int) -> list[int]:
+    steps = [order[start : start + batch] for start in range(0, len(order), batch)]
+    return [k for step in steps for k in sorted(step, key=lambda sample: -lengths[sample])]
 
 
 def mean_of_means(

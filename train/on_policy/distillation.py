@@ -223,7 +223,9 @@ def build_trainer(
     longest = validation["reasoning"][lengths.index(max(lengths))]
     log.info(audit_student(model, processor, student, longest, collator))
     lengths = training.lengths(processor, student.image_size)
-    sampler = LengthSampler(lengths, train.batch, cfg.seed, train.micro_batch, world_size())
+    sampler = LengthSampler(
+        lengths, training.item_ids, train.batch, cfg.seed, train.micro_batch, world_size()
+    )
     answers = HeldOutAnswers(train, student, processor, run.folder)
     return DistillationTrainer(
         model=model,

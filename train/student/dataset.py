@@ -72,7 +72,7 @@ class SupervisedItem:
         render = partial(self._render_in_epoch, frames, frame_count, order_seed)
         pairs = -(-frame_count // 2)
         picture_count = 0 if self.facts else pairs + len(LETTERS)
-        return LazySample(self.text, picture_count, render, self.item.family)
+        return LazySample(self.text, picture_count, self.item.item_id, render, self.item.family)
 
     def render(self, frames: FrameReader, frame_count: int) -> Sample:
         if self.facts:

@@ -25,12 +25,14 @@ class LazySample:
         text: Text of the prompt and the response, without parts that all prompts have.
         picture_count: Number of images plus number of frame pairs of the clip. With `text`, it
             determines the estimated length in tokens.
+        item_id: Its selection item.
         render: Returns the sample in a given epoch; for distillation, `PairedPrompts`.
         family: Family of the selection item.
     """
 
     text: str
     picture_count: int
+    item_id: str
     render: Callable[[int], Sample]
     family: str | None = None
 
@@ -60,6 +62,10 @@ class StudentDataset(Dataset):
     @property
     def families(self) -> list[str | None]:
         return [s.family for s in self.samples]
+
+    @property
+    def item_ids(self) -> list[str]:
+        return [s.item_id for s in self.samples]
 
     @property
     def texts(self) -> list[str]:

@@ -85,7 +85,9 @@ def build_trainer(
     lengths = training.lengths(processor, student.image_size)
     longest = training[lengths.index(max(lengths))]
     log.info(audit_student(model, processor, student, longest, collator))
-    sampler = LengthSampler(lengths, train.batch, cfg.seed, train.micro_batch, world_size())
+    sampler = LengthSampler(
+        lengths, training.item_ids, train.batch, cfg.seed, train.micro_batch, world_size()
+    )
     cache = answers = None
     if train.reuse_features and not takes_clips(processor):
         log.info("train.reuse_features has no effect: only features of Qwen models are reused")

@@ -164,7 +164,9 @@ class Writer(nn.Module):
 
 def held_out(responses: list[str]) -> StudentDataset:
     def lazy(k: int, response: str) -> LazySample:
-        return LazySample(response, 0, lambda _: build_sample(f"item-{k}", ["Which?"], response))
+        return LazySample(
+            response, 0, f"item-{k}", lambda _: build_sample(f"item-{k}", ["Which?"], response)
+        )
 
     return StudentDataset([lazy(k, response) for k, response in enumerate(responses)])
 

@@ -266,8 +266,9 @@ def test_fsdp_without_effect_is_refused(settings, tmp_path, monkeypatch) -> None
 def test_ranks_divide_each_step_of_a_single_rank(count, micro_batch, number) -> None:
     """accelerate deals the micro-batches to the ranks in turn."""
     lengths = np.random.default_rng(0).integers(1, 1000, count).tolist()
-    alone = list(LengthSampler(lengths, 8, 0))
-    order = LengthSampler(lengths, 8, 0, micro_batch, number)
+    items = [f"item-{k // 2}" for k in range(count)]
+    alone = list(LengthSampler(lengths, items, 8, 0))
+    order = LengthSampler(lengths, items, 8, 0, micro_batch, number)
     batches = BatchSampler(order, micro_batch, drop_last=False)
     shares = [list(BatchSamplerShard(batches, number, rank)) for rank in range(number)]
     assert len(order) == len(list(order)) == sum(len(b) for part in shares for b in part)
@@ -277,7 +278,7 @@ def test_ranks_divide_each_step_of_a_single_rank(count, micro_batch, number) -> 
         samples = [i for part in shares for b in part[first : first + each] for i in b]
         supervised = sorted(i for i in samples if i >= 0)
         assert supervised == sorted(alone[step : step + 8])
-        # The samples that fill up a step repeat its shortest sample.
+        # The samples that fill up a step repeat its last sample.
         assert {~i for i in samples if i < 0} <= {alone[step : step + 8][-1]}
     assert len({len(part) for part in shares}) == 1
 
@@ -285,7 +286,8 @@ def test_ranks_divide_each_step_of_a_single_rank(count, micro_batch, number) -> 
 def test_ranks_get_samples_of_equal_length() -> None:
     """The longer of two consecutive samples goes to each rank in turn."""
     lengths = np.random.default_rng(0).integers(1, 1000, 64)
-    order = np.array(list(LengthSampler(lengths.tolist(), 64, 0, 1, 2))).reshape(-1, 2)
+    sampler = LengthSampler(lengths.tolist(), [str(k) for k in range(64)], 64, 0, 1, 2)
+    order = np.array(list(sampler)).reshape(-1, 2)
     loads = lengths[order].sum(axis=0)
     assert abs(loads[0] - loads[1]) <= lengths.max() - lengths.min()
     assert (lengths[order[::2, 0]] >= lengths[order[::2, 1]]).all()
@@ -296,7 +298,7 @@ def test_a_filler_changes_no_loss(micro_store, frames, student_cfg, processor, m
     items = micro_store.selection("train")[:2]
     samples = StudentDataset(
         [
-            LazySample("", 0, partial(render, item, frames, student_cfg, text))
+            LazySample("", 0, item.item_id, partial(render, item, frames, student_cfg, text))
             for item, text in zip(items, ("Answer: A", "near the top\nAnswer: B"), strict=True)
         ]
     )

@@ -113,7 +113,7 @@ def test_lengths_are_estimated_without_rendering(
 
     items = micro_store.selection("train")[:4]
     texts = ["near the top " * words + "\nAnswer: A" for words in (3, 9, 27, 1)]
-    samples = StudentDataset([LazySample(text, 10, refuse) for text in texts])
+    samples = StudentDataset([LazySample(text, 10, text, refuse) for text in texts])
     estimated = samples.lengths(processor, 96)
     real = [
         len(encode(sample, processor, 1500).input_ids)
@@ -145,7 +145,7 @@ def test_the_letter_with_the_highest_logit_is_chosen(
     assert right.tolist() == [i.answer for i in items]
     assert (chosen == right).tolist() == [False] + [True] * 5
     samples = StudentDataset(
-        [LazySample("", 0, lambda epoch: None, f) for f in ("event",) * 4 + ("time",) * 2]
+        [LazySample("", 0, f, lambda epoch: None, f) for f in ("event",) * 4 + ("time",) * 2]
     )
     metrics = LetterAccuracy.measure(
         EvalPrediction(torch.stack([chosen, right], dim=1).numpy(), None), samples
@@ -156,17 +156,28 @@ def test_the_letter_with_the_highest_logit_is_chosen(
 
 
 @pytest.mark.parametrize("count", [1, 7, 64, 1000])
-def test_each_step_is_sorted_by_length(count) -> None:
+@pytest.mark.parametrize("each", [1, 2, 8])
+def test_steps_are_sorted_by_length_and_keep_the_samples_of_an_item_together(count, each) -> None:
     lengths = np.random.default_rng(0).integers(1, 1000, count)
-    order = LengthSampler(lengths.tolist(), 16, seed=0)
-    first = list(order)
+    items = np.random.default_rng(1).permutation(count) // each
+    sampler = LengthSampler(lengths.tolist(), items.astype(str).tolist(), 16, seed=0)
+    first = list(sampler)
     assert sorted(first) == list(range(count))
-    assert first == list(order)
-    for start in range(0, count, 16):
-        assert (np.diff(lengths[first[start : start + 16]]) <= 0).all()
-    order.set_epoch(1)
-    second = list(order)
+    assert first == list(sampler)
+    changes = (np.diff(items[first]) != 0).sum()
+    steps = [first[start : start + 16] for start in range(0, count, 16)]
+    # Only the end of a step can separate the samples of an item.
+    assert changes <= len(set(items)) - 1 + len(steps) - 1
+    for step in steps:
+        own = items[step]
+        longest = [lengths[step][own == item].max() for item in own]
+        assert (np.diff(longest) <= 0).all()
+        within = np.diff(own) == 0
+        assert (np.diff(lengths[step])[within] <= 0).all()
+    sampler.set_epoch(1)
+    second = list(sampler)
     assert sorted(second) == list(range(count))
     # The samples of a single step have one order.
     assert first != second or count <= 16
-    assert second != list(LengthSampler(lengths.tolist(), 16, seed=1)) or count <= 16
+    other = LengthSampler(lengths.tolist(), sampler.item_ids, 16, seed=1)
+    assert second != list(other) or count <= 16
