@@ -82,9 +82,22 @@ def causal(length: int, dtype: torch.dtype) -> torch.Tensor:
 
 @pytest.mark.parametrize("queries", [33, 20, 1])
 @pytest.mark.parametrize("block", [8, 11, 64])
-def test_products_equal_the_librarys_eager_attention(queries, block, monkeypatch) -> None:
-    """The last queries attend to all keys before them, of which some are padding."""
+@pytest.mark.parametrize("processor", ["AVX2", "AVX512"])
+def test_products_equal_the_librarys_eager_attention(
+    queries, block, processor, monkeypatch
+) -> None:
+    """The last queries attend to all keys before them, of which some are padding.
+
+    With AVX2, fewer than 33 queries use the fused attention.
+    """
     monkeypatch.setattr(attention, "MATMUL_BLOCK", block)
+    monkeypatch.setattr(attention, "MATMUL_MIN_QUERIES", 33)
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: processor)
+    calls = []
+    apply = attention.ProductAttention.apply
+    monkeypatch.setattr(
+        attention.ProductAttention, "apply", lambda *inputs: calls.append(1) or apply(*inputs)
+    )
     query, key, value = heads(2, 4, 33, 16)
     query = query[:, :, -queries:].detach().requires_grad_()
     key, value = key[:, :2].detach().requires_grad_(), value[:, :2].detach().requires_grad_()
@@ -99,6 +112,7 @@ def test_products_equal_the_librarys_eager_attention(queries, block, monkeypatch
         attend(layer, *inputs, mask, scaling=0.25)[0][:, -28:]
         for attend in (attend_by_matmul, eager_attention_forward)
     )
+    assert bool(calls) is (processor == "AVX512" or queries == 33)
     check_equal(ours, theirs, inputs)
 
 
@@ -146,18 +160,10 @@ def test_every_pass_over_the_frames_is_one_call(samples, processor, model, monke
     assert [shape[0] for shape in shapes] == [2 * 4] * layers + [2 * 6] * layers
 
 
-def test_attention_depends_on_processor_precision_and_length(model, monkeypatch) -> None:
+def test_attention_depends_on_the_length(model) -> None:
     text, vision = model.config.text_config, model.config.vision_config
-    for processor, precision, length, expected in (
-        ("AVX512", "bf16", MATMUL_MAX_TOKENS, MATMUL),
-        ("AVX512", "bf16", MATMUL_MAX_TOKENS + 1, "sdpa"),
-        ("AVX512", "fp32", MATMUL_MAX_TOKENS, MATMUL),
-        ("AVX512", "fp32", MATMUL_MAX_TOKENS + 1, "sdpa"),
-        ("AVX2", "bf16", MATMUL_MAX_TOKENS, MATMUL),
-        ("AVX2", "fp32", MATMUL_MAX_TOKENS, "sdpa"),
-    ):
-        monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda name=processor: name)
-        choose_attention(model, precision, length)
+    for length, expected in ((MATMUL_MAX_TOKENS, MATMUL), (MATMUL_MAX_TOKENS + 1, "sdpa")):
+        choose_attention(model, "fp32", length)
         assert (text._attn_implementation, vision._attn_implementation) == (expected, BY_FRAME)
 
 
