@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +14,8 @@ class LengthSampler(Sampler[int]):
     """Yields the indices of all samples: those of an item together, and the items in random order.
 
     `models.shared_prompts` computes the start of an item's prompts once if its samples are in the
-    same micro-batch. Within a step, the items with the longest samples are first, so that the
-    padding of micro-batches is small. Which samples a step has depends neither on the size of the
+    same micro-batch. Within a step, the items are sorted by length, so that the padding of
+    micro-batches is small. Which samples a step has depends neither on the size of the
     micro-batches nor on the number of ranks.
 
     accelerate gives consecutive micro-batches to the ranks in turn. Every other round is reversed,
@@ -44,26 +44,41 @@ class LengthSampler(Sampler[int]):
         return len(self.lengths) + self._missing(len(self.lengths) % self.batch)
 
     def __iter__(self) -> Iterator[int]:
-        samples_of: dict[str, list[int]] = {}
-        for sample, item in enumerate(self.item_ids):
-            samples_of.setdefault(item, []).append(sample)
-        items = np.random.default_rng([self.seed, self.epoch]).permutation(list(samples_of))
-        order = [sample for item in items for sample in samples_of[item]]
+        order = self._shuffle()
         for start in range(0, len(order), self.batch):
             yield from self._deal(self._sort(order[start : start + self.batch])).tolist()
 
+    def _shuffle(self) -> list[int]:
+        """Return all samples, with the items in random order. Items with one sample are in twos, so
+        that the ends of steps separate no items with two samples."""
+        samples_of = self._samples_of(range(len(self.lengths)))
+        items = np.random.default_rng([self.seed, self.epoch]).permutation(list(samples_of))
+        order, single = [], []
+        for item in items:
+            samples = samples_of[item]
+            if len(samples) == 1 and not single:
+                single = samples
+            elif len(samples) == 1:
+                order += single + samples
+                single = []
+            else:
+                order += samples
+        return order + single
+
+    def _samples_of(self, samples: Iterable[int]) -> dict[str, list[int]]:
+        """Return the samples of each item."""
+        found: dict[str, list[int]] = {}
+        for sample in samples:
+            found.setdefault(self.item_ids[sample], []).append(sample)
+        return found
+
     def _sort(self, step: list[int]) -> list[int]:
-        """Sort the samples of a step by the length of the longest sample of their item."""
-        longest: dict[str, int] = {}
-        for sample in step:
-            item = self.item_ids[sample]
-            longest[item] = max(longest.get(item, 0), self.lengths[sample])
-
-        def sort_key(sample: int) -> tuple[int, str, int]:
-            item = self.item_ids[sample]
-            return -longest[item], item, -self.lengths[sample]
-
-        return sorted(step, key=sort_key)
+        """Sort the samples of a step by their item's longest sample. Items with more samples are
+        first, so that the ends of micro-batches separate none of them."""
+        samples_of = self._samples_of(step)
+        items = [sorted(s, key=lambda k: -self.lengths[k]) for s in samples_of.values()]
+        items.sort(key=lambda samples: (-len(samples), -self.lengths[samples[0]]))
+        return [sample for samples in items for sample in samples]
 
     def _deal(self, step: list[int]) -> np.ndarray:
         """Arrange the sorted samples of a step in the order in which the ranks get them."""

@@ -170,8 +170,11 @@ def test_steps_are_sorted_by_length_and_keep_the_samples_of_an_item_together(cou
     assert changes <= len(set(items)) - 1 + len(steps) - 1
     for step in steps:
         own = items[step]
-        longest = [lengths[step][own == item].max() for item in own]
-        assert (np.diff(longest) <= 0).all()
+        number = np.array([(own == item).sum() for item in own])
+        longest = np.array([lengths[step][own == item].max() for item in own])
+        assert (np.diff(number) <= 0).all()
+        for one in set(number):
+            assert (np.diff(longest[number == one]) <= 0).all()
         within = np.diff(own) == 0
         assert (np.diff(lengths[step])[within] <= 0).all()
     sampler.set_epoch(1)
@@ -181,3 +184,18 @@ def test_steps_are_sorted_by_length_and_keep_the_samples_of_an_item_together(cou
     assert first != second or count <= 16
     other = LengthSampler(lengths.tolist(), sampler.item_ids, 16, seed=1)
     assert second != list(other) or count <= 16
+
+
+def test_no_step_and_no_micro_batch_separates_the_two_samples_of_an_item() -> None:
+    """Some items have one sample, since their rationale was rejected."""
+    singles = 13
+    items = [f"item-{k}" for k in range(500)] + [f"item-{k}" for k in range(500 - singles)]
+    lengths = np.random.default_rng(0).integers(1, 1000, len(items)).tolist()
+    sampler = LengthSampler(lengths, items, 16, seed=0)
+    order = list(sampler)
+    assert sorted(order) == list(range(len(items)))
+    for micro_batch in (2, 4, 8, 16):
+        places: dict[str, set[int]] = {}
+        for place, sample in enumerate(order):
+            places.setdefault(items[sample], set()).add(place // micro_batch)
+        assert all(len(found) == 1 for found in places.values())
