@@ -65,7 +65,8 @@ def attend_by_matmul(
     module: Module, query: Tensor, key: Tensor, value: Tensor, attention_mask: Any, **settings: Any
 ) -> tuple[Tensor, None]:
     """Compute attention by matrix products, from (B, H, Q, D) queries to (B, G, K, D) keys and
-    values, where H is a multiple of G. Return (B, Q, H, D).
+    values, where H is a multiple of G. Return (B, Q, H, D). Torch's fused attention is used where
+    it is faster and for dropout.
 
     Args:
         attention_mask: (B, 1, Q, K) mask to add to the scores, which masks at least all later keys

@@ -41,6 +41,7 @@ from data.frames.frame_cache import FrameReader
 from data.items.cells import family_quotas
 from data.parallel import Workers
 from data.store import open_store
+from models.precision import resolve_precision
 from teacher.narrate import JOURNAL_FILE, narrate_store
 
 BUILD_PARTS = {
@@ -132,14 +133,16 @@ def narrate(scenes: int, args: argparse.Namespace) -> Seconds:
 
 def train_student(batch: int, args: argparse.Namespace) -> Seconds:
     """Train the tiny student with a number of samples per step."""
-    settings = ["+exp=cot", "train.generated_items=0", f"store={args.store}"]
+    precision = f"train.precision={resolve_precision('auto')}"
+    settings = ["+exp=cot", "train.generated_items=0", f"store={args.store}", precision]
     variant = sft.Variant((f"batch={batch}",))
     return step_seconds(batch, sft.measure(settings, variant, STEPS, False))
 
 
 def train_retriever(batch: int, args: argparse.Namespace) -> Seconds:
     """Train the tiny retriever with a number of queries per step."""
-    settings = [f"store={args.store}", f"train.batch={batch}", "train.mini_batch=16"]
+    precision = f"train.precision={resolve_precision('auto')}"
+    settings = [f"store={args.store}", f"train.batch={batch}", "train.mini_batch=16", precision]
     return step_seconds(batch, contrastive.measure(settings, contrastive.Variant(), STEPS))
 
 
@@ -153,7 +156,7 @@ def embed(frames: int, args: argparse.Namespace) -> Seconds:
 
     cfg, seconds = compose("evaluation.retrieve", RetrieveCommand, ["retriever=tiny"]), {}
     store = build.ensure_benchmark(cfg.benchmark, Path(args.store), args.workers)
-    database = [f for part in store.databases.values() for f in part]
+    database = store.database()
     chosen = (database * -(-frames // len(database)))[:frames]
     reader = FrameReader(store, cfg.retriever.image_size)
     with tempfile.TemporaryDirectory() as folder:
@@ -236,14 +239,19 @@ def main() -> None:
     parser.add_argument("--workers", type=positive_int, default=2)
     parser.add_argument("--parallel", choices=["loky", "ray"], default="loky")
     args = parser.parse_args()
-    work = [(s, n) for s in args.stages or STAGES for n in args.sizes or STAGES[s].sizes]
-    rows: list[dict[str, Any]] = []
-    for stage, size in tqdm(work, unit="measurement"):
-        rows += comparison.run_in_process(measure, stage, size, args)
-    table = pd.DataFrame(rows)
-    parts = table.groupby(["stage", "part"])[["seconds", "peak GiB"]]
-    table = table.join((table[["seconds", "peak GiB"]] / parts.shift(1)).add_suffix(", growth"))
-    print(table.to_string(index=False, float_format="{:.2f}".format, na_rep=""))
+    for stage in args.stages or STAGES:
+        rows: list[dict[str, Any]] = []
+        for size in tqdm(args.sizes or STAGES[stage].sizes, desc=stage, unit="measurement"):
+            rows += comparison.run_in_process(measure, stage, size, args)
+        print_growth(pd.DataFrame(rows))
+
+
+def print_growth(table: pd.DataFrame) -> None:
+    """Print measurements, and their ratios to those of the same part at the previous size."""
+    measures = ["seconds", "peak GiB"]
+    growth = table[measures] / table.groupby("part")[measures].shift(1)
+    table = table.join(growth.add_suffix(", growth"))
+    print(table.to_string(index=False, float_format="{:.2f}".format, na_rep=""), flush=True)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
     python -m benchmarks.speed.sft --losses
 
 Every variant trains on the same samples of the tiny benchmark in each step, with the same base and
-hyperparameters, in a process of its own. TRL gets the samples of a step sorted by length. The
+hyperparameters, in a process of its own. The samples of TRL's steps are sorted by length. The
 script prints medians over the rounds and the ratios to our trainer with the preset's settings,
 whose rate on a GPU is recorded for benchmarks.speed.hours. A released size has random weights, so
 that nothing is downloaded. Losses of our trainer and of TRL are not comparable here, because each
@@ -170,11 +170,10 @@ def measure(
     with tempfile.TemporaryDirectory() as folder:
         if variant.trl:
             lengths = training.lengths(processor, cfg.student.image_size)
-            sampler = LengthSampler(lengths, training.item_ids, cfg.train.batch, cfg.seed)
-            order = list(islice(sampler, (steps + 1) * cfg.train.batch))
-            if not same_micro_batches:
-                order = sort_steps(order, lengths, cfg.train.batch)
-            samples = Subset(training, order)
+            order = LengthSampler(
+                lengths, training.item_ids, cfg.train.batch, cfg.seed, pairs=same_micro_batches
+            )
+            samples = Subset(training, list(islice(order, (steps + 1) * cfg.train.batch)))
             trainer = build_trl_trainer(cfg, model, processor, samples, Path(folder), variant.flash)
         else:
             use_fast_layers(model)
@@ -184,11 +183,6 @@ def measure(
                 micro_batches = cfg.train.batch // cfg.train.micro_batch
                 trainer.compute_loss_func = partial(mean_of_means, micro_batches)
         return comparison.train(trainer, cfg.train.batch)
-
-
-def sort_steps(order: list[int], lengths: list[int], batch: int) -> list[int]:
-    steps = [order[start : start + batch] for start in range(0, len(order), batch)]
-    return [k for step in steps for k in sorted(step, key=lambda sample: -lengths[sample])]
 
 
 def mean_of_means(

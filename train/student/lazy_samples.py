@@ -25,7 +25,7 @@ class LazySample:
         text: Text of the prompt and the response, without parts that all prompts have.
         picture_count: Number of images plus number of frame pairs of the clip. With `text`, it
             determines the estimated length in tokens.
-        item_id: Its selection item.
+        item_id: Id of its selection item.
         render: Returns the sample in a given epoch; for distillation, `PairedPrompts`.
         family: Family of the selection item.
     """

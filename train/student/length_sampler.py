@@ -13,10 +13,9 @@ from torch.utils.data import Sampler
 class LengthSampler(Sampler[int]):
     """Yields the indices of all samples: those of an item together, and the items in random order.
 
-    `models.shared_prompts` computes the start of an item's prompts once if its samples are in the
-    same micro-batch. Within a step, the items are sorted by length, so that the padding of
-    micro-batches is small. Which samples a step has depends neither on the size of the
-    micro-batches nor on the number of ranks.
+    Within a step, the samples are sorted by length, so that the padding of micro-batches is small.
+    Which samples a step has depends neither on this order nor on the number of ranks. An item with
+    two samples has both in the same step if the batch is even.
 
     accelerate gives consecutive micro-batches to the ranks in turn. Every other round is reversed,
     so that no rank always gets the longest samples. If the samples of an epoch's last step cannot
@@ -27,6 +26,8 @@ class LengthSampler(Sampler[int]):
         lengths: Length of each sample in tokens.
         item_ids: Item of each sample.
         batch: Samples per step, over all micro-batches and ranks.
+        pairs: Whether an item's samples follow each other within a step, so that they are in one
+            micro-batch of even size. `models.shared_prompts` then computes their prompt once.
     """
 
     lengths: Sequence[int]
@@ -35,6 +36,7 @@ class LengthSampler(Sampler[int]):
     seed: int
     micro_batch: int = 1
     world_size: int = 1
+    pairs: bool = False
     epoch: int = 0
 
     def set_epoch(self, epoch: int) -> None:
@@ -50,7 +52,7 @@ class LengthSampler(Sampler[int]):
 
     def _shuffle(self) -> list[int]:
         """Return all samples, with the items in random order. Items with one sample are in twos, so
-        that the ends of steps separate no items with two samples."""
+        that the ends of even steps separate no item with two samples."""
         samples_of = self._samples_of(range(len(self.lengths)))
         items = np.random.default_rng([self.seed, self.epoch]).permutation(list(samples_of))
         order, single = [], []
@@ -73,11 +75,12 @@ class LengthSampler(Sampler[int]):
         return found
 
     def _sort(self, step: list[int]) -> list[int]:
-        """Sort the samples of a step by their item's longest sample. Items with more samples are
-        first, so that the ends of micro-batches separate none of them."""
-        samples_of = self._samples_of(step)
-        items = [sorted(s, key=lambda k: -self.lengths[k]) for s in samples_of.values()]
-        items.sort(key=lambda samples: (-len(samples), -self.lengths[samples[0]]))
+        """Sort the samples of a step from the longest to the shortest. With `pairs`, sort items by
+        their longest sample; those with fewer samples are last and separate no others."""
+        step = sorted(step, key=lambda k: -self.lengths[k])
+        if not self.pairs:
+            return step
+        items = sorted(self._samples_of(step).values(), key=lambda samples: -len(samples))
         return [sample for samples in items for sample in samples]
 
     def _deal(self, step: list[int]) -> np.ndarray:

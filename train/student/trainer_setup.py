@@ -13,6 +13,7 @@ from conf.runs import Run, local_world_size, world_size
 from conf.schema import SftCommand, StudentTrainConfig
 from models.distributed import split_batch
 from models.memory import available_cpu_bytes
+from models.shared_prompts import shares_prompts
 from models.student.chat_format import takes_clips
 from models.student.collator import Collator, letter_ids
 from train.common.arguments import common_arguments
@@ -86,7 +87,13 @@ def build_trainer(
     longest = training[lengths.index(max(lengths))]
     log.info(audit_student(model, processor, student, longest, collator))
     sampler = LengthSampler(
-        lengths, training.item_ids, train.batch, cfg.seed, train.micro_batch, world_size()
+        lengths,
+        training.item_ids,
+        train.batch,
+        cfg.seed,
+        train.micro_batch,
+        world_size(),
+        pairs=train.micro_batch > 1 and shares_prompts(model),
     )
     cache = answers = None
     if train.reuse_features and not takes_clips(processor):

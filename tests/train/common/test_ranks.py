@@ -283,6 +283,24 @@ def test_ranks_divide_each_step_of_a_single_rank(count, micro_batch, number) -> 
     assert len({len(part) for part in shares}) == 1
 
 
+@pytest.mark.parametrize(("micro_batch", "number"), [(2, 2), (4, 2), (8, 2), (2, 4)])
+def test_the_two_samples_of_an_item_are_in_one_micro_batch(micro_batch, number) -> None:
+    """Some items have one sample, since their rationale was rejected."""
+    items = [f"item-{k}" for k in range(500)] + [f"item-{k}" for k in range(500 - 13)]
+    lengths = np.random.default_rng(0).integers(1, 1000, len(items)).tolist()
+    order = LengthSampler(lengths, items, 16, 0, micro_batch, number, pairs=True)
+    batches = BatchSampler(order, micro_batch, drop_last=False)
+    shares = [BatchSamplerShard(batches, number, rank) for rank in range(number)]
+    seen: dict[str, set[tuple[int, int]]] = {}
+    for rank, share in enumerate(shares):
+        for place, batch in enumerate(share):
+            for sample in batch:
+                if sample >= 0:
+                    seen.setdefault(items[sample], set()).add((rank, place))
+    assert len(seen) == 500
+    assert all(len(places) == 1 for places in seen.values())
+
+
 def test_ranks_get_samples_of_equal_length() -> None:
     """The longer of two consecutive samples goes to each rank in turn."""
     lengths = np.random.default_rng(0).integers(1, 1000, 64)

@@ -157,45 +157,31 @@ def test_the_letter_with_the_highest_logit_is_chosen(
 
 @pytest.mark.parametrize("count", [1, 7, 64, 1000])
 @pytest.mark.parametrize("each", [1, 2, 8])
-def test_steps_are_sorted_by_length_and_keep_the_samples_of_an_item_together(count, each) -> None:
+def test_steps_are_sorted_by_length_and_have_whole_items(count, each) -> None:
     lengths = np.random.default_rng(0).integers(1, 1000, count)
     items = np.random.default_rng(1).permutation(count) // each
-    sampler = LengthSampler(lengths.tolist(), items.astype(str).tolist(), 16, seed=0)
-    first = list(sampler)
+    order = LengthSampler(lengths.tolist(), items.astype(str).tolist(), 16, seed=0)
+    pairs = replace(order, pairs=True)
+    first = list(order)
     assert sorted(first) == list(range(count))
-    assert first == list(sampler)
-    changes = (np.diff(items[first]) != 0).sum()
-    steps = [first[start : start + 16] for start in range(0, count, 16)]
+    assert first == list(order)
     # Only the end of a step can separate the samples of an item.
-    assert changes <= len(set(items)) - 1 + len(steps) - 1
-    for step in steps:
-        own = items[step]
-        number = np.array([(own == item).sum() for item in own])
-        longest = np.array([lengths[step][own == item].max() for item in own])
-        assert (np.diff(number) <= 0).all()
-        for one in set(number):
-            assert (np.diff(longest[number == one]) <= 0).all()
-        within = np.diff(own) == 0
-        assert (np.diff(lengths[step])[within] <= 0).all()
-    sampler.set_epoch(1)
-    second = list(sampler)
+    changes, steps = (np.diff(items[list(pairs)]) != 0).sum(), -(-count // 16)
+    assert changes <= len(set(items)) - 1 + steps - 1
+    for start in range(0, count, 16):
+        step = first[start : start + 16]
+        assert (np.diff(lengths[step]) <= 0).all()
+        assert sorted(list(pairs)[start : start + 16]) == sorted(step)
+    order.set_epoch(1)
+    second = list(order)
     assert sorted(second) == list(range(count))
     # The samples of a single step have one order.
     assert first != second or count <= 16
-    other = LengthSampler(lengths.tolist(), sampler.item_ids, 16, seed=1)
+    other = LengthSampler(lengths.tolist(), order.item_ids, 16, seed=1)
     assert second != list(other) or count <= 16
 
 
-def test_no_step_and_no_micro_batch_separates_the_two_samples_of_an_item() -> None:
-    """Some items have one sample, since their rationale was rejected."""
-    singles = 13
-    items = [f"item-{k}" for k in range(500)] + [f"item-{k}" for k in range(500 - singles)]
-    lengths = np.random.default_rng(0).integers(1, 1000, len(items)).tolist()
-    sampler = LengthSampler(lengths, items, 16, seed=0)
-    order = list(sampler)
-    assert sorted(order) == list(range(len(items)))
-    for micro_batch in (2, 4, 8, 16):
-        places: dict[str, set[int]] = {}
-        for place, sample in enumerate(order):
-            places.setdefault(items[sample], set()).add(place // micro_batch)
-        assert all(len(found) == 1 for found in places.values())
+def test_pairs_are_sorted_by_their_longest_sample_and_single_samples_are_last() -> None:
+    lengths = [10, 70, 20, 60, 50, 40, 90]
+    items = ["a", "a", "b", "c", "b", "c", "single"]
+    assert list(LengthSampler(lengths, items, 7, 0, pairs=True)) == [1, 0, 3, 5, 4, 2, 6]
