@@ -8,13 +8,13 @@ the tests of the modules below fail for the others.
 
 Hooks in other modules, which subclass a library's classes or depend on how it passes its inputs:
 
-- `models.fast_layers` swaps the class of peft's `Linear` and `Linear4bit` layers, registers a
-  `LoraVariant` in their `lora_variant`, and overrides `_cast_input_dtype`. It and
+- `models.layers.fast_layers` swaps the class of peft's `Linear` and `Linear4bit` layers, registers
+  a `LoraVariant` in their `lora_variant`, and overrides `_cast_input_dtype`. It and
   `models.retriever.last_token` swap the classes of norms, attention, the last layer and the text
-  tower of transformers' Qwen3-VL. `models.shared_prompts` gives the text tower a mask of four
-  dimensions, from `create_causal_mask` with an `and_mask_function`.
-- `models.attention` registers a function whose name contains "flash", because Qwen3-VL's vision
-  tower then passes all frames in one call, with `cu_seq_lens_q` and `max_length_q`.
+  tower of transformers' Qwen3-VL. `models.layers.shared_prompts` gives the text tower a mask of
+  four dimensions, from `create_causal_mask` with an `and_mask_function`.
+- `models.layers.attention` registers a function whose name contains "flash", because Qwen3-VL's
+  vision tower then passes all frames in one call, with `cu_seq_lens_q` and `max_length_q`.
 - `train.common.training_loop` calls `Trainer._load_from_checkpoint`, which also reads the parts of
   an FSDP checkpoint.
 - `models.loading` leaves the weights of an FSDP rank without values if transformers and accelerate

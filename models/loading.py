@@ -28,7 +28,6 @@ from transformers.utils import logging as transformers_logging
 
 from conf.errors import UserError
 from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
-from models.attention import choose_attention
 from models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
@@ -41,6 +40,7 @@ from models.checks import (
 )
 from models.compat import keep_differentiable, write_clips_as_released
 from models.distributed import is_sharded, lacks_weights, rank_device
+from models.layers.attention import choose_attention
 from models.student.chat_format import TIMED_PROCESSORS
 from models.tiny_qwen3_vl import build_model, build_processor
 from models.towers import choose_lora_targets, find_unquantized

@@ -30,7 +30,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from models.checks import check_available
     from models.compat import keep_freed_memory
     from models.distributed import is_sharded, main_first, split_batch
-    from models.fast_layers import use_fast_layers
+    from models.layers.fast_layers import use_fast_layers
     from models.resolved_settings import data_digest, resolve_run
     from models.retriever.embedder import load_retriever, tokenizer_texts
     from train.common.checkpoints import newest_checkpoint

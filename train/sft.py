@@ -28,7 +28,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from data.build import ensure_benchmark
     from models import compat, distributed, loading
     from models.checks import check_adapters, check_available
-    from models.fast_layers import use_fast_layers
+    from models.layers.fast_layers import use_fast_layers
     from models.resolved_settings import data_digest, resolve_run
     from teacher.narrate import ensure_rationales
     from train.common import training_loop

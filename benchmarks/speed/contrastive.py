@@ -47,8 +47,8 @@ from data.build import ensure_benchmark
 from data.frames.frame_cache import FrameReader
 from data.records import RetrievalQuery
 from models import compat
-from models.attention import choose_attention
-from models.fast_layers import use_fast_layers
+from models.layers.attention import choose_attention
+from models.layers.fast_layers import use_fast_layers
 from models.retriever import embedder
 from models.retriever.inputs import Retriever, frame_input, query_input
 from train.retriever.batches import QueryBatchSampler

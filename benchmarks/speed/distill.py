@@ -40,7 +40,7 @@ from conf.schema import DistillCommand, SftCommand
 from data.build import ensure_benchmark
 from models import compat, loading
 from models.distributed import rank_device
-from models.fast_layers import use_fast_layers
+from models.layers.fast_layers import use_fast_layers
 from teacher.narrate import ensure_rationales
 from train.on_policy import distillation, sampling
 from train.on_policy.continuation import inherit_settings

@@ -45,8 +45,8 @@ from conf.runs import Run
 from conf.schema import SftCommand
 from data.build import ensure_benchmark
 from models import compat, loading
-from models.attention import flash_attention
-from models.fast_layers import use_fast_layers
+from models.layers.attention import flash_attention
+from models.layers.fast_layers import use_fast_layers
 from models.student.collator import Collator, encode, pad
 from models.student.prompts import Sample
 from teacher.narrate import ensure_rationales

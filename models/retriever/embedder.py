@@ -24,7 +24,6 @@ from conf.errors import UserError
 from conf.runs import rank
 from conf.schema import RetrieverConfig
 from data.records import RetrievalQuery
-from models.attention import choose_attention
 from models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
@@ -34,6 +33,7 @@ from models.checks import (
 )
 from models.compat import keep_differentiable, write_clips_as_released
 from models.distributed import main_first, rank_device
+from models.layers.attention import choose_attention
 from models.loading import (
     explain_damage,
     explain_unloadable,

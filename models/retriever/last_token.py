@@ -20,7 +20,7 @@ from transformers import Qwen3VLTextModel
 from transformers.modeling_outputs import BaseModelOutputWithPast
 from transformers.models.qwen3_vl.modeling_qwen3_vl import Qwen3VLTextDecoderLayer
 
-from models.fast_layers import FastAttention
+from models.layers.fast_layers import FastAttention
 from models.retriever.inputs import Retriever
 
 

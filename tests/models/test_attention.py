@@ -8,8 +8,8 @@ from torch import nn
 from transformers import PreTrainedModel
 from transformers.models.qwen3_vl.modeling_qwen3_vl import eager_attention_forward
 
-from models import attention
-from models.attention import (
+from models.layers import attention
+from models.layers.attention import (
     BY_FRAME,
     MATMUL,
     MATMUL_MAX_TOKENS,

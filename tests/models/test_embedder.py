@@ -14,8 +14,8 @@ from conf.schema import LateConfig, LoraConfig
 from conf.schema.benchmark import POOLS
 from data.items.database import UniqueFrames
 from data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
-from models.attention import BY_FRAME
 from models.compat import keep_differentiable
+from models.layers.attention import BY_FRAME
 from models.retriever import embedder
 from models.retriever.inputs import frame_input, query_input
 from models.towers import count_parameters

@@ -16,7 +16,7 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import (
 
 from conf.schema import LoraConfig
 from models import loading
-from models.fast_layers import (
+from models.layers.fast_layers import (
     AddedInPlace,
     FastAttention,
     FrozenNorm,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from conf.schema import LateConfig, LoraConfig, RetrieverConfig
-from models.attention import MATMUL
+from models.layers.attention import MATMUL
 from models.retriever import embedder
 from models.retriever.inputs import Retriever, model_inputs, preprocess
 from models.retriever.last_token import LastTokenTower, compute_last_token

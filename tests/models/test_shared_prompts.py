@@ -13,9 +13,9 @@ from torch import nn
 
 from conf.schema import LoraConfig
 from models import loading
-from models.attention import MATMUL
-from models.fast_layers import use_fast_layers
-from models.shared_prompts import PADDING, SHARED, pack_samples, shares_prompts
+from models.layers.attention import MATMUL
+from models.layers.fast_layers import use_fast_layers
+from models.layers.shared_prompts import PADDING, SHARED, pack_samples, shares_prompts
 from models.student.collator import Collator
 from models.student.prompts import selection_sample
 from tests.tiny_models import randomize_adapters

@@ -18,7 +18,7 @@ from conf.runs import Run, rank
 from conf.schema import DistillCommand, ReinforceCommand, SftCommand
 from models import loading
 from models.distributed import is_sharded, main_first, rank_device
-from models.fast_layers import use_fast_layers
+from models.layers.fast_layers import use_fast_layers
 from models.resolved_settings import check_base, resolve_run
 from models.trained_runs import (
     STUDENT_SETTINGS,

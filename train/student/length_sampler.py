@@ -27,7 +27,8 @@ class LengthSampler(Sampler[int]):
         item_ids: Item of each sample.
         batch: Samples per step, over all micro-batches and ranks.
         pairs: Whether an item's samples follow each other within a step, so that they are in one
-            micro-batch of even size. `models.shared_prompts` then computes their prompt once.
+            micro-batch of even size. `models.layers.shared_prompts` then computes their prompt
+            once.
     """
 
     lengths: Sequence[int]

@@ -12,8 +12,8 @@ from transformers import ProcessorMixin, TrainingArguments
 from conf.runs import Run, local_world_size, world_size
 from conf.schema import SftCommand, StudentTrainConfig
 from models.distributed import split_batch
+from models.layers.shared_prompts import shares_prompts
 from models.memory import available_cpu_bytes
-from models.shared_prompts import shares_prompts
 from models.student.chat_format import takes_clips
 from models.student.collator import Collator, letter_ids
 from train.common.arguments import common_arguments

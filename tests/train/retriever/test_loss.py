@@ -20,7 +20,7 @@ from torch.nn.functional import cross_entropy, normalize
 from torch.nn.utils.rnn import pad_sequence
 
 from conf.schema import LateConfig, LoraConfig, RetrieverConfig
-from models.fast_layers import use_fast_layers
+from models.layers.fast_layers import use_fast_layers
 from models.retriever.embedder import load_retriever, tokenizer_texts
 from models.retriever.inputs import Retriever, embed, model_inputs
 from tests.tiny_models import randomize_adapters

@@ -12,7 +12,7 @@ from transformers import EvalPrediction, PreTrainedModel, ProcessorMixin
 from conf.schema import LoraConfig
 from data.records import SelectionItem
 from models import loading
-from models.attention import BY_FRAME
+from models.layers.attention import BY_FRAME
 from models.student.collator import IGNORED, Collator, Encoded, encode, letter_ids, pad
 from models.student.prompts import Sample, selection_sample
 from tests.tiny_models import randomize_adapters

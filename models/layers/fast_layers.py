@@ -4,7 +4,7 @@
 - Adapters scale B's weights, and add the product of A's narrow output with them in place to the
   base layer's output. peft scales and adds B's wide output, keeps the intermediate results, and
   first copies the output of a 4-bit layer.
-- The start that samples of a batch share is computed once (see `models.shared_prompts`).
+- The start that samples of a batch share is computed once (see `models.layers.shared_prompts`).
 - Frozen norms, and the rotation of normed queries and keys by their positions, have their own
   gradients. Autograd reads and writes twice as many tensors of the size of the input.
 """
@@ -29,7 +29,7 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import (
     eager_attention_forward,
 )
 
-from models.shared_prompts import SharedPromptTower
+from models.layers.shared_prompts import SharedPromptTower
 
 
 def use_fast_layers(model: nn.Module) -> None:
