@@ -184,15 +184,13 @@ def group_samples(samples: Sequence[Tensor]) -> list[Group]:
     """
     groups: list[Group] = []
     for index, sample in enumerate(samples):
-        joined = [join(group, index, samples) for group in groups]
-        best = max(range(len(groups)), key=lambda k: joined[k].shared, default=None)
-        if (
-            best is not None
-            and joined[best].width ** 2 < groups[best].width ** 2 + len(sample) ** 2
-        ):
-            groups[best] = joined[best]
+        alone = Group([index], len(sample), len(sample))
+        joined = [(join(group, index, samples), k) for k, group in enumerate(groups)]
+        best, row = max(joined, key=lambda pair: pair[0].shared, default=(alone, 0))
+        if joined and best.width**2 < groups[row].width ** 2 + alone.width**2:
+            groups[row] = best
         else:
-            groups.append(Group([index], len(sample), len(sample)))
+            groups.append(alone)
     return groups
 
 
