@@ -23,6 +23,7 @@ from conf.errors import UserError
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
 from data.seeded_order import interleave
+from teacher.grounding import describe_grounding
 from teacher.journal import ACCEPTED, Journal, save_accepted
 from teacher.narrator import write_rationale
 from teacher.report import (
@@ -127,6 +128,12 @@ def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) ->
     with Journal(store.folder / JOURNAL_FILE) as journal:
         check_items(journal, every)
         report_other_vocabularies(journal, cfg)
+        if cfg.grounding != "oracle":
+            log.info(
+                "teacher.grounding=%s: the facts of the rationales are not validated against the "
+                "simulator's record",
+                cfg.grounding,
+            )
         responses: dict[str, list[Rationale]] = defaultdict(list)
         for rationale in journal.rationales:
             if grader.is_current(rationale) and (cfg.fallback or not rationale.fallback):
@@ -255,9 +262,10 @@ def _write_rationales(
     """Write rationales of an item with the built-in narrator, from attempt `first` until one is
     accepted or no attempt is left. An item whose prefix is too short gets none."""
     predicates = describe_item(item, store, grader.cfg)
-    if predicates is None:
+    facts = describe_grounding(item, store, grader.cfg)
+    if predicates is None or facts is None:
         return []
-    vocabulary = choose_vocabulary(predicates, grader.cfg)
+    vocabulary = choose_vocabulary(facts, grader.cfg)
     rationales: list[Rationale] = []
     for attempt in range(first, grader.cfg.attempts):
         text = write_rationale(vocabulary, item, grader.cfg.seed, attempt)

@@ -14,9 +14,10 @@ import numpy as np
 
 from conf.files import write_json, write_text
 from data.records import COLORS, MATERIALS, Rationale, SelectionItem
+from teacher.grounding import describe_grounding
 from teacher.prompts import format_facts
 from teacher.validation.validator import WORD
-from teacher.vocabulary import choose_vocabulary, describe_item, name_vocabulary
+from teacher.vocabulary import choose_vocabulary, name_vocabulary
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -249,7 +250,7 @@ def write_report(
     rows, examples = SheetRows(store), []
     for item in choose_examples(store.training_items(), responses, count, cfg.seed):
         write_bytes(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.make(item)]))
-        predicates = describe_item(item, store, cfg)
+        predicates = describe_grounding(item, store, cfg)
         facts = predicates and choose_vocabulary(predicates, cfg)
         shown = sorted(responses[item.item_id], key=lambda r: not r.accepted)
         examples.append((item, shown, json.dumps(facts and format_facts(facts), indent=1)))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
 from teacher.cited_rationales import CitationError, cited_schema, compose_rationale, list_facts
+from teacher.grounding import describe_grounding
 from teacher.prompts import build_messages
 from teacher.sections import GRAMMAR
 from teacher.servers.capabilities import Constraint, RequestFields
@@ -47,17 +48,17 @@ async def request_rationales(
 
     async def narrate(job: Job) -> None:
         item, attempt = job
-        predicates = describe_item(item, store, cfg)
+        predicates, facts = describe_item(item, store, cfg), describe_grounding(item, store, cfg)
         # There are no predicates if the prefix is too short.
-        while predicates and attempt < cfg.attempts:
+        while predicates and facts and attempt < cfg.attempts:
             # Most first responses are accepted, so several are requested only after a rejection.
             n = min(cfg.samples, cfg.attempts - attempt) if attempt else 1
             try:
-                vocabulary = choose_vocabulary(predicates, cfg)
+                vocabulary = choose_vocabulary(facts, cfg)
                 responses = await pool.complete(build_messages(vocabulary, item, cfg), n)
                 if cfg.form == "cited":
-                    facts = list_facts(vocabulary, item)
-                    responses = [fill_slots(r, facts, item.letter) for r in responses]
+                    slots = list_facts(vocabulary, item)
+                    responses = [fill_slots(r, slots, item.letter) for r in responses]
             except NoResponseError as error:
                 unanswered[item.item_id] = str(error)
                 break

@@ -161,6 +161,10 @@ class TeacherConfig(ServersConfig):
     it requests every rationale again."""
     predicates: str = setting("paper", options=("paper", "relational"))
     """Vocabulary of the facts: that of the paper, or with relations between objects too."""
+    grounding: str = setting("oracle", options=("oracle", "extrapolated", "shuffled"))
+    """Facts of the rationales: those of the simulator; those of the same prefix with a future at
+    constant velocity; or those of another scene. The answers are right in each case. Only the first
+    are validated against the simulator's record."""
     bounds: RelationBounds = field(default_factory=RelationBounds)
     """Bounds of the words for relations."""
     sufficient: bool = False
@@ -211,6 +215,11 @@ class TeacherConfig(ServersConfig):
                 f"{group}min_words={self.min_words} and {group}max_words={self.max_words}: the "
                 f"built-in narrator writes {shortest} to {longest} words, so lower the minimum and "
                 f"raise the maximum to these, or give {group}url"
+            )
+        if self.sufficient and self.grounding != "oracle":
+            yield (
+                f"{group}sufficient=true and {group}grounding={self.grounding}: only the facts of "
+                f"the simulator can decide an item; set {group}sufficient=false"
             )
         for name in ("grammar", "fallback"):
             if getattr(self, name) and self.url is None:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from data.oracle.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
+from data.oracle.extrapolation import extrapolate, project
 from data.records import (
     Candidate,
     FrameRef,
@@ -20,7 +21,6 @@ from data.records import (
     SelectionItem,
     original_scene_id,
 )
-from data.sim.camera import Camera
 from data.store import Store
 
 
@@ -32,17 +32,12 @@ def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: St
     also for an object that the candidate's scene lacks. The result is NaN for releases whose scenes
     record no camera.
     """
-    config = store.manifest["config"]
-    if config["simulator"] in ("movi_a", "physion"):
-        return np.nan
     scene, other = store.scene(item.scene_id), store.scene(candidate.scene_id)
     seconds = (item.target_frame - item.prefix_stop) / scene.fps
-    positions = scene.positions[item.prefix_stop] + seconds * scene.velocities[item.prefix_stop]
-    if config["simulator"] == "tracks":
-        # Positions are those of the image plane, in heights of the image with y up.
-        expected = (positions[:, :2] * [1, -1] + [0, 1]) * scene.image_size[1]
-    else:
-        expected, _ = Camera.from_settings(config["world"]["camera"]).project(positions)
+    positions = extrapolate(scene, item.prefix_stop, seconds)
+    expected = project(positions, scene, store.manifest["config"])
+    if expected is None:
+        return np.nan
     actual = dict(zip(other.object_keys, other.image_positions[candidate.frame], strict=True))
     scale = MODEL_SIZE / np.array(scene.image_size)
     distances = [

@@ -22,6 +22,7 @@ from data.oracle.displacement import (
     object_displacements,
     visible_positions,
 )
+from data.oracle.extrapolation import extrapolate
 from data.records import CONTACT, FrameRef, Scene, SelectionItem
 from data.sim.camera import Camera
 
@@ -117,14 +118,6 @@ def _gap(scene: Scene, frame: int) -> float:
     return max(float(min(gaps, default=APART)), TOUCHING)
 
 
-def constant_velocity_positions(
-    scene: Scene, frame: int, seconds: float, camera: Camera
-) -> np.ndarray:
-    """Return where the objects (N, 2) are in the image if they keep their velocities of a frame for
-    some seconds, px of the camera's image."""
-    return camera.project(scene.positions[frame] + seconds * scene.velocities[frame])[0]
-
-
 def collision_scores(
     scene: Scene,
     stop: int,
@@ -139,13 +132,13 @@ def collision_scores(
     velocities = scene.velocities[stop, collision.objects, :2]
     pair = np.array(collision.objects)[np.argsort(-np.linalg.norm(velocities, axis=-1))]
     ahead = (collision.frame - stop) / scene.fps
-    meeting = scene.positions[stop, pair] + ahead * scene.velocities[stop, pair]
+    meeting = extrapolate(scene, stop, ahead)[pair]
     places = np.stack([other.positions[frame, pair] for other, frame in frames])
     moved = (places - meeting)[..., :2]
     travel = np.linalg.norm(moved, axis=-1)
     heading = scene.velocities[stop, pair[0], :2]
     cosine = moved[:, 0] @ heading / np.maximum(travel[:, 0] * np.linalg.norm(heading), 1e-6)
-    expected = constant_velocity_positions(scene, stop, (moment - stop) / scene.fps, camera)
+    expected, _ = camera.project(extrapolate(scene, stop, (moment - stop) / scene.fps))
     scale = MODEL_SIZE / np.array(scene.image_size)
     away = np.stack([(other.image_positions[frame] - expected) * scale for other, frame in frames])
     return np.stack(

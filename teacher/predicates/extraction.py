@@ -98,10 +98,9 @@ def extract_predicates(
     )
     if facts is None:
         return None
-    if item.distractors == CONTACT:
+    if item.distractors == CONTACT and (upcoming := next_collision(scene, item.prefix_stop)):
         # A text names few pairs: first the one on whose collision the item turns.
-        pair = next_collision(scene, item.prefix_stop).objects
-        names = tuple(scene.objects[k].noun_phrase for k in pair)
+        names = tuple(scene.objects[k].noun_phrase for k in upcoming.objects)
         courses, contacts = (
             tuple(sorted(meetings, key=lambda meeting: meeting.objects != names))
             for meetings in (facts.courses, facts.contacts)

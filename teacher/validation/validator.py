@@ -53,7 +53,10 @@ class Validation:
 def validate_rationale(
     text: str, predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
 ) -> Validation:
-    """Check a rationale against its item, and collect every reason to reject it."""
+    """Check a rationale against its item, and collect every reason to reject it.
+
+    Only the form and the answer of an ungrounded rationale are checked (`teacher.grounding`).
+    """
     numbers = [*find_numbers(text)]
     reasons = [f"number: {text[start:stop]!r}" for start, stop in numbers]
     words = len(WORD.findall(text))
@@ -67,8 +70,10 @@ def validate_rationale(
     if answer is not None and answer != item.letter:
         reasons.append(f"wrong answer: {answer}")
     claims = extract_claims(text, predicates)
-    reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
-    if cfg.strict:
+    grounded = cfg.grounding == "oracle"
+    if grounded:
+        reasons += dict.fromkeys(f"contradicts: {c}" for c in claims if c.verdict == "contradicted")
+    if grounded and cfg.strict:
         for start, stop in (c.span for c in claims if c.kind == "unreadable"):
             # A number has a reason of its own.
             if not any(start <= number < stop for number, _ in numbers):

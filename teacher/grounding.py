@@ -1,0 +1,126 @@
+"""Groundings: the facts from which a rationale is written are the simulator's, or a guess.
+
+The narrator, its words and the answer are the same for every grounding. Ungrounded rationales
+measure what the facts of a rationale contribute, apart from its form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from conf.errors import UserError
+from data.oracle.contacts import group_contacts
+from data.oracle.extrapolation import extrapolate, project
+from data.records import ALTERNATIVE, Collision, Scene, SelectionItem, original_scene_id
+from data.seeded_order import named_rng
+from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.places import contact_distance
+from teacher.vocabulary import describe_item
+
+if TYPE_CHECKING:
+    from conf.schema import TeacherConfig
+    from data.store import Store
+
+EXTRAPOLATED = f"{ALTERNATIVE}extrapolated"
+"""Suffix of the id of a scene that a guess continues. It marks an alternative future."""
+
+
+def describe_grounding(
+    item: SelectionItem, store: Store, cfg: TeacherConfig
+) -> RelationalPredicates | None:
+    """Return the predicates from which the rationale of a training item is written; None if a
+    prefix is too short, or if no other item can be drawn.
+
+    With `cfg.grounding`:
+
+    - oracle: those of the item.
+    - extrapolated: the same with another target, in which the objects have kept the velocities of
+      the prefix's last frame. Objects on straight paths that meet are said to collide, and move on.
+      The distractors are described as they are.
+    - shuffled: those of a training item of another scene, drawn with `cfg.seed`, that has the same
+      family and answer.
+
+    Raises:
+        UserError: The scenes record no camera, so that no frame can be extrapolated.
+    """
+    if cfg.grounding == "extrapolated":
+        item, scene_of = extrapolate_target(item, store)
+        return describe_item(item, store, cfg, scene_of)
+    if cfg.grounding == "shuffled":
+        donors = find_donors(item, store.training_items(), cfg.seed)
+        return next(filter(None, (describe_item(donor, store, cfg) for donor in donors)), None)
+    return describe_item(item, store, cfg)
+
+
+def extrapolate_target(
+    item: SelectionItem, store: Store
+) -> tuple[SelectionItem, Callable[[str], Scene]]:
+    """Return an item whose target is a frame of an extrapolated scene, and the function that
+    returns a scene by its id, including this one."""
+    guess = extrapolate_scene(store.scene(item.target.scene_id), item.prefix_stop, store)
+    candidates = list(item.candidates)
+    candidates[item.answer] = replace(item.target, scene_id=guess.scene_id)
+
+    def scene_of(scene_id: str) -> Scene:
+        return guess if scene_id == guess.scene_id else store.scene(scene_id)
+
+    return replace(item, candidates=tuple(candidates)), scene_of
+
+
+def extrapolate_scene(scene: Scene, stop: int, store: Store) -> Scene:
+    """Return a scene whose objects keep their velocities and orientations after frame `stop`, and
+    pass through each other."""
+    seconds = np.arange(1, scene.frames - stop)[:, None, None] / scene.fps
+    positions = _continued(scene.positions, stop, extrapolate(scene, stop, seconds))
+    image = project(positions, scene, store.manifest["config"])
+    if image is None:
+        raise UserError(
+            f"teacher.grounding=extrapolated: {store.name} records no camera, so the places of "
+            "extrapolated objects in the image are unknown. Use oracle or shuffled"
+        )
+    inside = ((image >= 0) & (image < scene.image_size)).all(axis=-1)
+    contacts = [c for c in scene.collisions if c.frame <= stop]
+    return replace(
+        scene,
+        scene_id=scene.scene_id + EXTRAPOLATED,
+        collisions=(*contacts, *_meetings(scene, positions, stop)),
+        positions=positions,
+        quaternions=_continued(scene.quaternions, stop),
+        velocities=_continued(scene.velocities, stop),
+        angular_velocities=_continued(scene.angular_velocities, stop),
+        image_positions=_continued(scene.image_positions, stop, image[stop + 1 :]),
+        in_view=_continued(scene.in_view, stop, inside[stop + 1 :]),
+        visible_fraction=_continued(scene.visible_fraction, stop, inside[stop + 1 :]),
+    )
+
+
+def find_donors(
+    item: SelectionItem, items: Sequence[SelectionItem], seed: int
+) -> Iterator[SelectionItem]:
+    """Yield the items of other scenes with the same family and answer, in random order."""
+    for k in named_rng(seed, "donor", item.item_id).permutation(len(items)):
+        other = items[k]
+        alike = (other.family, other.answer) == (item.family, item.answer)
+        if alike and original_scene_id(other.scene_id) != original_scene_id(item.scene_id):
+            yield other
+
+
+def _continued(values: np.ndarray, stop: int, later: np.ndarray | None = None) -> np.ndarray:
+    """Return the values of all frames, with others after frame `stop`, or with those of `stop`."""
+    result = values.copy()
+    result[stop + 1 :] = values[stop] if later is None else later
+    return result
+
+
+def _meetings(scene: Scene, positions: np.ndarray, stop: int) -> tuple[Collision, ...]:
+    """Return the contacts that begin after frame `stop`, for given positions."""
+    touching = {}
+    for i, j in combinations(range(len(scene.objects)), 2):
+        apart = np.linalg.norm(positions[stop:, i, :2] - positions[stop:, j, :2], axis=-1)
+        touching[i, j] = stop + np.flatnonzero(apart < contact_distance(scene, i, j))
+    return tuple(c for c in group_contacts(touching, scene.fps) if c.frame > stop)
