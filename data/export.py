@@ -1,13 +1,14 @@
-"""Export a benchmark as a Hugging Face dataset."""
+"""Export benchmarks as a Hugging Face dataset."""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
 
+from conf.compose import compose
 from conf.entry import Run, command
 from conf.files import write_text
-from conf.schema import ExportCommand
+from conf.schema import BuildCommand, ExportCommand
 
 log = logging.getLogger(__name__)
 
@@ -18,12 +19,16 @@ def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
     from data.parallel import Workers
     from data.publish.huggingface import ensure_export, summarize
 
-    root = Path(cfg.store)
-    if cfg.images:
-        store = ensure_benchmark(cfg.benchmark, root, cfg.workers)
-    else:
-        store = ensure_items(cfg.benchmark, root, Workers(cfg.workers))
-    shards = ensure_export(store, Path(cfg.folder), cfg.images)
+    root, benchmarks = Path(cfg.store), {cfg.benchmark.name: cfg.benchmark}
+    for name in cfg.also:
+        benchmarks[name] = compose("data.build", BuildCommand, [f"benchmark={name}"]).benchmark
+    stores = {
+        name: ensure_benchmark(benchmark, root, cfg.workers)
+        if cfg.images
+        else ensure_items(benchmark, root, Workers(cfg.workers))
+        for name, benchmark in benchmarks.items()
+    }
+    shards = ensure_export(stores, Path(cfg.folder), cfg.images)
     summary = summarize(shards)
     text = f"{cfg.folder}\n{summary.to_string(float_format='{:,.1f}'.format)}"
     log.info("%s", text)

@@ -42,6 +42,7 @@ from data.records import (
     Collision,
     FrameRef,
     Landing,
+    Rationale,
     RetrievalQuery,
     Scene,
     SceneObject,
@@ -63,6 +64,7 @@ PARTS = "parts"
 """Folder of the results of a build's jobs; absent from a complete store."""
 SCENES_FOLDER, FRAMES_FOLDER = "scenes", "frames"
 TABLES = ("selection.parquet", "retrieval.parquet", "database.parquet")
+RATIONALES = "rationales.parquet"
 DATABASES = ("test", "future", "counterfactual")
 """Names of the databases of frames: of the standard test, of the future-state queries and of the
 counterfactual queries. Every frame of `test` is also in `future`."""
@@ -190,6 +192,11 @@ class Store:
         """Selection items for training: those of the benchmark's own suite, and the pairs about
         interventions."""
         return self.selection("train") + self.selection("train", INTERVENTIONS)
+
+    def rationales(self) -> list[Rationale]:
+        """Rationales that the last narration accepted; none if there has been no narration."""
+        path = self.folder / RATIONALES
+        return [Rationale.from_row(row) for row in load_rows(path)] if path.exists() else []
 
     def retrieval(self, split: str | None = None, pool: str = "future") -> list[RetrievalQuery]:
         """Retrieval queries of one of the `POOLS`; by default of both splits."""

@@ -11,6 +11,7 @@ COMMANDS = {
     "data.gallery": "draw contact sheets of items and queries",
     "data.export": "write a Hugging Face dataset",
     "teacher.narrate": "write rationales with the built-in narrator or a served model",
+    "teacher.claims_benchmark": "write claims of students and of false texts, with verdicts",
     "teacher.serve": "serve a model with vLLM",
     "train.sft": "train a student",
     "train.distill": "train a student further on its own responses",

@@ -9,10 +9,10 @@ from conf.schema import TeacherConfig
 from dynapix.benchmark import Item
 from teacher.numbers.detection import find_numbers
 from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.vocabulary import describe_item
 from teacher.reading.claims import VERDICTS, Claim
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
-from teacher.vocabulary import describe_item
 
 
 @dataclass(frozen=True)

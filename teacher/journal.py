@@ -13,11 +13,9 @@ from typing import Any
 from conf.errors import UserError
 from conf.runs import wait_for_lock
 from data.records import Rationale
-from data.store import load_rows, save_rows
+from data.store import RATIONALES, load_rows, save_rows
 from teacher.sections import SECTIONS
 
-ACCEPTED = "rationales.parquet"
-"""Table of the rationales that the last narration accepted, in the folder of the benchmark."""
 DIGEST = "sha256"
 """Key of the checksum in a line of the journal."""
 LINE_ERRORS = (ValueError, TypeError, KeyError, AttributeError)
@@ -132,9 +130,9 @@ def read_accepted(folder: Path) -> dict[str, str]:
     Raises:
         UserError: There has been no narration.
     """
-    if not (folder / ACCEPTED).exists():
+    if not (folder / RATIONALES).exists():
         raise UserError(
-            f"{folder} has no {ACCEPTED}: write rationales with python -m teacher.narrate",
+            f"{folder} has no {RATIONALES}: write rationales with python -m teacher.narrate",
             code="no-rationales",
         )
-    return {row["item_id"]: row["text"] for row in load_rows(folder / ACCEPTED)}
+    return {row["item_id"]: row["text"] for row in load_rows(folder / RATIONALES)}

@@ -23,9 +23,11 @@ from conf.errors import UserError
 from conf.schema import NarrateCommand, TeacherConfig
 from data.records import Rationale, SelectionItem
 from data.seeded_order import interleave
-from teacher.grounding import describe_grounding
-from teacher.journal import ACCEPTED, Journal, save_accepted
+from data.store import RATIONALES
+from teacher.journal import Journal, save_accepted
 from teacher.narrator import write_rationale
+from teacher.predicates.grounding import Grounding
+from teacher.predicates.vocabulary import choose_vocabulary, describe_item, name_vocabulary
 from teacher.report import (
     Figures,
     describe_sufficiency,
@@ -36,7 +38,6 @@ from teacher.report import (
 )
 from teacher.servers.responses import Response
 from teacher.validation.grader import RationaleGrader
-from teacher.vocabulary import choose_vocabulary, describe_item, name_vocabulary
 
 if TYPE_CHECKING:
     from data.store import Store
@@ -124,7 +125,7 @@ def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) ->
         sample = f"{len(items)} of {len(every)} items, seed {cfg.seed}"
         log.info("narrating a sample: %s", sample)
     unanswered: dict[str, str] = {}
-    grader = RationaleGrader(cfg)
+    grader, grounding = RationaleGrader(cfg), Grounding(store, cfg)
     with Journal(store.folder / JOURNAL_FILE) as journal:
         check_items(journal, every)
         report_other_vocabularies(journal, cfg)
@@ -165,7 +166,7 @@ def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) ->
         with progress.bar:
             if cfg.url is None:
                 for item, attempt in jobs:
-                    record(_write_rationales(item, store, grader, attempt))
+                    record(_write_rationales(item, store, grader, grounding, attempt))
                     progress.bar.update()
             elif jobs:
                 from teacher.server_narrator import request_rationales
@@ -175,11 +176,11 @@ def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) ->
         if cfg.fallback:
             for item in items:
                 if not is_settled(item) and len(responses[item.item_id]) >= cfg.attempts:
-                    *_, last = _write_rationales(item, store, grader)
+                    *_, last = _write_rationales(item, store, grader, grounding)
                     if last.accepted:
                         attempt = cfg.attempts + last.attempt
                         record([grader.mark_fallback(last, attempt)])
-        save_accepted(select_accepted(every, responses), store.folder / ACCEPTED)
+        save_accepted(select_accepted(every, responses), store.folder / RATIONALES)
     if unanswered:
         name, reason = next(iter(unanswered.items()))
         log.warning(
@@ -257,12 +258,16 @@ def report_other_vocabularies(journal: Journal, cfg: TeacherConfig) -> None:
 
 
 def _write_rationales(
-    item: SelectionItem, store: Store, grader: RationaleGrader, first: int = 0
+    item: SelectionItem,
+    store: Store,
+    grader: RationaleGrader,
+    grounding: Grounding,
+    first: int = 0,
 ) -> list[Rationale]:
     """Write rationales of an item with the built-in narrator, from attempt `first` until one is
     accepted or no attempt is left. An item whose prefix is too short gets none."""
     predicates = describe_item(item, store, grader.cfg)
-    facts = describe_grounding(item, store, grader.cfg)
+    facts = grounding.describe(item)
     if predicates is None or facts is None:
         return []
     vocabulary = choose_vocabulary(facts, grader.cfg)

@@ -14,10 +14,10 @@ import numpy as np
 
 from conf.files import write_json, write_text
 from data.records import COLORS, MATERIALS, Rationale, SelectionItem
-from teacher.grounding import describe_grounding
+from teacher.predicates.grounding import Grounding
+from teacher.predicates.vocabulary import choose_vocabulary, name_vocabulary
 from teacher.prompts import format_facts
 from teacher.validation.validator import WORD
-from teacher.vocabulary import choose_vocabulary, name_vocabulary
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -247,10 +247,10 @@ def write_report(
     text = f"teacher: {teacher}\npredicates: {name_vocabulary(cfg)}\n{format_figures(figures)}"
     write_json(folder / "report.json", {"teacher": teacher, **figures})
     write_text(folder / "report.txt", text + "\n")
-    rows, examples = SheetRows(store), []
+    rows, grounding, examples = SheetRows(store), Grounding(store, cfg), []
     for item in choose_examples(store.training_items(), responses, count, cfg.seed):
         write_bytes(folder / "images" / f"{item.item_id}.png", draw_sheet([rows.make(item)]))
-        predicates = describe_grounding(item, store, cfg)
+        predicates = grounding.describe(item)
         facts = predicates and choose_vocabulary(predicates, cfg)
         shown = sorted(responses[item.item_id], key=lambda r: not r.accepted)
         examples.append((item, shown, json.dumps(facts and format_facts(facts), indent=1)))

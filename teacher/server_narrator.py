@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 from conf.schema import TeacherConfig
 from data.records import Rationale, SelectionItem
 from teacher.cited_rationales import CitationError, cited_schema, compose_rationale, list_facts
-from teacher.grounding import describe_grounding
+from teacher.predicates.grounding import Grounding
+from teacher.predicates.vocabulary import choose_vocabulary, describe_item
 from teacher.prompts import build_messages
 from teacher.sections import GRAMMAR
 from teacher.servers.capabilities import Constraint, RequestFields
 from teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from teacher.servers.responses import Response
 from teacher.validation.grader import RationaleGrader
-from teacher.vocabulary import choose_vocabulary, describe_item
 
 if TYPE_CHECKING:
     from data.store import Store
@@ -44,11 +44,12 @@ async def request_rationales(
         attempt.
     """
     cfg = grader.cfg
+    grounding = Grounding(store, cfg)
     unanswered: dict[str, str] = {}
 
     async def narrate(job: Job) -> None:
         item, attempt = job
-        predicates, facts = describe_item(item, store, cfg), describe_grounding(item, store, cfg)
+        predicates, facts = describe_item(item, store, cfg), grounding.describe(item)
         # There are no predicates if the prefix is too short.
         while predicates and facts and attempt < cfg.attempts:
             # Most first responses are accepted, so several are requested only after a rejection.

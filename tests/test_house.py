@@ -30,7 +30,7 @@ LARGEST_FOLDER = 14
 
 def test_all_commands_are_found() -> None:
     assert {"data.build", "train.sft", "train.contrastive", "evaluation.report"} <= set(COMMANDS)
-    assert len(COMMANDS) == 19
+    assert len(COMMANDS) == 20
 
 
 @pytest.mark.parametrize("package", PACKAGES)

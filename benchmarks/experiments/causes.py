@@ -43,8 +43,8 @@ from models.student.generation import generate
 from models.student.prompts import Sample, selection_sample
 from models.trained_runs import check_modes, check_unseen, product_folder, read_trained_settings
 from teacher.narrator import write_rationale
+from teacher.predicates.vocabulary import choose_vocabulary, describe_item
 from teacher.sections import split_sections
-from teacher.vocabulary import choose_vocabulary, describe_item
 
 GIVEN = {
     "nothing": None,

@@ -22,10 +22,10 @@ from conf.failures import report_failures
 from conf.schema import TeacherConfig
 from data.store import open_store
 from teacher.narrator import write_rationale
+from teacher.predicates.vocabulary import choose_vocabulary, describe_item
 from teacher.statement_choice import choose_statements
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.validator import validate_rationale
-from teacher.vocabulary import choose_vocabulary, describe_item
 
 ITEMS = 10_000
 T = TypeVar("T")

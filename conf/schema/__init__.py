@@ -8,6 +8,7 @@ each invalid value or combination of values; a message names keys as the user ty
 from conf.schema.benchmark import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
 from conf.schema.commands import (
     BuildCommand,
+    ClaimsCommand,
     CommandConfig,
     ContrastiveCommand,
     DistillCommand,

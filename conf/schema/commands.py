@@ -83,6 +83,9 @@ class StatisticsCommand(CommandConfig):
 @dataclass
 class ExportCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
+    also: list[str] = field(default_factory=list)
+    """Further benchmarks in the same dataset, by the names of their presets. The name of a table
+    then begins with that of its benchmark, such as tiny-selection."""
     folder: str = path(MISSING)
     """Folder to write to; it must not contain an earlier export."""
     images: bool = True
@@ -112,6 +115,19 @@ class NarrateCommand(CommandConfig):
     limit: int | None = setting(None, least=1)
     """Number of items to narrate, sampled with `teacher.seed` evenly over the families; null
     narrates all. A later narration of more items goes on from this one."""
+
+
+@dataclass
+class ClaimsCommand(CommandConfig):
+    benchmark: BenchmarkConfig = MISSING
+    runs: list[str] = field(default_factory=list)
+    """Names of evaluations of students below checkpoints/select/, whose responses in reasoning mode
+    are judged; `*` stands for any text."""
+    claims: int = setting(50_000, least=1)
+    """Minimum number of claims. Rationales of the built-in narrator, with and without a false word,
+    are added until it is reached."""
+    seed: int = setting(0, least=0)
+    """Seed of the rationales and of the false words."""
 
 
 @dataclass

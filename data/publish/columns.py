@@ -1,12 +1,13 @@
 """The columns of an exported benchmark (see `columns.yaml`), and the rows of its records.
 
 Columns have the names of the records' fields. An export with images also contains, as PNGs, the
-frames of prefixes, candidates, targets and databases. Hard negatives have no images.
+frames of prefixes, candidates, targets, hard negatives and databases.
 """
 
 from __future__ import annotations
 
 import io
+import json
 from dataclasses import asdict
 from functools import lru_cache
 from importlib.resources import files
@@ -14,20 +15,23 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
+from conf.schema.benchmark import PAIRED
 from data.frames.frame_cache import FrameReader
-from data.records import FrameRef, RetrievalQuery, SelectionItem, sample_prefix_frames
+from data.records import FrameRef, Rationale, RetrievalQuery, SelectionItem, sample_prefix_frames
 from data.store import Store
 
 if TYPE_CHECKING:
+    import pyarrow as pa
     from datasets import Features
 
 COLUMNS = OmegaConf.to_container(
     OmegaConf.create((files("data.publish") / "columns.yaml").read_text())
 )
 DESCRIPTIONS: dict[str, str] = COLUMNS.pop("descriptions")
+COLUMNS |= dict.fromkeys(PAIRED, COLUMNS["selection"])
 ENCODED_FRAMES = 1_000
 """Number of encoded frames that are kept in memory, at up to 100 KB each."""
-ExportedRecord = SelectionItem | RetrievalQuery | FrameRef
+ExportedRecord = SelectionItem | RetrievalQuery | FrameRef | Rationale
 
 
 def list_columns(images: bool) -> dict[str, dict[str, str]]:
@@ -57,35 +61,62 @@ def dataset_features(images: bool) -> dict[str, Features]:
     }
 
 
+def arrow_schema(kind: str, images: bool) -> pa.Schema:
+    """Return the schema of a table's parquet files. Its metadata tell `datasets` the columns, and
+    pandas that integers stay integers where some are missing."""
+    schema = dataset_features(images)[kind].arrow_schema
+    columns = [
+        {
+            "name": name, "field_name": name, "pandas_type": "int64", "numpy_type": "Int64",
+            "metadata": None,
+        }
+        for name, kind_of in list_columns(images)[kind].items()
+        if kind_of == "int64"
+    ]  # fmt: skip
+    pandas = {"index_columns": [], "column_indexes": [], "columns": columns}
+    return schema.with_metadata({**schema.metadata, b"pandas": json.dumps(pandas).encode()})
+
+
 class RowBuilder:
     """Converts a store's records to rows, with images of their frames if `images` is set."""
 
     def __init__(self, store: Store, images: bool) -> None:
         self.images = images
-        self._frames = FrameReader(store)
-        self._prefix_frames = store.manifest["config"]["prefix_frames"]
+        self._store, self._frames = store, FrameReader(store)
+        config = store.manifest["config"]
+        self._prefix_frames = config["prefix_frames"]
+        self._negatives = config["retrieval"]["hard_negatives"]
         # Items of one scene share many frames, and encoding takes most of an export's time.
         self._encode = lru_cache(maxsize=ENCODED_FRAMES)(self._encode_png)
 
     def images_per_row(self, configuration: str) -> int:
         """Return the maximum number of images in a row of a configuration."""
-        counts = {"selection": self._prefix_frames + 4, "retrieval": self._prefix_frames + 1}
-        return counts.get(configuration, 1) if self.images else 0
+        if not self.images or configuration == "rationales":
+            return 0
+        if configuration == "database":
+            return 1
+        return self._prefix_frames + (self._negatives + 1 if configuration == "retrieval" else 4)
 
     def row(self, record: ExportedRecord, split: str) -> dict[str, Any]:
         """Return a record's values by column. For a frame, `split` is the name of its database."""
+        if isinstance(record, Rationale):
+            row = asdict(record) | {"split": split}
+            return {name: row[name] for name in COLUMNS["rationales"]}
         if isinstance(record, FrameRef):
             row = {**asdict(record), "database": split}
             return row | ({"image": self._encode(record)} if self.images else {})
         frames = sample_prefix_frames(record.prefix_start, record.prefix_stop, self._prefix_frames)
-        row = asdict(record) | {"prefix_frames": frames}
+        fps = self._store.scene(record.scene_id).fps
+        times = [frame / fps for frame in frames]
+        row = asdict(record) | {"fps": fps, "prefix_frames": frames, "prefix_times": times}
         if not self.images:
             return row
         row["prefix_images"] = [self._encode(FrameRef(record.scene_id, f)) for f in frames]
         if isinstance(record, RetrievalQuery):
-            return row | {"target_image": self._encode(record.target)}
+            row["target_image"] = self._encode(record.target)
+            return row | {"hard_negative_images": [*map(self._encode, record.hard_negatives)]}
         references = (FrameRef(c.scene_id, c.frame) for c in record.candidates)
-        return row | {"candidate_images": list(map(self._encode, references))}
+        return row | {"candidate_images": [*map(self._encode, references)]}
 
     def _encode_png(self, frame: FrameRef) -> dict[str, Any]:
         """Encode a frame in the form that `datasets.Image` stores."""

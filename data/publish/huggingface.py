@@ -1,8 +1,12 @@
-"""Write a benchmark as a Hugging Face dataset, which can be loaded without this repository.
+"""Write benchmarks as a Hugging Face dataset, which can be loaded without this repository.
 
     <folder>/README.md      the dataset card, which names the files of each split
-             export.json    the exported benchmark's identity, and the SHA-256 of every file
-             selection/ retrieval/ database/    <split>-00000-of-00002.parquet
+             export.json    the exported benchmarks' identities, and the SHA-256 of every file
+             <configuration>/<split>-00000-of-00002.parquet
+
+The configurations of a benchmark are its tables: selection, matched_anchor, interventions,
+retrieval, database and rationales, as far as it has them. In a dataset of several benchmarks, their
+names begin with that of their benchmark, such as tiny-selection.
 
 The dataset is written to a hidden folder beside `<folder>`, one shard after another, and renamed
 when it is complete. A killed export resumes with the shards that it has written.
@@ -10,12 +14,14 @@ when it is complete. A killed export resumes with the shards that it has written
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +37,7 @@ from data.publish.columns import (
     DESCRIPTIONS,
     ExportedRecord,
     RowBuilder,
-    dataset_features,
+    arrow_schema,
     list_columns,
 )
 from data.records import SPLITS, RetrievalQuery, SelectionItem
@@ -44,7 +50,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 EXPORT_RECORD, CARD = "export.json", "README.md"
-EXPORT_VERSION = "4"
+EXPORT_VERSION = "5"
 """Changes whenever the same store would give another dataset."""
 GROUP_IMAGES = 512
 """Images in a parquet row group (about 30 MB at 480 x 320 px), which an export keeps in memory."""
@@ -77,16 +83,20 @@ Shard = dict[str, Any]
 folder, rows, bytes and sha256."""
 
 
-def ensure_export(store: Store, folder: Path, images: bool) -> list[Shard]:
-    """Export a store to `folder` unless that is already done, and return the shards.
+def ensure_export(stores: Mapping[str, Store], folder: Path, images: bool) -> list[Shard]:
+    """Export stores to `folder` unless that is already done, and return the shards.
+
+    Args:
+        stores: The benchmarks by name.
 
     Raises:
         UserError: `folder` contains something else or a damaged export, or another process is
             writing to it.
     """
+    tables = list_tables(stores)
     plan = {
-        "benchmark": store.name,
-        "identity": store.identity,
+        "benchmarks": {name: store.identity for name, store in stores.items()},
+        "rationales": digest_rationales(tables),
         "version": EXPORT_VERSION,
         "images": images,
     }
@@ -102,50 +112,85 @@ def ensure_export(store: Store, folder: Path, images: bool) -> list[Shard]:
             for path in partial.iterdir():
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         _write_record(partial, plan)
-        builder, tables, shards = RowBuilder(store, images), list_tables(store), []
-        rows = sum(map(len, tables.values()))
+        shards: list[Shard] = []
+        builders = {name: RowBuilder(store, images) for name, store in stores.items()}
+        rows = sum(len(table.records) for table in tables)
         with tqdm(total=rows, desc="exporting", unit="row", mininterval=1.0) as bar:
-            for (configuration, split), records in tables.items():
-                shards += _write_table(partial, configuration, split, records, builder, bar)
-        write_bytes(partial / CARD, render_card(store, shards, images).encode())
+            for table in tables:
+                shards += _write_table(partial, table, builders[table.benchmark], bar)
+        write_bytes(partial / CARD, render_card(stores, shards, images).encode())
         _write_record(partial, plan | {"shards": shards, "card": hash_file(partial / CARD)})
         partial.rename(folder)
     return shards
 
 
-def list_tables(store: Store) -> dict[tuple[str, str], list[ExportedRecord]]:
-    """Return the records of each table that is not empty, by configuration and split. The splits
-    of the configuration `database` are the databases."""
-    tables: dict[tuple[str, str], list[ExportedRecord]] = {}
-    for split in SPLITS:
-        tables["selection", split] = [
-            item for suite in (None, *PAIRED) for item in store.selection(split, suite)
+@dataclass(frozen=True)
+class ExportedTable:
+    """A split of a table.
+
+    Attributes:
+        benchmark: Name of the benchmark.
+        kind: Name of the table, such as selection.
+        configuration: Name of the table in the dataset: `kind`, or with the benchmark's name.
+        split: train or test; for the frames of a database, its name.
+    """
+
+    benchmark: str
+    kind: str
+    configuration: str
+    split: str
+    records: Sequence[ExportedRecord]
+
+
+def list_tables(stores: Mapping[str, Store]) -> list[ExportedTable]:
+    """Return the tables of benchmarks that are not empty."""
+    tables = []
+    for benchmark, store in stores.items():
+        prefix = f"{benchmark}-" if len(stores) > 1 else ""
+        tables += [
+            ExportedTable(benchmark, kind, prefix + kind, split, records)
+            for (kind, split), records in _list_records(store).items()
+            if records
         ]
+    return tables
+
+
+def _list_records(store: Store) -> dict[tuple[str, str], list[ExportedRecord]]:
+    """Return the records of a benchmark by table and split."""
+    records: dict[tuple[str, str], list[ExportedRecord]] = {}
+    for kind, suite in {"selection": None, **{suite: suite for suite in PAIRED}}.items():
+        for split in SPLITS:
+            records[kind, split] = [*store.selection(split, suite)]
     for split in SPLITS:
-        tables["retrieval", split] = [q for pool in POOLS for q in store.retrieval(split, pool)]
-    tables |= {("database", name): store.database(name) for name in DATABASES}
-    return {name: records for name, records in tables.items() if records}
+        queries = [q for pool in POOLS for q in store.retrieval(split, pool)]
+        records["retrieval", split] = [*queries]
+    records |= {("database", name): [*store.database(name)] for name in DATABASES}
+    # Rationales are written for training items.
+    return records | {("rationales", "train"): [*store.rationales()]}
+
+
+def digest_rationales(tables: Iterable[ExportedTable]) -> str | None:
+    """Return a short hash of all rationales, which a later narration replaces; None if there are
+    none."""
+    texts = [r.text for table in tables if table.kind == "rationales" for r in table.records]
+    content = json.dumps(texts).encode()
+    return hashlib.sha256(content).hexdigest()[:16] if texts else None
 
 
 def _write_table(
-    folder: Path,
-    configuration: str,
-    split: str,
-    records: list[ExportedRecord],
-    builder: RowBuilder,
-    bar: tqdm,
+    folder: Path, table: ExportedTable, builder: RowBuilder, bar: tqdm
 ) -> Iterator[Shard]:
     """Write the missing shards of a table, and yield each of its shards."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    schema = dataset_features(builder.images)[configuration].arrow_schema
-    images = builder.images_per_row(configuration)
+    schema = arrow_schema(table.kind, builder.images)
+    images, records = builder.images_per_row(table.kind), table.records
     group = max(1, GROUP_IMAGES // images) if images else GROUP_ROWS
     size = group * SHARD_GROUPS
     count = -(-len(records) // size)
     for k in range(count):
-        path = folder / configuration / f"{split}-{k:05d}-of-{count:05d}.parquet"
+        path = folder / table.configuration / f"{table.split}-{k:05d}-of-{count:05d}.parquet"
         part = records[k * size : (k + 1) * size]
         if path.exists():
             bar.update(len(part))
@@ -157,13 +202,13 @@ def _write_table(
                 pq.ParquetWriter(file, schema, compression="zstd") as writer,
             ):
                 for start in range(0, len(part), group):
-                    rows = [builder.row(r, split) for r in part[start : start + group]]
+                    rows = [builder.row(r, table.split) for r in part[start : start + group]]
                     writer.write_table(pa.Table.from_pylist(rows, schema))
                     bar.update(len(rows))
             os.replace(unfinished, path)
         yield {
-            "configuration": configuration,
-            "split": split,
+            "configuration": table.configuration,
+            "split": table.split,
             "path": path.relative_to(folder).as_posix(),
             "rows": len(part),
             "bytes": path.stat().st_size,
@@ -171,34 +216,49 @@ def _write_table(
         }
 
 
-def render_card(store: Store, shards: Sequence[Shard], images: bool) -> str:
+def render_card(stores: Mapping[str, Store], shards: Sequence[Shard], images: bool) -> str:
     """Return the dataset card (README.md) of an export with these shards."""
     from jinja2 import Template
 
-    # The folder of a release is that of the machine on which the benchmark was built.
-    settings = store.manifest["config"] | {"folder": None}
     rows: dict[str, Counter[str]] = {}
     for shard in shards:
         rows.setdefault(shard["configuration"], Counter())[shard["split"]] += shard["rows"]
+    kinds = {t.configuration: t.kind for t in list_tables(stores)}
+    columns, shown = list_columns(images), dict.fromkeys(kinds[name] for name in rows)
+    text = (files("data.publish") / "templates/dataset_card.md").read_text()
+    benchmarks = [_describe_benchmark(name, store) for name, store in stores.items()]
+    licences = {each["origin"]["license"] for each in benchmarks}
+    return Template(text).render(
+        benchmarks=benchmarks,
+        licence=licences.pop() if len(licences) == 1 else "other",
+        is_simulated=all(each["is_simulated"] for each in benchmarks),
+        images=images,
+        rows=rows,
+        columns={kind: columns[kind] for kind in shown},
+        descriptions=DESCRIPTIONS,
+    )
+
+
+def _describe_benchmark(name: str, store: Store) -> dict[str, Any]:
+    """Return what the card says of a benchmark."""
+    # The folder of a release is that of the machine on which the benchmark was built.
+    settings = store.manifest["config"] | {"folder": None}
     items = [i for suite in (None, *PAIRED) for i in store.selection(suite=suite)]
     queries = [q for pool in POOLS for q in store.retrieval(pool=pool)]
-    text = (files("data.publish") / "templates/dataset_card.md").read_text()
-    return Template(text).render(
-        store=store,
-        images=images,
-        scene=store.scene(store.scene_ids("test")[0]),
-        scenes={split: len(store.scene_ids(split)) for split in SPLITS},
-        origin=ORIGINS[settings["simulator"]],
-        is_simulated=settings["simulator"] == "bullet",
-        families=_count_rows(items, "suite", "family"),
-        subtypes=_count_rows(items, "suite", "family", "subtype"),
-        queries=_count_rows(queries, "pool", "builder", "anchor"),
-        rows=rows,
-        columns=list_columns(images),
-        descriptions=DESCRIPTIONS,
-        versions=component_versions(settings),
-        settings=OmegaConf.to_yaml(OmegaConf.create(settings)),
-    )
+    return {
+        "name": name,
+        "store": store,
+        "scene": store.scene(store.scene_ids("test")[0]),
+        "scenes": {split: len(store.scene_ids(split)) for split in SPLITS},
+        "origin": ORIGINS[settings["simulator"]],
+        "is_simulated": settings["simulator"] == "bullet",
+        "families": _count_rows(items, "suite", "family"),
+        "subtypes": _count_rows(items, "suite", "family", "subtype"),
+        "queries": _count_rows(queries, "pool", "builder", "anchor"),
+        "databases": {name: len(store.database(name)) for name in DATABASES},
+        "versions": component_versions(settings),
+        "settings": OmegaConf.to_yaml(OmegaConf.create(settings)),
+    }
 
 
 def _count_rows(records: Iterable[SelectionItem | RetrievalQuery], *axes: str) -> list[tuple]:

@@ -12,6 +12,7 @@ from conf.schema import TeacherConfig
 from data.checks.intervals import Interval, SceneBootstrap
 from data.records import SelectionItem
 from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.vocabulary import describe_item
 from teacher.reading.claims import Claim
 from teacher.validation.reasons import (
     CONTRADICTED,
@@ -20,7 +21,6 @@ from teacher.validation.reasons import (
     ResponseReasons,
     read_response,
 )
-from teacher.vocabulary import describe_item
 
 if TYPE_CHECKING:
     from data.store import Store

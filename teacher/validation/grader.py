@@ -12,6 +12,7 @@ from data.records import Rationale, SelectionItem
 from teacher.cited_rationales import CITED_VERSION
 from teacher.narrator import NARRATOR_VERSION
 from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.vocabulary import choose_vocabulary, name_vocabulary
 from teacher.prompts import PROMPT_VERSION
 from teacher.reading.claims import VERDICTS
 from teacher.sections import GRAMMAR_VERSION
@@ -19,7 +20,6 @@ from teacher.servers.responses import Response
 from teacher.statement_choice import choose_statements
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.validator import VALIDATOR_VERSION, Validation, validate_rationale
-from teacher.vocabulary import choose_vocabulary, name_vocabulary
 
 MAX_CHARACTERS = 20_000
 """Maximum length of a response. A longer one is rejected, and the record has its beginning only."""

@@ -24,13 +24,13 @@ from conf.compose import compose
 from conf.schema import BuildCommand
 from data.frames.frame_cache import FrameReader
 from data.records import SPLITS, Rationale
-from data.store import MANIFEST, Store
+from data.store import MANIFEST, RATIONALES, Store
 from dynapix.__main__ import COMMANDS, overview
 from dynapix.benchmark import _preset_world, _reopen, preset_names
 from dynapix.selection import MIN_FAILURES_TO_STOP
 from evaluation.metrics.selection import Choices, build_selection_report
 from evaluation.reporting.tables import selection_table
-from teacher.journal import ACCEPTED, save_accepted
+from teacher.journal import save_accepted
 from tests.dynapix.models import always_a, nearest
 from tests.test_house import COMMANDS as ALL_COMMANDS
 from tests.user_errors import raises_user_error
@@ -346,14 +346,14 @@ def test_messages_show_the_item_in_the_order_of_the_prompt(bench) -> None:
 def test_rationales_are_those_of_the_last_narration(micro_store, tmp_path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(micro_store.folder, folder)
-    (folder / ACCEPTED).unlink(missing_ok=True)
+    (folder / RATIONALES).unlink(missing_ok=True)
     with raises_user_error("no-rationales", contains="teacher.narrate"):
         dynapix.load(folder).rationales  # noqa: B018
     written = [
         Rationale(f"item-{k}", 0, True, f"Text {k}.", "A", "template", "1", "1", "0", 0)
         for k in range(3)
     ]
-    save_accepted(written, folder / ACCEPTED)
+    save_accepted(written, folder / RATIONALES)
     assert dynapix.load(folder).rationales == {r.item_id: r.text for r in written}
 
 

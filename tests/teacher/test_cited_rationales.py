@@ -21,11 +21,11 @@ from teacher.cited_rationales import (
 )
 from teacher.journal import read_rationales
 from teacher.narrate import narrate_store
+from teacher.predicates.vocabulary import describe_item, name_vocabulary
 from teacher.prompts import build_messages
 from teacher.sufficiency import measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from teacher.vocabulary import describe_item, name_vocabulary
 from tests.teacher.faulty_server import FaultyServer, teacher_at
 from tests.teacher.memory_store import MemoryStore
 from tests.teacher.test_predicates import random_cases

@@ -20,23 +20,18 @@ from random import Random
 
 import pytest
 
-from benchmarks.experiments.mutations import (
-    MUTATIONS,
-    RELATION_MUTATIONS,
-    is_contradicted,
-    parse_predicates,
-    read_rationales,
-)
+from benchmarks.experiments.mutations import is_contradicted, parse_predicates, read_rationales
 from conf.schema import RelationBounds, TeacherConfig
 from teacher.narrator import write_rationale
 from teacher.predicates.extraction import EVENT_MOMENTS
 from teacher.predicates.facts import REGIONS
 from teacher.predicates.relations import describe_distance
+from teacher.predicates.vocabulary import choose_vocabulary
 from teacher.reading.phrases import PHRASES_BY_FIRST_WORD
 from teacher.sections import SECTIONS
 from teacher.validation.claim_extraction import extract_claims
+from teacher.validation.mutations import MUTATIONS, RELATION_MUTATIONS
 from teacher.validation.validator import validate_rationale
-from teacher.vocabulary import choose_vocabulary
 from tests.teacher.marked import marked_items
 from tests.teacher.test_predicates import random_cases
 

@@ -10,18 +10,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from conf.errors import UserError
 from conf.schema import TeacherConfig
 from conf.schema.world import WorldConfig
 from data.records import Scene
 from data.store import Store
-from teacher.grounding import describe_grounding, extrapolate_scene, extrapolate_target
 from teacher.journal import read_rationales
 from teacher.narrate import JOURNAL_FILE, narrate_store
 from teacher.predicates.extraction import extract_predicates
+from teacher.predicates.grounding import Grounding, extrapolate_scene, extrapolate_target
+from teacher.predicates.vocabulary import describe_item
 from teacher.validation.validator import validate_rationale
-from teacher.vocabulary import describe_item
 from tests.teacher import synthetic
+from tests.user_errors import raises_user_error
 
 GUESSES = ("extrapolated", "shuffled")
 CLEVRER = {"config": {"simulator": "bullet", "world": asdict(WorldConfig())}}
@@ -82,7 +82,7 @@ def test_a_guess_describes_the_distractors_as_they_are(micro_store: Store) -> No
     others = 0
     for item in micro_store.training_items():
         true = describe_item(item, micro_store, oracle)
-        found = describe_grounding(item, micro_store, guess)
+        found = Grounding(micro_store, guess).describe(item)
         assert (true is None) == (found is None)
         if true is None or true.instant != found.instant:
             continue
@@ -99,12 +99,12 @@ def test_shuffled_facts_are_those_of_another_scene(micro_store: Store) -> None:
     known = {k: describe_item(item, micro_store, oracle) for k, item in items.items()}
     for item_id in [k for k, p in known.items() if p is not None]:
         item = items[item_id]
-        found = describe_grounding(item, micro_store, cfg)
+        found = Grounding(micro_store, cfg).describe(item)
         donors = [items[k] for k, predicates in known.items() if predicates == found]
         assert donors
         assert all(d.scene_id != item.scene_id and d.family == item.family for d in donors)
         assert found.answer == item.letter
-        assert found == describe_grounding(item, micro_store, cfg)
+        assert found == Grounding(micro_store, cfg).describe(item)
 
 
 @pytest.mark.parametrize("grounding", GUESSES)
@@ -140,8 +140,8 @@ def test_a_scene_without_a_camera_cannot_be_extrapolated(tmp_path: Path) -> None
     scene = synthetic.scene([(0, 0), (1, 1)], [(1, 0), (0, 0)])
     manifest = {"config": {"simulator": "movi_a"}}
     store = SimpleNamespace(manifest=manifest, scene=lambda _: scene, name="movi_a-1")
-    with pytest.raises(UserError, match=r"movi_a-1 records no camera.*Use oracle or shuffled"):
-        describe_grounding(synthetic.item((60, 70, 90, 110)), store, teacher("extrapolated"))
+    with raises_user_error("no-camera", contains="movi_a-1 records no camera"):
+        Grounding(store, teacher("extrapolated")).describe(synthetic.item((60, 70, 90, 110)))
 
 
 def test_sufficient_rationales_need_the_facts_of_the_simulator() -> None:

@@ -12,8 +12,8 @@ from data.records import Rationale
 from teacher.journal import Journal, read_rationales
 from teacher.narrate import ensure_rationales, narrate_store
 from teacher.narrator import NARRATOR_VERSION
+from teacher.predicates.vocabulary import name_vocabulary
 from teacher.sections import GRAMMAR, GRAMMAR_VERSION
-from teacher.vocabulary import name_vocabulary
 from tests.teacher import synthetic
 from tests.teacher.faulty_server import teacher_at
 from tests.teacher.memory_store import make_store

@@ -9,6 +9,7 @@ import pytest
 from conf.schema import TeacherConfig
 from data.records import Rationale
 from teacher.narrate import narrate_store
+from teacher.predicates.vocabulary import name_vocabulary
 from teacher.report import (
     describe_sufficiency,
     format_figures,
@@ -16,7 +17,6 @@ from teacher.report import (
     summarize,
     write_report,
 )
-from teacher.vocabulary import name_vocabulary
 from tests.teacher import synthetic
 
 ITEMS = [synthetic.item((60, 80, 100, 120), item_id=f"item-{k}") for k in range(5)]

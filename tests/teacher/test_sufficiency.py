@@ -10,11 +10,11 @@ import pytest
 from conf.schema import RelationBounds, TeacherConfig
 from data.records import Scene
 from teacher.narrator import write_rationale
+from teacher.predicates.vocabulary import choose_vocabulary
 from teacher.servers.responses import Response
 from teacher.sufficiency import find_predicted, measure_sufficiency
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.grader import RationaleGrader
-from teacher.vocabulary import choose_vocabulary
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 

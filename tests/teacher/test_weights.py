@@ -12,8 +12,8 @@ from data.items.futures.contact import LEAD, collision_timings
 from data.oracle.contacts import next_collision
 from data.records import CONTACT, Candidate, Scene, SelectionItem
 from teacher.narrator import write_rationale
+from teacher.predicates.vocabulary import choose_vocabulary, describe_item
 from teacher.validation.claim_extraction import extract_claims
-from teacher.vocabulary import choose_vocabulary, describe_item
 from tests.data.simulated import preset_world, simulate_scene
 
 WORLD = preset_world("above_masses")

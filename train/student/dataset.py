@@ -22,9 +22,9 @@ from models.student.prompts import (
     selection_sample,
 )
 from teacher.candidate_letters import relabel_text, reorder_candidates
-from teacher.grounding import describe_grounding
 from teacher.narrator import write_facts, write_match_lines
-from teacher.vocabulary import choose_vocabulary
+from teacher.predicates.grounding import Grounding
+from teacher.predicates.vocabulary import choose_vocabulary
 from train.common.held_out import check_not_empty, held_out_scenes, shuffled
 from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
 
@@ -120,11 +120,12 @@ def supervised_items(
             then left out.
     """
     by_mode: dict[str, list[SupervisedItem]] = {mode: [] for mode in MODES}
+    grounding = Grounding(store, teacher)
     for item in items:
         rationale, facts, lines = rationales.get(item.item_id), "", ()
         if rationale and (with_facts or has_matches(regime)):
             # An item that has a rationale has predicates.
-            predicates = choose_vocabulary(describe_grounding(item, store, teacher), teacher)
+            predicates = choose_vocabulary(grounding.describe(item), teacher)
             facts = write_facts(predicates, item) if with_facts else ""
             lines = write_match_lines(predicates, item) if has_matches(regime) else ()
         if rationale:

@@ -33,7 +33,7 @@ from teacher.narrator import write_rationale
 from teacher.predicates.extraction import extract_facts
 from teacher.predicates.places import close_pairs
 from teacher.predicates.relations import Places, find_relations
-from teacher.vocabulary import describe_item
+from teacher.predicates.vocabulary import describe_item
 from tests.data.sources.tracks_files import (
     SIZE,
     box_lines,

@@ -20,7 +20,7 @@ from data.records import ALTERNATIVE, Collision, Scene, SelectionItem, original_
 from data.seeded_order import named_rng
 from teacher.predicates.facts import RelationalPredicates
 from teacher.predicates.places import contact_distance
-from teacher.vocabulary import describe_item
+from teacher.predicates.vocabulary import describe_item
 
 if TYPE_CHECKING:
     from conf.schema import TeacherConfig
@@ -30,11 +30,8 @@ EXTRAPOLATED = f"{ALTERNATIVE}extrapolated"
 """Suffix of the id of a scene that a guess continues. It marks an alternative future."""
 
 
-def describe_grounding(
-    item: SelectionItem, store: Store, cfg: TeacherConfig
-) -> RelationalPredicates | None:
-    """Return the predicates from which the rationale of a training item is written; None if a
-    prefix is too short, or if no other item can be drawn.
+class Grounding:
+    """The facts of the rationales of a benchmark's training items.
 
     With `cfg.grounding`:
 
@@ -44,17 +41,27 @@ def describe_grounding(
       The distractors are described as they are.
     - shuffled: those of a training item of another scene, drawn with `cfg.seed`, that has the same
       family and answer.
-
-    Raises:
-        UserError: The scenes record no camera, so that no frame can be extrapolated.
     """
-    if cfg.grounding == "extrapolated":
-        item, scene_of = extrapolate_target(item, store)
-        return describe_item(item, store, cfg, scene_of)
-    if cfg.grounding == "shuffled":
-        donors = find_donors(item, store.training_items(), cfg.seed)
-        return next(filter(None, (describe_item(donor, store, cfg) for donor in donors)), None)
-    return describe_item(item, store, cfg)
+
+    def __init__(self, store: Store, cfg: TeacherConfig) -> None:
+        self._store, self._cfg = store, cfg
+        self._donors = store.training_items() if cfg.grounding == "shuffled" else []
+
+    def describe(self, item: SelectionItem) -> RelationalPredicates | None:
+        """Return the predicates from which the rationale of an item is written; None if a prefix is
+        too short, or if no other item can be drawn.
+
+        Raises:
+            UserError: The scenes record no camera, so that no frame can be extrapolated.
+        """
+        store, cfg = self._store, self._cfg
+        if cfg.grounding == "extrapolated":
+            item, scene_of = extrapolate_target(item, store)
+            return describe_item(item, store, cfg, scene_of)
+        if cfg.grounding == "shuffled":
+            drawn = find_donors(item, self._donors, cfg.seed)
+            return next(filter(None, (describe_item(donor, store, cfg) for donor in drawn)), None)
+        return describe_item(item, store, cfg)
 
 
 def extrapolate_target(
@@ -81,7 +88,8 @@ def extrapolate_scene(scene: Scene, stop: int, store: Store) -> Scene:
     if image is None:
         raise UserError(
             f"teacher.grounding=extrapolated: {store.name} records no camera, so the places of "
-            "extrapolated objects in the image are unknown. Use oracle or shuffled"
+            "extrapolated objects in the image are unknown. Use oracle or shuffled",
+            code="no-camera",
         )
     inside = ((image >= 0) & (image < scene.image_size)).all(axis=-1)
     contacts = [c for c in scene.collisions if c.frame <= stop]
