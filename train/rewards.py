@@ -7,7 +7,8 @@ letters earns no more than the answer line alone.
 
 from __future__ import annotations
 
-from collections import Counter
+import math
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -65,27 +66,35 @@ def reward_answer(response: JudgedResponse) -> float:
 
 def reward_truth(response: JudgedResponse) -> float:
     """Return the share of the claims that the oracle supports less that of those it contradicts,
-    from -1 to 1.
+    from -1 to 1: the sum over `credit_claims`."""
+    return math.fsum(credit for _, credit in credit_claims(response))
 
-    Each claim counts once, whatever its moment and the order of its objects; further mentions above
-    `MAX_MENTIONS` count as contradicted. Negated claims count only if they are contradicted:
-    otherwise, a list of what is not the case would be supported without any knowledge.
+
+def credit_claims(response: JudgedResponse) -> list[tuple[Claim, float]]:
+    """Return the claims that the oracle supports or contradicts, each with its part of
+    `reward_truth`.
+
+    Each claim counts once, whatever its moment and the order of its objects: its mentions share its
+    part. Further mentions above `MAX_MENTIONS` count as contradicted. Negated claims count only if
+    they are contradicted: otherwise, a list of what is not the case would be supported without any
+    knowledge. A claim that is contradicted at one moment is not supported at another.
     """
-    mentions: Counter[tuple] = Counter()
-    affirmed, supported, contradicted = set(), set(), set()
+    mentions: dict[tuple, list[Claim]] = defaultdict(list)
     for claims in response.reasons.claims.values():
         for claim in claims:
-            key = _identify(claim)
-            mentions[key] += 1
-            if claim.affirmed:
-                affirmed.add(key)
-            if claim.verdict == CONTRADICTED:
-                contradicted.add(key)
-            elif _is_earned(claim):
-                supported.add(key)
-    repeated = sum(max(0, count - MAX_MENTIONS) for count in mentions.values())
-    total = max(len(affirmed | contradicted) + repeated, MIN_CLAIMS)
-    return (len(supported - contradicted) - len(contradicted) - repeated) / total
+            mentions[_identify(claim)].append(claim)
+    credits: list[tuple[Claim, float]] = []
+    counted = 0
+    for claims in mentions.values():
+        contradicted = [claim for claim in claims if claim.verdict == CONTRADICTED]
+        earned = contradicted or [claim for claim in claims if _is_earned(claim)]
+        sign = -1 if contradicted else 1
+        credits += [(claim, sign / len(earned)) for claim in earned]
+        repeated = claims[MAX_MENTIONS:]
+        credits += [(claim, -1) for claim in repeated]
+        counted += bool(contradicted or claims[0].affirmed) + len(repeated)
+    total = max(counted, MIN_CLAIMS)
+    return [(claim, credit / total) for claim, credit in credits]
 
 
 def _identify(claim: Claim) -> tuple:

@@ -9,7 +9,8 @@ from typing import ClassVar
 from conf.schema.benchmark import POOLS
 from conf.schema.settings import Settings, check_choices, setting
 
-REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout", "answer_only")
+RATIONALE_REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout")
+REGIMES = (*RATIONALE_REGIMES, "answer_only")
 LOSS_TYPES = ("dapo", "grpo", "bnpo", "dr_grpo", "cispo", "sapo", "luspo", "vespo")
 """The values of `loss_type` of TRL's GRPOConfig."""
 
@@ -113,6 +114,9 @@ class SftTrainConfig(StudentTrainConfig):
     facts: bool = False
     """Show the facts of an item as text instead of its frames. Such a model can be the teacher of
     train.distill; it cannot be evaluated."""
+    weighting: str = setting("token", options=("token", "sample"))
+    """What the loss is a mean over: the supervised tokens of a step, as in the paper, or its
+    samples. An answer has about 1% of the tokens of a rationale."""
     reuse_features: bool = False
     """Cache the frozen vision tower's features of each frame in up to half of the free memory. With
     an 8B model, the features of a frame take about 3 MB."""
@@ -201,6 +205,9 @@ class ReinforceTrainConfig(TrainConfig):
     validation_items: int = setting(16, least=1)
     """Number of items of held-out training scenes on which the rewards are measured."""
     rewards: RewardWeights = field(default_factory=RewardWeights)
+    credit: str = setting("response", options=("response", "claims"))
+    """Which tokens get the reward for true claims: all tokens of a response, or those of each claim
+    their part of it."""
     loss_type: str = setting("dapo", LOSS_TYPES)
     """Loss of TRL's GRPOTrainer. dapo is the mean over all tokens of a step. With bnpo, the result
     also depends on `micro_batch`."""
@@ -217,6 +224,8 @@ class ReinforceTrainConfig(TrainConfig):
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
+        if self.credit == "claims" and not self.rewards.truth:
+            yield f"{group}credit=claims needs a {group}rewards.truth above 0"
         if self.micro_batch > 0 and (self.batch * self.responses) % self.micro_batch:
             yield (
                 f"{group}micro_batch={self.micro_batch} must divide the {self.batch} x "

@@ -10,7 +10,7 @@ from data.store import Store
 from models.student.prompts import answer_line, build_response
 from teacher.narrator import write_match_lines, write_rationale
 from teacher.predicates.facts import REGIONS, RelationalPredicates
-from teacher.vocabulary import describe_item
+from teacher.predicates.vocabulary import describe_item
 from train.rewards import REWARDS, judge_response, reward_form, reward_truth
 
 TEACHER = TeacherConfig(name="template", predicates="relational")

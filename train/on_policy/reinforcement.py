@@ -22,6 +22,7 @@ from typing import Any, NoReturn
 import torch
 from datasets import Dataset
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 from transformers import ProcessorMixin
 from trl import GRPOConfig, GRPOTrainer
 from trl.trainer.utils import RepeatSampler
@@ -37,10 +38,11 @@ from models.distributed import split_batch
 from models.student.collator import pad
 from models.student.prompts import Sample, selection_sample
 from teacher.predicates.facts import RelationalPredicates
-from teacher.vocabulary import describe_item
+from teacher.predicates.vocabulary import describe_item
 from train.common.arguments import common_arguments
 from train.common.callbacks import EpochCallback
 from train.common.held_out import check_not_empty
+from train.on_policy.claim_credit import credit_tokens
 from train.on_policy.mismatch import Mismatch
 from train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
 from train.on_policy.served_sampling import build_sampler
@@ -179,6 +181,8 @@ class MediaGRPOTrainer(GRPOTrainer):
         response_sampler: Samples the responses.
         beta: See `ReinforceTrainConfig`; that of TRL's arguments is 0.
         importance_cap: See `ReinforceTrainConfig`.
+        claim_weight: Weight of the advantages of claims, which their tokens get besides that of
+            their response.
     """
 
     def __init__(
@@ -189,6 +193,7 @@ class MediaGRPOTrainer(GRPOTrainer):
         response_sampler: ResponseSampler,
         beta: float,
         importance_cap: float | None,
+        claim_weight: float,
         **settings: Any,
     ) -> None:
         trained = {p: p.data for p in model.parameters() if p.requires_grad}
@@ -207,6 +212,8 @@ class MediaGRPOTrainer(GRPOTrainer):
         self._inputs: list[EncodedPrompt] = []
         self._loss_inputs: dict[str, Any] | None = None
         self._importance_cap, self._mismatch = importance_cap, Mismatch(importance_cap)
+        self._claim_weight = claim_weight
+        self._token_credits: list[Tensor] = []
         self._differ = torch.empty(0, dtype=torch.bool)
 
     def _send_telemetry(self) -> None:
@@ -231,13 +238,19 @@ class MediaGRPOTrainer(GRPOTrainer):
     def _generate_and_score_completions(self, inputs: list[dict[str, Any]]) -> dict[str, Any]:
         """Sample and judge a response to each row, and keep the prompts for the loss.
 
-        Responses to an item whose rewards are all equal do not count in the mean over tokens.
+        Responses to an item whose rewards are all equal do not count in the mean over tokens, nor
+        do they with `claim_weight` if they also have no claims.
         """
         self._batch_items = [self._items[row["split"]][row["index"]] for row in inputs]
         self._prompts = self._inputs = [row[PROMPT] for row in inputs]
         output = super()._generate_and_score_completions(inputs)
         first = self.accelerator.process_index * len(inputs)
         counted = self._differ[first : first + len(inputs), None]
+        if self._claim_weight:
+            credits = pad_sequence(self._token_credits, True).to(counted.device)
+            counted = counted | credits.any(dim=1, keepdim=True)
+            advantages = self._claim_weight * self._standardize(credits)
+            output["advantages"] = output["advantages"][:, None] + advantages
         # Tokens that it masks are read by the model, but not in the loss.
         output["tool_mask"] = counted.expand_as(output["completion_mask"])
         mode = "train" if self.model.training else "eval"
@@ -246,6 +259,17 @@ class MediaGRPOTrainer(GRPOTrainer):
         output["num_items_in_batch"] = total.clamp(min=1)
         # TRL shuffles and splits the tensors of its output by their rows.
         return {**output, ROW: torch.arange(len(inputs), device=self.accelerator.device)}
+
+    def _standardize(self, credits: Tensor) -> Tensor:
+        """Return the credits (B, T) of the tokens of claims less their mean over all ranks, in
+        units of their standard deviation; 0 for other tokens."""
+        claimed = credits != 0
+        found = credits[claimed]
+        sums = torch.stack([claimed.sum(), found.sum(), found.square().sum()]).float()
+        count, total, squares = self.accelerator.reduce(sums)
+        mean = total / count.clamp(min=1)
+        deviation = (squares / count.clamp(min=1) - mean**2).clamp(min=0).sqrt()
+        return claimed * (credits - mean) / (deviation + 1e-6)
 
     def _calculate_rewards(self, inputs: list[dict[str, Any]], *rest: Any) -> Tensor:
         """Return the rewards of all ranks' responses, (N, rewards), and note for each response
@@ -279,6 +303,9 @@ class MediaGRPOTrainer(GRPOTrainer):
             self.response_sampler.check_parsed([j.letter for j in judged], self.accelerator)
         prompt_ids = [prompt.encoded.input_ids for prompt in self._prompts]
         ids = [list(t.ids) for t in texts]
+        if self._claim_weight:
+            pairs = zip(judged, ids, strict=True)
+            self._token_credits = [credit_tokens(*pair, self._tokenizer) for pair in pairs]
         logs = [list(t.log_probabilities) for t in texts]
         return {"prompt_ids": prompt_ids, "completion_ids": ids, "logprobs": logs, "judged": judged}
 
@@ -331,7 +358,9 @@ class MediaGRPOTrainer(GRPOTrainer):
             if self.loss_type == "vespo":
                 inputs["importance_sampling_ratio"] = weights
             else:
-                inputs["advantages"] = inputs["advantages"][:, None] * weights
+                advantages = inputs["advantages"]
+                columns = advantages[:, None] if advantages.dim() == 1 else advantages
+                inputs["advantages"] = columns * weights
 
     def _score(
         self,
@@ -425,7 +454,12 @@ def build_trainer(
             code="batch-too-large",
         )
     encode = partial(encode_prompt, processor=processor, max_length=student.max_length)
-    names = [name for name in REWARDS if getattr(train.rewards, name)]
+    weights = {name: getattr(train.rewards, name) for name in REWARDS}
+    weights = {name: weight for name, weight in weights.items() if weight}
+    names, claim_weight = [*weights], 0.0
+    if train.credit == "claims":
+        # The reward for true claims is measured, and its tokens get their parts of it instead.
+        claim_weight, weights["truth"] = weights["truth"], 0.0
     arguments = GRPOConfig(
         **common_arguments(train, run, cfg.seed, checkpoint),
         per_device_train_batch_size=train.micro_batch,
@@ -436,7 +470,7 @@ def build_trainer(
         temperature=train.temperature,
         loss_type=train.loss_type,
         epsilon=train.epsilon,
-        reward_weights=[getattr(train.rewards, name) for name in names],
+        reward_weights=[*weights.values()],
         ddp_find_unused_parameters=not student.lora.rank,
     )
     trainer = MediaGRPOTrainer(
@@ -450,6 +484,7 @@ def build_trainer(
         response_sampler=build_sampler(processor, student, train, cfg.sampling_server, run.folder),
         beta=train.beta,
         importance_cap=train.importance_cap,
+        claim_weight=claim_weight,
     )
     trainer.add_callback(EpochCallback(trainer))
     return trainer

@@ -1,7 +1,7 @@
 """The student's trainer, a transformers.Trainer with its own loss, order of samples and measures.
 
-The loss weights all supervised tokens of an accumulated batch equally. A non-finite loss or
-gradient stops the run before the affected weights are saved.
+The loss weights all supervised tokens of an accumulated batch equally, or all its samples. A
+non-finite loss or gradient stops the run before the affected weights are saved.
 """
 
 from __future__ import annotations
@@ -59,6 +59,24 @@ def token_losses(logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
     return torch.stack([losses.sum(dim=-1), (following != IGNORED).sum(dim=-1)], dim=-1)
 
 
+def sample_mean(
+    outputs: Any, labels: torch.Tensor, num_items_in_batch: torch.Tensor | int | None = None
+) -> torch.Tensor:
+    """Return a micro-batch's part of the mean over an accumulated batch's samples of their mean
+    cross entropy.
+
+    `num_items_in_batch` is the number of supervised samples of the accumulated batch (default: of
+    the micro-batch).
+    """
+    losses, counts = token_losses(outputs.logits, labels).unbind(dim=-1)
+    total = (losses / counts.clamp(min=1)).sum()
+    return total / ((counts > 0).sum() if num_items_in_batch is None else num_items_in_batch)
+
+
+LOSSES = {"token": token_mean, "sample": sample_mean}
+"""The losses by `train.weighting`."""
+
+
 @dataclass(frozen=True)
 class TrainerCollator:
     """Adds the samples' ids to a batch and, if `digests` is set for a `VisionCache`, the digests of
@@ -108,6 +126,14 @@ class StudentTrainer(Trainer):
 
     def _get_train_sampler(self, *_: Any) -> Sampler[int]:
         return self._sampler
+
+    def _get_num_items_in_batch(self, batches: list, device: torch.device) -> Any:
+        """Return the number of supervised tokens of an accumulated batch on all ranks, or of
+        supervised samples for `sample_mean`."""
+        if self.compute_loss_func is sample_mean:
+            # The largest label of a sample stands for all: it is IGNORED if none is supervised.
+            batches = [{**b, "shift_labels": b["labels"].amax(dim=1)} for b in batches]
+        return super()._get_num_items_in_batch(batches, device)
 
     def _reduce(
         self, outputs: torch.Tensor | tuple[torch.Tensor, ...], labels: torch.Tensor

@@ -23,7 +23,7 @@ from train.student.held_out_answers import HeldOutAnswers
 from train.student.lazy_samples import StudentDataset
 from train.student.length_sampler import LengthSampler
 from train.student.metrics import LetterAccuracy
-from train.student.trainer import StudentTrainer, TrainerCollator, token_mean
+from train.student.trainer import LOSSES, StudentTrainer, TrainerCollator
 from train.student.vision_cache import VisionCache
 
 log = logging.getLogger(__name__)
@@ -110,7 +110,7 @@ def build_trainer(
         data_collator=TrainerCollator(collator, digests=cache is not None),
         train_dataset=training,
         eval_dataset=validation,
-        compute_loss_func=token_mean,
+        compute_loss_func=LOSSES[train.weighting],
         callbacks=[EpochCallback(training, sampler)],
         sampler=sampler,
         accuracy=LetterAccuracy(letter_ids(processor)),

@@ -16,7 +16,8 @@ from hydra.core.config_store import ConfigStore
 from conf.errors import UserError
 from conf.runs import rank
 from train import contrastive, sft
-from train.student import dataset, trainer_setup
+from train.student import dataset
+from train.student.trainer import LOSSES
 
 TRAINERS = {"sft": sft.main, "contrastive": contrastive.main}
 VALIDATION_ITEMS = 3
@@ -62,7 +63,7 @@ def main() -> None:
         if rank() == 0 and run["checkpoint"]:
             shutil.copytree(run["checkpoint"], Path(run["folder"]) / Path(run["checkpoint"]).name)
         if rank() == run["failing_rank"]:
-            trainer_setup.token_mean = fail
+            LOSSES["token"] = fail
         sys.argv[1:] = run["overrides"]
         TRAINERS[run["trainer"]]()
 

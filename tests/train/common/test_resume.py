@@ -149,11 +149,13 @@ def test_a_run_with_one_evaluation_resumes_from_its_middle(sft_settings, tmp_pat
 
 
 @pytest.mark.slow
-def test_micro_batches_change_neither_loss_nor_gradient(few_steps, tmp_path) -> None:
+@pytest.mark.parametrize("weighting", ["token", "sample"])
+def test_micro_batches_change_neither_loss_nor_gradient(weighting, few_steps, tmp_path) -> None:
     """In the first step, with four samples of unequal length in one micro-batch or in four."""
     first = []
     for micro_batch in (4, 1):
-        settings = few_steps(batch=4, max_steps=1, validation_items=1, micro_batch=micro_batch)
+        sizes = {"batch": 4, "max_steps": 1, "validation_items": 1, "micro_batch": micro_batch}
+        settings = few_steps(**sizes, weighting=weighting)
         folder = train(sft.main, settings, tmp_path / str(micro_batch))
         first.append(next(r for r in read_journal(folder) if "grad_norm" in r))
     assert first[0]["loss"] == pytest.approx(first[1]["loss"], rel=1e-4)

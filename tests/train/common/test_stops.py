@@ -22,7 +22,7 @@ from tests.user_errors import raises_user_error
 from train import sft
 from train.common.held_out import HELD_OUT_SHARE, held_out_scenes
 from train.student.dataset import load_datasets, uses_only
-from train.student.trainer import token_mean
+from train.student.trainer import LOSSES, token_mean
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_a_non_finite_gradient_stops_the_run(few_steps, tmp_path, monkeypatch) -
     def loss(*args: Any, **options: Any) -> torch.Tensor:
         return NanGradient.apply(token_mean(*args, **options))
 
-    monkeypatch.setattr("train.student.trainer_setup.token_mean", loss)
+    monkeypatch.setitem(LOSSES, "token", loss)
     settings = few_steps(regime="answer_only", batch=4, micro_batch=2)
     with raises_user_error("non-finite-gradient", contains="stopped.json"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))
@@ -67,9 +67,7 @@ def test_a_non_finite_gradient_stops_the_run(few_steps, tmp_path, monkeypatch) -
 
 @pytest.mark.slow
 def test_too_little_memory_names_the_settings_to_lower(settings, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(
-        "train.student.trainer_setup.token_mean", lambda *_, **__: torch.empty(1 << 50)
-    )
+    monkeypatch.setitem(LOSSES, "token", lambda *_, **__: torch.empty(1 << 50))
     with raises_user_error("out-of-memory", contains="train.micro_batch"):
         sft.main.__wrapped__(settings, Run("run", tmp_path))
 

@@ -20,7 +20,7 @@ from tests.user_errors import raises_user_error
 from train.student.lazy_samples import LazySample, StudentDataset
 from train.student.length_sampler import LengthSampler
 from train.student.metrics import LetterAccuracy
-from train.student.trainer import token_mean
+from train.student.trainer import sample_mean, token_mean
 
 # The attention of the language tower and of the vision tower.
 ATTENTIONS = {
@@ -46,10 +46,10 @@ def samples(micro_store, frames, student_cfg) -> list[Sample]:
     ]
 
 
-def loss_of(model, batch: dict, count: int | None = None) -> torch.Tensor:
+def loss_of(model, batch: dict, count: int | None = None, loss=token_mean) -> torch.Tensor:
     batch = dict(batch)
     labels = batch.pop("labels")
-    return token_mean(model(**batch, use_cache=False), labels, count)
+    return loss(model(**batch, use_cache=False), labels, count)
 
 
 def gradients(model: PreTrainedModel, loss: torch.Tensor) -> list[torch.Tensor]:
@@ -87,6 +87,19 @@ def test_padding_changes_neither_loss_nor_gradients(samples, processor, model, a
         for one, two in zip(gradients(model, loss), expected, strict=True):
             assert two.abs().max() > 1e-4
             assert (one - two).norm() < 1e-3 * two.norm()
+
+
+def test_each_sample_weighs_the_same_in_any_micro_batches(samples, processor, model) -> None:
+    collate = Collator(processor, 1500)
+
+    def mean(samples: list[Sample], count: int | None = None) -> torch.Tensor:
+        return loss_of(model, collate(samples), count, sample_mean)
+
+    expected = torch.stack([loss_of(model, collate([s])) for s in samples]).mean()
+    torch.testing.assert_close(mean(samples), expected)
+    torch.testing.assert_close(mean(samples[:2], 3) + mean(samples[2:], 3), expected)
+    # A sample that is not supervised weighs nothing.
+    torch.testing.assert_close(mean([*samples, replace(samples[0], supervised=False)]), expected)
 
 
 def test_only_the_response_is_supervised(samples, processor) -> None:
