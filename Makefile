@@ -56,14 +56,21 @@ run: setup ## Train and evaluate the tiny student and the tiny retriever
 # `paper-tiny`, which uses the commands' default presets (tiny); the lines `paper:` below set them for
 # `paper`. An interrupted command resumes, and a finished command reuses its results. $(RUNS) is the
 # prefix of the names of the students' runs. `make run` and `paper-tiny` share it, and thus their runs.
+# $(BASES) and $(SCORERS) are the rows of Tables 2 and 3; $(PREDICTOR) is the base of the predict rows.
+# STUDIES names finished human studies (Table 11).
 REGIMES := answer_only cot cot_no_candidate_analysis cot_no_match_layout
 CONTROLS := candidate_only shuffled_prefix matched_anchor
 RUNS := relational-
 RETRIEVER_RUN := default
 SUITES := standin_movi_a standin_physion
+BASES := tiny
+SCORERS := tiny
+PREDICTOR := tiny
 NARRATOR := teacher.predicates=relational
 # No record mode: the tiny base was not trained to write the structured record.
 ZERO_SHOT := modes=[reasoning,answer]
+# The student that learned the match layout, with the prompt of the one that did not.
+NO_MATCH_LAYOUT := prompt_regime=cot_no_match_layout modes=[reasoning]
 # The tiny matcher is the trained retriever, because an untrained one cannot match texts to frames.
 MATCHER := matcher.model=checkpoints/contrastive/$(RETRIEVER_RUN)
 
@@ -77,6 +84,9 @@ paper: BENCHMARK := benchmark=dynapix
 paper: NARRATOR := teacher=$(TEACHER)
 paper: BASE := student=$(STUDENT)
 paper: RUNS := $(STUDENT)-
+paper: BASES := qwen3_vl_2b qwen3_vl_8b qwen3_vl_8b_thinking qwen3_5_27b qwen3_6_27b
+paper: SCORERS := clip languagebind siglip2 vlm2vec qwen3_vl_emb_2b qwen3_vl_emb_8b
+paper: PREDICTOR := qwen3_vl_2b
 paper: EMBEDDER := retriever=$(RETRIEVER)
 paper: RETRIEVER_RUN := $(RETRIEVER)
 paper: SUITES := movi_a physion
@@ -84,23 +94,32 @@ paper: FOLDER = benchmark.folder=$(RELEASES)/$$s
 # The paper measures bases in record mode. Reasoning and answer mode compare them with the students.
 paper: ZERO_SHOT := modes=[record,constrained,reasoning,answer]
 paper: MATCHER := matcher=$(RETRIEVER)
-paper: releases hours experiments ## Run every experiment at the paper's scale; variables: STUDENT, RETRIEVER, TEACHER, RELEASES=FOLDER
+paper: releases hours experiments ## Run every experiment at the paper's scale; variables: STUDENT, RETRIEVER, TEACHER, STUDIES, RELEASES=FOLDER
 
 experiments: setup
-	$(PY) evaluation.select $(BENCHMARK) $(BASE) $(ZERO_SHOT)
+	for b in $(BASES); do $(PY) evaluation.select $(BENCHMARK) student=$$b $(ZERO_SHOT) || exit; done
+	for b in $(BASES); do for c in $(CONTROLS); do \
+	  $(PY) evaluation.select +exp=$$c $(BENCHMARK) student=$$b $(ZERO_SHOT) || exit; done; done
+	for s in $(SCORERS); do $(PY) evaluation.similarity $(BENCHMARK) retriever=$$s || exit; \
+	  $(PY) evaluation.similarity +exp=matched_anchor $(BENCHMARK) retriever=$$s || exit; \
+	  $(PY) evaluation.retrieve $(BENCHMARK) retriever=$$s || exit; done
 	for r in $(REGIMES); do $(PY) train.sft +exp=$$r $(BENCHMARK) $(NARRATOR) $(BASE) run=$(RUNS)$$r || exit; done
 	for r in $(REGIMES); do $(PY) evaluation.select $(BENCHMARK) model=checkpoints/sft/$(RUNS)$$r || exit; done
+	$(PY) evaluation.select $(BENCHMARK) model=checkpoints/sft/$(RUNS)cot $(NO_MATCH_LAYOUT)
 	for c in $(CONTROLS); do $(PY) evaluation.select +exp=$$c $(BENCHMARK) model=checkpoints/sft/$(RUNS)answer_only || exit; done
 	for c in $(CONTROLS); do $(PY) evaluation.select +exp=$$c $(BENCHMARK) model=checkpoints/sft/$(RUNS)cot || exit; done
 	for s in $(SUITES); do $(PY) data.build benchmark=$$s $(FOLDER) || exit; done
 	for s in $(SUITES); do $(PY) evaluation.select benchmark=$$s $(BASE) $(ZERO_SHOT) || exit; done
 	for s in $(SUITES); do for r in $(REGIMES); do \
-	  $(PY) evaluation.select benchmark=$$s model=checkpoints/sft/$(RUNS)$$r || exit; done; done
+	  $(PY) evaluation.select benchmark=$$s model=checkpoints/sft/$(RUNS)$$r || exit; done; \
+	  $(PY) evaluation.select benchmark=$$s model=checkpoints/sft/$(RUNS)cot $(NO_MATCH_LAYOUT) || exit; done
 	$(PY) train.contrastive $(BENCHMARK) $(EMBEDDER) run=$(RETRIEVER_RUN)
 	$(PY) evaluation.retrieve $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVER_RUN)
 	$(PY) evaluation.similarity $(BENCHMARK) model=checkpoints/contrastive/$(RETRIEVER_RUN)
-	$(PY) evaluation.two_stage $(BENCHMARK) $(BASE) $(MATCHER)
+	$(PY) evaluation.two_stage $(BENCHMARK) $(BASE) routes=[cot_text] $(MATCHER)
+	$(PY) evaluation.two_stage $(BENCHMARK) student=$(PREDICTOR) routes=[predict_caption,predict_image] $(MATCHER)
 	$(PY) evaluation.two_stage $(BENCHMARK) model=checkpoints/sft/$(RUNS)cot $(MATCHER)
+	for s in $(STUDIES); do $(PY) evaluation.study.export run=$$s || exit; done
 	$(PY) evaluation.report
 
 releases:

@@ -40,6 +40,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         from models.checks import check_available
 
         check_available("student", student.model)
+    regime = cfg.prompt_regime or regime
 
     from data.build import ensure_benchmark
     from models.distributed import end_ranks, main_first
@@ -81,9 +82,9 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     end_ranks()
     if rank() > 0:
         return {}
+    name = model.name + (f", prompt of {cfg.prompt_regime}" if cfg.prompt_regime else "")
     choices = [
-        Choices.from_answers(model.name, *variant, responses)
-        for variant, responses in answers.items()
+        Choices.from_answers(name, *variant, responses) for variant, responses in answers.items()
     ]
     asked = [(*variant, key) for variant, key in keys.items()]
     reasons = {

@@ -50,10 +50,31 @@ def test_every_experiment_runs_and_the_report_is_last(lines: list[str]) -> None:
     for regime in ("answer_only", "cot", "cot_no_candidate_analysis", "cot_no_match_layout"):
         assert f"train.sft +exp={regime} " in text
     for control in ("candidate_only", "shuffled_prefix", "matched_anchor"):
-        assert text.count(f"evaluation.select +exp={control} ") == 2
+        bases = 5 if "student=qwen3_vl_2b" in text else 1
+        assert text.count(f"evaluation.select +exp={control} ") == 2 + bases
+    assert text.count(" prompt_regime=cot_no_match_layout modes=[reasoning]") == 3
     for command in ("train.contrastive", "retrieve", "similarity", "two_stage"):
         assert command in text
     assert lines[-1] == "python -m evaluation.report"
+
+
+def test_the_papers_rows_are_measured(lines: list[str]) -> None:
+    """Table 2 has six scorers and five generative models, and Table 3 six embedders and three
+    two-stage rows."""
+    text = "\n".join(lines)
+    if "benchmark=dynapix " not in text:
+        return
+    scorers = ("clip", "languagebind", "siglip2", "vlm2vec", "qwen3_vl_emb_2b", "qwen3_vl_emb_8b")
+    for scorer in scorers:
+        for command in ("similarity", "retrieve"):
+            line = f"python -m evaluation.{command} benchmark=dynapix retriever={scorer}"
+            assert lines.count(line) == 1
+    bases = ("2b", "8b", "8b_thinking")
+    for base in (*(f"qwen3_vl_{size}" for size in bases), "qwen3_5_27b", "qwen3_6_27b"):
+        assert f"evaluation.select benchmark=dynapix student={base} modes=" in text
+    assert "evaluation.two_stage benchmark=dynapix student=qwen3_vl_8b routes=[cot_text] " in text
+    predict = "student=qwen3_vl_2b routes=[predict_caption,predict_image] "
+    assert f"evaluation.two_stage benchmark=dynapix {predict}" in text
 
 
 def test_missing_releases_stop_the_target(tmp_path: Path) -> None:

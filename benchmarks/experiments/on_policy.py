@@ -9,6 +9,7 @@ The variants are
     relational CoT, 300 steps    the same, for about as much compute as the next two
     distillation                 the student, trained further by `train.distill`, towards a teacher
     rewards                      the student, trained further by `train.reinforce`
+    rewarded claims              the same, where each claim gets its own reward
 
 The runs of the first two are those of `benchmarks.experiments.regimes`, whichever runs first. All
 seeds have the same teacher: the base, all of whose weights `train.sft` has trained with the facts
@@ -46,10 +47,11 @@ from benchmarks.experiments.experiment import (
 )
 from benchmarks.experiments.records import (
     HORIZONS,
-    Resampling,
+    bootstrap,
     count_claims,
     credit_matrix,
-    horizon_intervals,
+    format_cells,
+    horizon_accuracies,
 )
 from benchmarks.experiments.regimes import BOTH, EVALUATION, SHARED
 from benchmarks.experiments.regimes import VARIANTS as REGIMES
@@ -62,14 +64,14 @@ from data.versions import BUILDERS
 from models.fingerprints import settings_key, weights_digest
 from teacher.narrator import NARRATOR_VERSION
 from teacher.numbers.detection import find_numbers
+from teacher.predicates.vocabulary import VERSIONS
 from teacher.validation.reasons import PARTS
-from teacher.vocabulary import VERSIONS
 
 RECORD = Path(__file__).with_name("on_policy.parquet")
-STUDENT, LONGER, DISTILLATION, REWARDS = (
-    "relational CoT", "relational CoT, 300 steps", "distillation", "rewards"
+STUDENT, LONGER, DISTILLATION, REWARDS, CLAIMS = (
+    "relational CoT", "relational CoT, 300 steps", "distillation", "rewards", "rewarded claims"
 )  # fmt: skip
-VARIANTS = (STUDENT, LONGER, DISTILLATION, REWARDS)
+VARIANTS = (STUDENT, LONGER, DISTILLATION, REWARDS, CLAIMS)
 TEACHER = "teacher with facts"
 SFT = {
     **{name: [*(REGIMES[name].training or ()), *SHARED] for name in (STUDENT, LONGER)},
@@ -81,7 +83,9 @@ SFT = {
 }  # fmt: skip
 """Overrides of `train.sft` by variant, and those of the teacher."""
 DISTILL = ["+exp=on_policy", "train.lr=1e-3", "train.max_steps=60", "train.evaluations=2"]
-REINFORCE = ["+exp=grpo", "train.lr=3e-4", "train.max_steps=20", "train.evaluations=2"]
+REWARDED = ["+exp=grpo", "train.lr=3e-4", "train.max_steps=20", "train.evaluations=2"]
+REINFORCE = {REWARDS: REWARDED, CLAIMS: [*REWARDED, "train.credit=claims"]}
+"""Overrides of `train.reinforce` by variant."""
 
 
 def main() -> None:
@@ -115,12 +119,13 @@ def settings_keys(benchmark: str) -> dict[str, str]:
         for name, sft in SFT.items()
     }
     distill = training_key("train.distill", DistillCommand, [*DISTILL, "model=none"], versions)
-    reinforce = training_key(
-        "train.reinforce", ReinforceCommand, [*REINFORCE, "model=none"], versions
-    )
+    reinforced = {
+        name: training_key("train.reinforce", ReinforceCommand, [*own, "model=none"], versions)
+        for name, own in REINFORCE.items()
+    }
     return keys | {
         DISTILLATION: settings_key([keys[STUDENT], keys[TEACHER], distill]),
-        REWARDS: settings_key([keys[STUDENT], reinforce]),
+        **{name: settings_key([keys[STUDENT], key]) for name, key in reinforced.items()},
     }
 
 
@@ -139,8 +144,9 @@ def train_variant(experiment: Experiment, variant: str, seed: int) -> list[Path]
     further = [
         f"model={student}", f"seed={seed}", f"store={args.store}", f"checkpoints={args.checkpoints}"
     ]  # fmt: skip
-    if variant == REWARDS:
-        return [student, experiment.train("train.reinforce", name, [*REINFORCE, *further])]
+    if variant in REINFORCE:
+        overrides = [*REINFORCE[variant], *further]
+        return [student, experiment.train("train.reinforce", name, overrides)]
     teacher = train_model(TEACHER, 0)
     overrides = [*DISTILL, f"teacher_model={teacher}", *further]
     return [student, teacher, experiment.train("train.distill", name, overrides)]
@@ -171,26 +177,23 @@ def print_accuracies(results: pd.DataFrame) -> None:
     differences between variants."""
     credits = {v: credit_matrix(results, v, "reasoning") for v in VARIANTS}
     credits = {variant: matrix for variant, matrix in credits.items() if matrix.shape[1]}
-    resampling = Resampling(next(iter(credits.values())).index)
+    resampling = bootstrap(next(iter(credits.values())))
     print_header("", *FAMILIES, "macro", *HORIZONS, "seeds", "CPU minutes")
     for variant, matrix in credits.items():
         rows = results[results.variant == variant]
-        intervals = [
-            *resampling.intervals((variant, matrix)),
-            *horizon_intervals(results, variant, "reasoning"),
-        ]
-        cells = [f"{m:.1f} [{low:.1f}, {high:.1f}]" for m, low, high in intervals]
+        cells = format_cells(resampling.accuracies(variant, matrix.to_numpy()))
+        cells += format_cells(horizon_accuracies(results, variant, "reasoning"), HORIZONS)
         minutes = rows.groupby("seed").cpu_minutes.first().astype(float).mean()
         print_row(variant, *cells, matrix.shape[1], "-" if pd.isna(minutes) else f"{minutes:.0f}")
     print_header("difference", *FAMILIES, "macro")
-    for variant in (DISTILLATION, REWARDS):
+    for variant in (DISTILLATION, REWARDS, CLAIMS):
         for other in (LONGER, STUDENT):
             if {variant, other} <= {*credits}:
                 first, second = credits[variant].align(credits[other], join="inner", axis=1)
                 # Variants with one name share the resampled seeds.
                 name = other if other == STUDENT else variant
-                intervals = resampling.intervals((name, first), (other, second))
-                cells = (f"{m:+.1f} [{low:+.1f}, {high:+.1f}]" for m, low, high in intervals)
+                pair = (name, first.to_numpy()), (other, second.to_numpy())
+                cells = format_cells(resampling.differences(*pair), sign="+")
                 print_row(f"{variant} minus {other}", *cells)
 
 

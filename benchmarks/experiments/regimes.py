@@ -1,6 +1,6 @@
 """Compares ways to train a student at tiny scale, on more than a thousand test items: zero-shot,
 answers alone, rationales in the paper's vocabulary and in relational words, and the latter without
-the candidate analysis or without the match layout.
+the candidate analysis, without the match layout, or with facts that are not the simulator's.
 
     python -m benchmarks.experiments.regimes            # train and evaluate what is missing
     python -m benchmarks.experiments.regimes --table    # print the recorded results
@@ -32,10 +32,12 @@ from benchmarks.experiments.experiment import (
 )
 from benchmarks.experiments.records import (
     HORIZONS,
-    Resampling,
+    bootstrap,
     count_claims,
     credit_matrix,
-    horizon_intervals,
+    format_cells,
+    format_percent,
+    horizon_accuracies,
 )
 from conf.compose import compose
 from conf.failures import report_failures
@@ -45,10 +47,11 @@ from data.records import FAMILIES
 from data.store import Store
 from data.versions import BUILDERS
 from evaluation.metrics.baselines import baseline_results
+from evaluation.metrics.seeds import MACRO, SeedBootstrap
 from models.fingerprints import weights_digest
 from teacher.narrator import NARRATOR_VERSION
+from teacher.predicates.vocabulary import VERSIONS
 from teacher.validation.reasons import PARTS
-from teacher.vocabulary import VERSIONS
 
 RECORD = Path(__file__).with_name("letters.parquet")
 BOTH = ("reasoning", "answer")
@@ -64,6 +67,10 @@ ANSWER_STEPS = "train.max_steps=600"
 LONG_STEPS = "train.max_steps=300"
 """Number of steps on rationales that take about as long as `ANSWER_STEPS`."""
 ZERO_SHOT = "zero-shot"
+EXTRAPOLATED, SHUFFLED = "relational CoT, extrapolated facts", "relational CoT, shuffled facts"
+"""Students of ungrounded rationales (`teacher.grounding`)."""
+WEIGHED = "relational CoT, samples weighed"
+"""The student whose loss is a mean over samples instead of tokens."""
 UNCHANGED = "none"
 CONTROLS = ("candidate_only", "shuffled_prefix", MATCHED_ANCHOR)
 """Overlays of `evaluation.select`: without the prefix, with its frames shuffled, and on pairs of
@@ -95,8 +102,12 @@ VARIANTS = {
         ("+exp=cot_no_candidate_analysis", STEPS, RELATIONAL)
     ),
     "relational CoT without match layout": Variant(("+exp=cot_no_match_layout", STEPS, RELATIONAL)),
+    EXTRAPOLATED: Variant(("+exp=cot", STEPS, RELATIONAL, "teacher.grounding=extrapolated")),
+    SHUFFLED: Variant(("+exp=cot", STEPS, RELATIONAL, "teacher.grounding=shuffled")),
+    WEIGHED: Variant(("+exp=cot", STEPS, RELATIONAL, "train.weighting=sample")),
 }
 MAIN = ("relational CoT", "reasoning")
+"""A variant and a mode."""
 PAIRS = (
     (MAIN, ("answers alone", "answer")),
     (("relational CoT, 300 steps", "reasoning"), ("answers alone", "answer")),
@@ -108,6 +119,11 @@ PAIRS = (
     (MAIN, (ZERO_SHOT, "reasoning")),
     (("CoT", "reasoning"), ("answers alone", "answer")),
     (("relational CoT", "answer"), ("answers alone", "answer")),
+    (MAIN, (EXTRAPOLATED, "reasoning")),
+    (MAIN, (SHUFFLED, "reasoning")),
+    ((EXTRAPOLATED, "reasoning"), ("answers alone", "answer")),
+    ((WEIGHED, "reasoning"), MAIN),
+    ((WEIGHED, "answer"), ("relational CoT", "answer")),
 )
 """The variants and modes that the second table compares: first minus second."""
 
@@ -186,7 +202,7 @@ def print_tables(table: pd.DataFrame, store: Store) -> None:
     groups = [(name, mode) for name, v in VARIANTS.items() for mode in v.modes]
     correct = {g: credit_matrix(unchanged, *g) for g in groups}
     correct = {group: credits for group, credits in correct.items() if credits.shape[1]}
-    resampling = Resampling(next(iter(correct.values())).index)
+    resampling = bootstrap(next(iter(correct.values())))
     print_accuracies(unchanged, correct, resampling)
     print_baselines(store)
     print_differences(correct, resampling)
@@ -195,19 +211,16 @@ def print_tables(table: pd.DataFrame, store: Store) -> None:
 
 
 def print_accuracies(
-    table: pd.DataFrame, correct: dict[tuple[str, str], pd.DataFrame], resampling: Resampling
+    table: pd.DataFrame, correct: dict[tuple[str, str], pd.DataFrame], resampling: SeedBootstrap
 ) -> None:
     horizons = [f"time, {horizon}" for horizon in HORIZONS]
     print_header("", "mode", *FAMILIES, "macro", *horizons, "by seed", "parsed")
     for (name, mode), credits in correct.items():
         rows = table[(table.variant == name) & (table["mode"] == mode)]
-        seeds = [100 * resampling.means(credits[[seed]])[-1] for seed in credits]
-        intervals = [
-            *resampling.intervals((name, credits)),
-            *horizon_intervals(table, name, mode),
-        ]
-        cells = [f"{m:.1f} [{low:.1f}, {high:.1f}]" for m, low, high in intervals]
-        by_seed = " ".join(f"{s:.1f}" for s in seeds)
+        cells = format_cells(resampling.accuracies(name, credits.to_numpy()))
+        cells += format_cells(horizon_accuracies(table, name, mode), HORIZONS)
+        macros = [credits[seed].groupby("family").mean().mean() for seed in credits]
+        by_seed = " ".join(f"{100 * macro:.1f}" for macro in macros)
         print_row(name, mode, *cells, by_seed, f"{100 * rows.letter.notna().mean():.1f}")
 
 
@@ -217,19 +230,19 @@ def print_baselines(store: Store) -> None:
         print_row(row.name, *(f"{100 * row.metrics[name]:.1f}" for name in (*FAMILIES, "macro")))
 
 
-def print_differences(correct: dict[tuple[str, str], pd.DataFrame], resampling: Resampling) -> None:
+def print_differences(
+    correct: dict[tuple[str, str], pd.DataFrame], resampling: SeedBootstrap
+) -> None:
     print_header("difference", *FAMILIES, "macro")
     for first, second in PAIRS:
         if first in correct and second in correct:
-            intervals = resampling.intervals(
-                (first[0], correct[first]), (second[0], correct[second])
-            )
+            pair = [(group[0], correct[group].to_numpy()) for group in (first, second)]
             title = f"{', '.join(first)} minus {', '.join(second)}"
-            print_row(title, *(f"{m:+.1f} [{low:+.1f}, {high:+.1f}]" for m, low, high in intervals))
+            print_row(title, *format_cells(resampling.differences(*pair), sign="+"))
 
 
 def print_controls(
-    table: pd.DataFrame, correct: dict[tuple[str, str], pd.DataFrame], resampling: Resampling
+    table: pd.DataFrame, correct: dict[tuple[str, str], pd.DataFrame], resampling: SeedBootstrap
 ) -> None:
     """Print the macro accuracy of the first seed under the controls and its difference from the
     unchanged items, and the accuracies on matched-anchor pairs by what names the moment."""
@@ -239,12 +252,13 @@ def print_controls(
         if not VARIANTS[name].controls or 0 not in credits:
             continue
         first = credits[[0]]
-        cells = [f"{100 * resampling.means(first)[-1]:.1f}"]
+        cells = [f"{100 * resampling.accuracies(name, first.to_numpy())[MACRO].value:.1f}"]
         for control in controls:
             changed = credit_matrix(table[table.control == control], name, mode)
-            m, low, high = resampling.intervals((name, changed), (name, first))[-1]
-            mean = 100 * resampling.means(changed)[-1]
-            cells.append(f"{mean:.1f} ({m:+.1f} [{low:+.1f}, {high:+.1f}])")
+            pair = [(name, credits.to_numpy()) for credits in (changed, first)]
+            difference = format_percent(resampling.differences(*pair)[MACRO], "+")
+            mean = resampling.accuracies(*pair[0])[MACRO].value
+            cells.append(f"{100 * mean:.1f} ({difference})")
         pairs = credit_matrix(table[table.control == MATCHED_ANCHOR], name, mode)
         by_family = pairs.groupby("family").mean().mean(axis=1)
         cells += [f"{100 * by_family[family]:.1f}" for family in ("event", "time")]

@@ -20,7 +20,7 @@ from conf.schema.settings import (
     path,
     setting,
 )
-from conf.schema.training import ContrastiveTrainConfig, SftTrainConfig
+from conf.schema.training import RATIONALE_REGIMES, ContrastiveTrainConfig, SftTrainConfig
 
 RESPONSE_MODES = ("reasoning", "answer", "record", "constrained")
 ROUTES = ("cot_text", "predict_caption", "predict_image")
@@ -72,6 +72,9 @@ class SelectCommand(GenerationCommand, ItemsCommand):
     control: str | None = setting(None, ("candidate_only", "shuffled_prefix", None))
     """Control condition to measure besides the unchanged items: candidate_only leaves out the
     prefix, shuffled_prefix shuffles its frames. null measures only the unchanged items."""
+    prompt_regime: str | None = setting(None, (*RATIONALE_REGIMES, None))
+    """Regime whose instruction ends the prompts in reasoning mode; null takes that of the student's
+    training. With cot_no_match_layout, a student of cot is asked for no lines per candidate."""
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)

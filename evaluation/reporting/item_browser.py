@@ -28,7 +28,12 @@ from evaluation.metrics.reasons import item_predicates, read_reasons
 from evaluation.metrics.results import SelectionResult
 from evaluation.metrics.selection import accuracy_by_horizon
 from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting.measurements import Measurement, compare_models
+from evaluation.reporting.measurements import (
+    Measurement,
+    SeededResult,
+    combine_seeds,
+    compare_models,
+)
 from evaluation.reporting.run_responses import ItemResponse, Responses
 from teacher.cited_rationales import list_facts
 from teacher.reading.claims import Claim
@@ -52,6 +57,8 @@ class ItemBrowser:
         frames: Data URLs of the items' frames, by name.
         notes: Sentences that say which items and frames are shown and which are missing.
         comparisons: Paired comparisons of models, by `Measurement.group`.
+        seeds: Trainings with several seeds, and differences between them (see `combine_seeds`), by
+            `Measurement.group`.
         baselines: Results of the baselines on the same items, by `Measurement.group`.
         observers: Curves of the observers on the same items, by `Measurement.item_set`; empty for
             items that no observer has seen.
@@ -65,6 +72,9 @@ class ItemBrowser:
     frames: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     comparisons: dict[str, list[PairedComparison]] = field(default_factory=dict)
+    seeds: dict[str, tuple[list[SeededResult], dict[str, dict[str, Interval]]]] = field(
+        default_factory=dict
+    )
     baselines: dict[str, list[SelectionResult]] = field(default_factory=dict)
     observers: dict[str, dict[str, ObserverCurve]] = field(default_factory=dict)
     observer_horizons: dict[str, dict[str, dict[str, Interval]]] = field(default_factory=dict)
@@ -91,6 +101,7 @@ class ItemBrowser:
         # The comparisons with controls are in the reports of the runs that measured them.
         unchanged = {label: m for label, m in models.items() if not m.variants}
         self.comparisons[name] = compare_models(unchanged, items, seed)
+        self.seeds[name] = combine_seeds(unchanged, items)
         answered = [i for k, i in items.items() if any(k in r for r in by_label.values())]
         standard = [item for item in answered if item.suite == store.suite]
         if standard:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,9 +12,13 @@ from itertools import permutations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from conf.schema.benchmark import store_name
+from data.checks.intervals import Interval
 from data.records import SelectionItem
 from evaluation.metrics.results import SCENE_ALONE, UNTRAINED, RetrievalResult, SelectionResult
+from evaluation.metrics.seeds import MACRO, SeedBootstrap
 from evaluation.metrics.significance import PairedComparison, compare_runs
 from evaluation.reporting.run_responses import Responses
 from evaluation.reporting.runs import FinishedRun
@@ -81,7 +87,9 @@ class Measurement:
 
     @property
     def regime(self) -> str | None:
-        return (self.training or {}).get("train", {}).get("regime")
+        """The regime of a student's training, or that of the prompts if it is another."""
+        trained = (self.training or {}).get("train", {}).get("regime")
+        return trained and (self.run.config.get("prompt_regime") or trained)
 
     @property
     def training_benchmark(self) -> str | None:
@@ -251,6 +259,81 @@ def compare_models(
         if answered:
             comparisons += compare_runs(answered, *credits, pair, seed)
     return comparisons
+
+
+@dataclass(frozen=True)
+class SeededResult:
+    """The results of trainings that differ only in their seed, on the same items.
+
+    Attributes:
+        name: Name of the first run, without its seed, and the mode of the evaluation.
+        accuracies: By family and macro, with intervals over scenes and seeds.
+        macros: Macro accuracy by seed.
+    """
+
+    name: str
+    accuracies: dict[str, Interval]
+    macros: dict[int, float]
+
+
+def combine_seeds(
+    models: Mapping[str, Measurement], items: Mapping[str, SelectionItem]
+) -> tuple[list[SeededResult], dict[str, dict[str, Interval]]]:
+    """Return the accuracies of trainings with several seeds, and the differences between the pairs
+    of them that the paper compares, by a name.
+
+    Args:
+        models: The models that were measured on the same items, by label.
+        items: The benchmark's items by id.
+    """
+    groups: dict[str, dict[int, Measurement]] = {}
+    for m in models.values():
+        if m.seed is not None:
+            groups.setdefault(_without_seed(m), {})[m.seed] = m
+    results, differences = [], {}
+    found: dict[str, tuple[dict[int, Measurement], np.ndarray, list[str]]] = {}
+    for group in groups.values():
+        first = next(iter(group.values()))
+        ids = [item_id for item_id in items if item_id in first.responses]
+        if len(group) < 2 or any({*ids} != m.responses.keys() for m in group.values()):
+            continue
+        name = f"{_name_without_seed(first)} ({first.result.mode})"
+        rows = [[m.responses[k].credit(items[k].letter) for m in group.values()] for k in ids]
+        credits = np.array(rows, float)
+        bootstrap = _bootstrap(ids, items)
+        macros = {
+            seed: bootstrap.accuracies(name, credits[:, [k]])[MACRO].value
+            for k, seed in enumerate(group)
+        }
+        results.append(SeededResult(name, bootstrap.accuracies(name, credits), macros))
+        found[name] = group, credits, ids
+    for first, second in permutations(found, 2):
+        (group, one, ids), (other_group, other, other_ids) = found[first], found[second]
+        shared = group.keys() & other_group.keys()
+        if ids == other_ids and any(
+            _is_paper_comparison(group[seed], other_group[seed]) for seed in shared
+        ):
+            pair = (first, one), (second, other)
+            differences[f"{first} minus {second}"] = _bootstrap(ids, items).differences(*pair)
+    return results, differences
+
+
+def _bootstrap(ids: Sequence[str], items: Mapping[str, SelectionItem]) -> SeedBootstrap:
+    return SeedBootstrap([items[k].family for k in ids], [items[k].scene_id for k in ids])
+
+
+def _without_seed(m: Measurement) -> str:
+    """Return the settings of a training and the mode of its evaluation, without the seed. A run
+    that another one continues has the seed in its name."""
+    names = ("seed", "run", "workers", "store", "checkpoints")
+    settings = {name: value for name, value in m.training.items() if name not in names}
+    if "model" in settings:
+        settings["model"] = re.sub(rf"(?<!\d){m.seed}(?!\d)", "", str(settings["model"]))
+    return json.dumps([m.result.mode, settings], sort_keys=True, default=str)
+
+
+def _name_without_seed(m: Measurement) -> str:
+    return re.sub(rf"[\W_]*(seed[\W_]*)?{m.seed}$", "", m.name) or m.name
 
 
 def _is_paper_comparison(m: Measurement, other: Measurement) -> bool:

@@ -172,14 +172,17 @@ def build_transfer(selections: Results, transfers: Container[str], browser: Item
 
 
 def _model_differences(group: str, browser: ItemBrowser) -> list[Table]:
-    """Return the differences between models over all items and, in a folded table, by family."""
+    """Return the accuracies of trainings with several seeds, and the differences between models
+    over all items and, in a folded table, by family."""
+    seeded = summary_tables.seed_tables(*browser.seeds.get(group, ([], {})), group)
     comparisons = browser.comparisons.get(group)
     if not comparisons:
-        return []
+        return seeded
     overall = tables.paired_table(p for p in comparisons if p.of == "all")
     by_family = tables.paired_table(comparisons)
     caption = f"{by_family.caption} by family"
     return [
+        *seeded,
         _name_table(replace(overall, name="differences"), group),
         _name_table(replace(by_family, caption=caption, folded=True), group),
     ]

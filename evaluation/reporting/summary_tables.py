@@ -8,10 +8,17 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
+from data.checks.intervals import Interval
 from data.checks.observer import SIMULATES
 from data.checks.observer_curve import ObserverCurve
 from evaluation.metrics.results import SIMILARITY, RetrievalResult, SelectionResult
-from evaluation.reporting.measurements import TRANSFER_SUITES, Measurement, shared_names
+from evaluation.metrics.seeds import MACRO
+from evaluation.reporting.measurements import (
+    TRANSFER_SUITES,
+    Measurement,
+    SeededResult,
+    shared_names,
+)
 from evaluation.reporting.reference import table_with_paper
 from evaluation.reporting.table import Row, Table, file_stem
 from evaluation.reporting.tables import (
@@ -97,6 +104,39 @@ def _group(m: Measurement) -> str:
     if m.trained:
         return "trained"
     return "similarity scorers" if m.result.mode == SIMILARITY else "generative models"
+
+
+def seed_tables(
+    results: Sequence[SeededResult], differences: Mapping[str, Mapping[str, Interval]], group: str
+) -> list[Table]:
+    """Return the table of trainings with several seeds, and that of the differences between them;
+    neither without such trainings."""
+    columns = [*FAMILY_COLUMNS, "Macro"]
+    note = "95% intervals are bootstrapped over scenes and seeds."
+
+    def cells(found: Mapping[str, Interval]) -> dict[str, Interval]:
+        return {name.capitalize(): interval for name, interval in found.items()}
+
+    rows = [
+        {
+            "name": r.name, **cells(r.accuracies), "Items": r.accuracies[MACRO].n,
+            "By seed": " ".join(f"{100 * r.macros[seed]:.1f}" for seed in sorted(r.macros)),
+        }
+        for r in results
+    ]  # fmt: skip
+    compared = [{"name": name, **cells(found)} for name, found in differences.items()]
+    tables = [
+        Table(
+            file_stem(f"seeds-{group}"), f"Trainings with several seeds: accuracy (%), on {group}",
+            [*columns, "By seed", "Items"], {"": rows}, (f"{note} By seed: macro.",),
+        ),
+        Table(
+            file_stem(f"seed-differences-{group}"),
+            f"Differences between trainings with several seeds (%), on {group}",
+            columns, {"": compared}, (note,), signed=True,
+        ),
+    ]  # fmt: skip
+    return [table for table in tables if table.groups[""]]
 
 
 def overall_table(

@@ -67,12 +67,12 @@ def finish(
     (folder / "run.json").write_text(json.dumps(started))
 
 
-def trained_student(root: Path, benchmark, name: str, regime: str) -> None:
+def trained_student(root: Path, benchmark, name: str, regime: str, seed: int = 0) -> None:
     """Write a run of train.sft, without its weights."""
     folder = root / "sft" / name
-    train = SftTrainConfig(regime=regime)
+    train, teacher = SftTrainConfig(regime=regime), TeacherConfig(name="template")
     settings = SftCommand(
-        benchmark=benchmark, teacher=TeacherConfig(name="template"), student=STUDENT, train=train
+        benchmark=benchmark, teacher=teacher, student=STUDENT, train=train, seed=seed, run=name
     )
     finish(folder, settings, None, {"answer_loss_at_start": 2.0, "answer_loss": 1.0})
     journal = [{"step": k, "loss": 2 - k / 9, "eval_answer_loss": 2 - k / 8} for k in range(5)]

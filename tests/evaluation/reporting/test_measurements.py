@@ -7,10 +7,13 @@ import shutil
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from conf.schema import ExportStudyCommand
-from data.records import FAMILIES
+from data.records import FAMILIES, SelectionItem
+from data.store import Store
+from tests.evaluation.reporting import measured
 from tests.evaluation.reporting.measured import finish, read_table, retrieve_run, run_report
 from tests.evaluation.study.test_agreement import summarize, vote
 
@@ -37,6 +40,38 @@ def test_results_of_a_model_on_two_benchmarks_share_a_row(runs):
         [row] = [row for row in table.splitlines() if row.startswith(f"| {line} |")]
         assert "100.0" in row.split("|")[2]
         assert "cot, cot" in table
+
+
+def test_trainings_with_several_seeds_are_compared(runs, micro, micro_store, report):
+    right, wrong = measured.right, measured.always_a
+    for name, regime, respond in (("ours", "cot", right), ("plain", "answer_only", wrong)):
+        for seed in range(3):
+            run = f"{name}-{seed}"
+            measured.trained_student(runs, micro, run, regime, seed)
+            measured.select_run(runs, micro_store, micro, run, respond, model=run)
+    folder = report(items=1)
+    table = read_table(folder, "seeds-micro")
+    share = 100 * np.mean(
+        [np.mean([i.letter == "A" for i in items]) for items in by_family(micro_store).values()]
+    )
+    [ours] = [row for row in table.splitlines() if row.startswith("| ours (answer) |")]
+    [plain] = [row for row in table.splitlines() if row.startswith("| plain (answer) |")]
+    assert ours.split("|")[5].strip() == "100.0"
+    assert plain.split("|")[5].strip() == f"{share:.1f}"
+    assert plain.split("|")[6].strip() == " ".join([f"{share:.1f}"] * 3)
+    # Runs of one seed have no row, and neither has the student whose items differ.
+    assert "cot (reasoning)" not in table
+    differences = read_table(folder, "seed-differences-micro")
+    [row] = [line for line in differences.splitlines() if " minus " in line]
+    assert row.startswith("| ours (answer) minus plain (answer) |")
+    assert row.split("|")[5].strip() == f"{100 - share:+.1f}"
+
+
+def by_family(store: Store) -> dict[str, list[SelectionItem]]:
+    found: dict[str, list[SelectionItem]] = {}
+    for item in store.selection("test"):
+        found.setdefault(item.family, []).append(item)
+    return found
 
 
 def test_an_untrained_base_that_two_runs_measured_has_one_row(runs, micro, micro_store, report):
