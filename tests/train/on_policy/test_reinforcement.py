@@ -231,6 +231,53 @@ def test_the_gradient_is_that_of_truncated_weights(
     assert step["mismatch_capped"] == pytest.approx(truncated)
 
 
+def test_the_tokens_of_claims_get_their_own_advantages(
+    settings, tmp_path, monkeypatch, short_rewards
+) -> None:
+    """In a step of eight responses, of which every third token has a credit of each sign."""
+    credits: list[torch.Tensor] = []
+    checked = 0
+
+    def credit(response, ids, tokenizer) -> torch.Tensor:
+        credits.append(torch.zeros(len(ids)))
+        credits[-1][::3], credits[-1][1::3] = 0.5, -0.1
+        return credits[-1]
+
+    monkeypatch.setattr(reinforcement, "credit_tokens", credit)
+    compute = reinforcement.MediaGRPOTrainer._compute_loss
+
+    def compared(self, model, inputs):
+        nonlocal checked
+        loss = compute(self, model, inputs)
+        found = torch.cat(credits[-8:])
+        found = found[found != 0]
+        mask, advantages = inputs["completion_mask"].bool(), inputs["advantages"]
+        columns = torch.arange(mask.shape[1])
+        for row, kept in zip(advantages, mask, strict=True):
+            # Tokens without a credit have the advantage of their response.
+            own = row[2]
+            for start, value in ((0, 0.5), (1, -0.1)):
+                part = (value - found.mean()) / found.std(correction=0)
+                expected = own + settings.train.rewards.truth * part
+                tokens = row[kept & (columns % 3 == start)]
+                torch.testing.assert_close(tokens, expected.expand_as(tokens), rtol=1e-3, atol=1e-4)
+                checked += len(tokens)
+            torch.testing.assert_close(row[2::3], own.expand_as(row[2::3]))
+        return loss
+
+    monkeypatch.setattr(reinforcement.MediaGRPOTrainer, "_compute_loss", compared)
+    train = replace(settings.train, max_steps=1, evaluations=1, credit="claims")
+    folder = run_reinforce(replace(settings, train=train), tmp_path / "run")
+    (step,) = (r for r in read_journal(folder) if "loss" in r)
+    assert checked > 20
+    assert step["grad_norm"] > 0
+    assert "rewards/truth/mean" in step
+    # The weighted sum leaves it out.
+    parts = asdict(settings.train.rewards).items()
+    total = sum(w * step[f"rewards/{name}/mean"] for name, w in parts if w and name != "truth")
+    assert step["reward"] == pytest.approx(total, rel=1e-4)
+
+
 def test_equal_weights_scale_the_gradient(settings, tmp_path, monkeypatch, short_rewards) -> None:
     steps = []
     for shift, cap in ((0, None), (-math.log(4), 2.0), (math.log(4), 2.0)):
