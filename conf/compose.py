@@ -184,14 +184,20 @@ def validate_settings(cfg: DictConfig, schema: type) -> Any:
 def open_hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
     """Initialise Hydra for a command; in the block, its errors become a SettingsError."""
     register(command, schema)
-    with initialize_config_module("conf", job_name=config_name(command), version_base="1.3"):
-        try:
-            yield GlobalHydra.instance().config_loader()
-        except (HydraException, OmegaConfBaseException) as error:
-            raise _settings_error(command, error) from error
-        except yaml.YAMLError as error:
-            problem = " ".join(str(error).split())
-            raise SettingsError(f"a file of settings is no valid YAML: {problem}") from error
+    # A running command composes the settings of further benchmarks.
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_module("conf", job_name=config_name(command), version_base="1.3"):
+            try:
+                yield GlobalHydra.instance().config_loader()
+            except (HydraException, OmegaConfBaseException) as error:
+                raise _settings_error(command, error) from error
+            except yaml.YAMLError as error:
+                problem = " ".join(str(error).split())
+                raise SettingsError(f"a file of settings is no valid YAML: {problem}") from error
+    finally:
+        GlobalHydra.instance().hydra = running
 
 
 def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.RUN) -> DictConfig:

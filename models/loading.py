@@ -312,12 +312,14 @@ def check_safetensors(folder: Path) -> None:
 
 
 def load_trained(
-    cfg: StudentConfig, precision: str, folder: Path
+    cfg: StudentConfig, precision: str, folder: Path, merge: bool = True
 ) -> tuple[nn.Module, ProcessorMixin]:
     """Load a trained student for inference: adapters and their base, or a whole model.
 
-    In fp32, adapters are merged into an unquantised base. A merged export keeps the precision of
-    its weights instead of `precision`.
+    A merged export keeps the precision of its weights instead of `precision`.
+
+    Args:
+        merge: In fp32, merge adapters into an unquantised base.
 
     Raises:
         UserError: `folder` contains no student, or adapters of another base or rank; or it is
@@ -331,7 +333,7 @@ def load_trained(
         with explain_damage(folder):
             check_adapters(folder, base, cfg.lora.rank, cfg.model)
             model = peft.PeftModel.from_pretrained(base, folder)
-        if precision == "fp32" and cfg.quantization == "none":
+        if merge and precision == "fp32" and cfg.quantization == "none":
             # A forward pass takes 0.87 times as long. In bf16, the sum of the weights is rounded.
             model = model.merge_and_unload()
         return for_inference(model), processor

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from importlib.resources import files
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any
@@ -68,19 +68,17 @@ def main(cfg: ClaimsCommand, run: Run) -> dict[str, float]:
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     described = describe_test_items(store)
-    runs = find_runs(Path(cfg.checkpoints) / "select", cfg.runs, store)
+    responses = gather_responses(Path(cfg.checkpoints) / "select", cfg.runs, store, described)
     texts = [
-        judge_text(*described[item_id], folder.name, text)
-        for folder in runs
-        for item_id, text in read_responses(folder, store.identity)
-        if item_id in described
+        judge_text(*described[i], source, text) for (_, i), (source, text) in responses.items()
     ]
     judged = sum(len(text.claims) for text in texts)
     with tqdm(total=max(cfg.claims, judged), initial=judged, unit="claim", mininterval=1.0) as bar:
         for text in narrate_with_false_words(described, cfg.seed):
-            if bar.n >= cfg.claims:
+            if judged >= cfg.claims:
                 break
             texts.append(text)
+            judged += len(text.claims)
             bar.update(len(text.claims))
 
     rows = [row for number, text in enumerate(texts) for row in claim_rows(number, text)]
@@ -97,35 +95,54 @@ def main(cfg: ClaimsCommand, run: Run) -> dict[str, float]:
 def describe_test_items(
     store: Store,
 ) -> dict[str, tuple[SelectionItem, RelationalPredicates]]:
-    """Return the test items that have predicates, with them, by item id."""
-    items = ((item, describe_item(item, store, RELATIONAL)) for item in store.selection("test"))
-    return {item.item_id: (item, found) for item, found in items if found is not None}
-
-
-def find_runs(root: Path, names: Sequence[str], store: Store) -> list[Path]:
-    """Return the folders of the evaluations of students on a benchmark whose names match.
+    """Return the test items that have predicates, with them, by item id.
 
     Raises:
-        UserError: A name matches no run, or only runs on other items.
+        UserError: There are none.
     """
-    found = {name: [f for f in sorted(root.glob("*")) if fnmatch(f.name, name)] for name in names}
-    chosen = {
-        name: [f for f in folders if any(read_responses(f, store.identity))]
-        for name, folders in found.items()
-    }
-    for name, folders in chosen.items():
-        if not folders:
+    items = ((item, describe_item(item, store, RELATIONAL)) for item in store.selection("test"))
+    described = {item.item_id: (item, found) for item, found in items if found is not None}
+    if not described:
+        raise UserError(
+            f"{store.name} has no test items with predicates: choose another benchmark",
+            code="no-items",
+        )
+    return described
+
+
+def gather_responses(
+    root: Path, names: Sequence[str], store: Store, described: Collection[str]
+) -> dict[tuple[str, str], tuple[str, str]]:
+    """Return the responses of students to described items: by the key of the model and its
+    settings and the id of the item, the name of the run and the text. An evaluation under a control
+    has the responses to unchanged items too, which count once.
+
+    Args:
+        names: Names of evaluations below `root`, with `*` for any text.
+
+    Raises:
+        UserError: A name matches no run with such responses.
+    """
+    found: dict[tuple[str, str], tuple[str, str]] = {}
+    for name in names:
+        matched = False
+        for folder in (f for f in sorted(root.glob("*")) if fnmatch(f.name, name)):
+            for key, item_id, text in read_responses(folder, store.identity):
+                if item_id in described:
+                    matched = True
+                    found.setdefault((key, item_id), (folder.name, text))
+        if not matched:
             raise UserError(
                 f"runs: {name} matches no run below {root} with responses in reasoning mode to "
-                f"{store.name}: evaluate a student with python -m evaluation.select, or leave it "
-                "out",
+                f"test items of {store.name}: evaluate a student with python -m evaluation.select, "
+                "or leave it out",
                 code="no-runs",
             )
-    return list(dict.fromkeys(chain.from_iterable(chosen.values())))
+    return found
 
 
-def read_responses(folder: Path, benchmark: str) -> Iterator[tuple[str, str]]:
-    """Yield the item ids and the texts of a run's responses in reasoning mode to unchanged items.
+def read_responses(folder: Path, benchmark: str) -> Iterator[tuple[str, str, str]]:
+    """Yield the keys, item ids and texts of a run's responses in reasoning mode to unchanged items.
 
     Args:
         benchmark: Identity of the benchmark of the items.
@@ -135,7 +152,7 @@ def read_responses(folder: Path, benchmark: str) -> Iterator[tuple[str, str]]:
         asked = row.get("asked")
         if asked is None:
             if row.get("key") in keys:
-                yield row["item_id"], row["text"]
+                yield row["key"], row["item_id"], row["text"]
         elif (row["mode"], asked["control"], asked["benchmark"]) == ("reasoning", None, benchmark):
             keys.add(row["key"])
 

@@ -180,7 +180,9 @@ def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) ->
                     if last.accepted:
                         attempt = cfg.attempts + last.attempt
                         record([grader.mark_fallback(last, attempt)])
-        save_accepted(select_accepted(every, responses), store.folder / RATIONALES)
+        # Readers of this table expect true facts.
+        if cfg.grounding == "oracle":
+            save_accepted(select_accepted(every, responses), store.folder / RATIONALES)
     if unanswered:
         name, reason = next(iter(unanswered.items()))
         log.warning(
@@ -267,7 +269,7 @@ def _write_rationales(
     """Write rationales of an item with the built-in narrator, from attempt `first` until one is
     accepted or no attempt is left. An item whose prefix is too short gets none."""
     predicates = describe_item(item, store, grader.cfg)
-    facts = grounding.describe(item)
+    facts = grounding.describe(item, predicates)
     if predicates is None or facts is None:
         return []
     vocabulary = choose_vocabulary(facts, grader.cfg)

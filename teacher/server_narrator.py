@@ -49,7 +49,8 @@ async def request_rationales(
 
     async def narrate(job: Job) -> None:
         item, attempt = job
-        predicates, facts = describe_item(item, store, cfg), grounding.describe(item)
+        predicates = describe_item(item, store, cfg)
+        facts = grounding.describe(item, predicates)
         # There are no predicates if the prefix is too short.
         while predicates and facts and attempt < cfg.attempts:
             # Most first responses are accepted, so several are requested only after a rejection.

@@ -86,9 +86,9 @@ class Student:
     def __init__(self, folder: Path, store: Store) -> None:
         self._settings = read_trained_settings(folder, SftCommand, "student")
         student = self._settings.student
-        precision = resolve_precision(self._settings.train.precision)
+        self._precision = resolve_precision(self._settings.train.precision)
         weights = product_folder(folder, "student")
-        self._model, processor = loading.load_trained(student, precision, weights)
+        self._model, processor = loading.load_trained(student, self._precision, weights)
         self._collate = Collator(processor, student.max_length)
         self._tokenizer = processor.tokenizer
         self._frames = FrameReader(store, student.image_size)
@@ -99,10 +99,12 @@ class Student:
     ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
         """Yield, for each text, where its tokens start and stop, and their log-probabilities."""
         samples = [self._sample(self._items[row.item_id], row.text) for row in rows]
-        batch = self._collate(samples)
-        labels = batch.pop("labels")[:, 1:]
-        with torch.no_grad():
-            logits = self._model(**batch, use_cache=False).logits[:, :-1].float()
+        device = next(self._model.parameters()).device
+        batch = {name: value.to(device) for name, value in self._collate(samples).items()}
+        labels = batch.pop("labels")[:, 1:].cpu()
+        autocast = torch.autocast(device.type, torch.bfloat16, enabled=self._precision == "bf16")
+        with torch.no_grad(), autocast:
+            logits = self._model(**batch, use_cache=False).logits[:, :-1].float().cpu()
         logs = torch.log_softmax(logits, dim=-1)
         logs = logs.gather(-1, labels.clamp(min=0)[..., None])[..., 0]
         for row, kept, own, values in zip(rows, labels != IGNORED, labels, logs, strict=True):

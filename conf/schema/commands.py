@@ -94,6 +94,9 @@ class ExportCommand(CommandConfig):
     def find_problems(self, group: str) -> Iterator[str]:
         if not self.folder:
             yield f"{group}folder= is empty: name a folder, such as folder=exports/tiny"
+        names = [self.benchmark.name, *self.also]
+        for name in sorted({name for name in names if names.count(name) > 1}):
+            yield f"{group}also: {name} is named twice; leave it out"
 
 
 @dataclass

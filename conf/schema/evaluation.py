@@ -78,6 +78,11 @@ class SelectCommand(GenerationCommand, ItemsCommand):
 
     def find_problems(self, group: str) -> Iterator[str]:
         yield from super().find_problems(group)
+        if self.prompt_regime and self.modes != ["reasoning"]:
+            yield (
+                f"prompt_regime={self.prompt_regime} changes the prompts of reasoning mode only: "
+                "add modes=[reasoning]"
+            )
         yield from check_choices("modes", self.modes, RESPONSE_MODES)
 
 

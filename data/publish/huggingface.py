@@ -21,7 +21,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -172,9 +172,9 @@ def _list_records(store: Store) -> dict[tuple[str, str], list[ExportedRecord]]:
 def digest_rationales(tables: Iterable[ExportedTable]) -> str | None:
     """Return a short hash of all rationales, which a later narration replaces; None if there are
     none."""
-    texts = [r.text for table in tables if table.kind == "rationales" for r in table.records]
-    content = json.dumps(texts).encode()
-    return hashlib.sha256(content).hexdigest()[:16] if texts else None
+    records = [r for table in tables if table.kind == "rationales" for r in table.records]
+    content = json.dumps([asdict(record) for record in records]).encode()
+    return hashlib.sha256(content).hexdigest()[:16] if records else None
 
 
 def _write_table(

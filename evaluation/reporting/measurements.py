@@ -89,7 +89,12 @@ class Measurement:
     def regime(self) -> str | None:
         """The regime of a student's training, or that of the prompts if it is another."""
         trained = (self.training or {}).get("train", {}).get("regime")
-        return trained and (self.run.config.get("prompt_regime") or trained)
+        return trained and (self.prompt_regime or trained)
+
+    @property
+    def prompt_regime(self) -> str | None:
+        """The regime of the prompts, if they are not those of the training."""
+        return self.run.config.get("prompt_regime")
 
     @property
     def training_benchmark(self) -> str | None:
@@ -286,35 +291,35 @@ def combine_seeds(
         models: The models that were measured on the same items, by label.
         items: The benchmark's items by id.
     """
-    groups: dict[str, dict[int, Measurement]] = {}
+    trainings: dict[tuple[str, str], dict[int, Measurement]] = {}
     for m in models.values():
-        if m.seed is not None:
-            groups.setdefault(_without_seed(m), {})[m.seed] = m
-    results, differences = [], {}
-    found: dict[str, tuple[dict[int, Measurement], np.ndarray, list[str]]] = {}
-    for group in groups.values():
+        if "seed" in m.run.recipe and m.trained and m.responses:
+            key = _without_seed(m), ", ".join(filter(None, [m.result.mode, m.prompt_regime]))
+            trainings.setdefault(key, {}).setdefault(m.run.recipe["seed"], m)
+    results, found = [], []
+    for (training, variant), by_seed in trainings.items():
+        group = {seed: by_seed[seed] for seed in sorted(by_seed)}
         first = next(iter(group.values()))
         ids = [item_id for item_id in items if item_id in first.responses]
         if len(group) < 2 or any({*ids} != m.responses.keys() for m in group.values()):
             continue
-        name = f"{_name_without_seed(first)} ({first.result.mode})"
+        name = f"{_name_without_seed(first)} ({variant})"
         rows = [[m.responses[k].credit(items[k].letter) for m in group.values()] for k in ids]
         credits = np.array(rows, float)
         bootstrap = _bootstrap(ids, items)
         macros = {
-            seed: bootstrap.accuracies(name, credits[:, [k]])[MACRO].value
+            seed: bootstrap.accuracies(training, credits[:, [k]])[MACRO].value
             for k, seed in enumerate(group)
         }
-        results.append(SeededResult(name, bootstrap.accuracies(name, credits), macros))
-        found[name] = group, credits, ids
-    for first, second in permutations(found, 2):
-        (group, one, ids), (other_group, other, other_ids) = found[first], found[second]
-        shared = group.keys() & other_group.keys()
-        if ids == other_ids and any(
-            _is_paper_comparison(group[seed], other_group[seed]) for seed in shared
-        ):
-            pair = (first, one), (second, other)
-            differences[f"{first} minus {second}"] = _bootstrap(ids, items).differences(*pair)
+        results.append(SeededResult(name, bootstrap.accuracies(training, credits), macros))
+        found.append((name, group, ids, (training, credits)))
+    differences = {}
+    for (first, group, ids, one), (second, others, other_ids, other) in permutations(found, 2):
+        shared = group.keys() & others.keys()
+        compared = any(_is_paper_comparison(group[seed], others[seed]) for seed in shared)
+        if compared and ids == other_ids:
+            name = f"{first} minus {second}"
+            differences[name] = _bootstrap(ids, items).differences(one, other)
     return results, differences
 
 
@@ -323,17 +328,22 @@ def _bootstrap(ids: Sequence[str], items: Mapping[str, SelectionItem]) -> SeedBo
 
 
 def _without_seed(m: Measurement) -> str:
-    """Return the settings of a training and the mode of its evaluation, without the seed. A run
-    that another one continues has the seed in its name."""
+    """Return the settings of the run that trained a model, without its seed. The run that it
+    continues, if any, has the seed at the end of its name."""
     names = ("seed", "run", "workers", "store", "checkpoints")
-    settings = {name: value for name, value in m.training.items() if name not in names}
+    settings = {name: value for name, value in m.run.recipe.items() if name not in names}
     if "model" in settings:
-        settings["model"] = re.sub(rf"(?<!\d){m.seed}(?!\d)", "", str(settings["model"]))
-    return json.dumps([m.result.mode, settings], sort_keys=True, default=str)
+        settings["model"] = _strip_seed(str(settings["model"]), m.run.recipe["seed"])
+    return json.dumps(settings, sort_keys=True, default=str)
 
 
 def _name_without_seed(m: Measurement) -> str:
-    return re.sub(rf"[\W_]*(seed[\W_]*)?{m.seed}$", "", m.name) or m.name
+    return _strip_seed(m.name.partition(", prompt of ")[0], m.run.recipe["seed"])
+
+
+def _strip_seed(name: str, seed: int) -> str:
+    """Return a name without a seed at its end, such as "cot" for "cot-0" and "cot_seed0"."""
+    return re.sub(rf"(?:[\W_]+(?:seed)?[\W_]*|seed){seed}$", "", name) or name
 
 
 def _is_paper_comparison(m: Measurement, other: Measurement) -> bool:

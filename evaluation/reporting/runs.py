@@ -40,6 +40,9 @@ class FinishedRun:
         training: Settings of the run that trained the evaluated model, or for a two-stage run with
             an untrained model, that trained its matcher (the retriever that ranks the frames); None
             for a released model, and an empty dictionary if that run's folder does not exist.
+        recipe: Settings of the run whose model is evaluated, as its command got them; empty if
+            there is none. For a student of `train.distill` or `train.reinforce`, `training` has
+            those of the student's first training instead.
         report: Content of report.json; None for a training run.
         started: Time of the first start, in ISO format.
     """
@@ -50,6 +53,7 @@ class FinishedRun:
     name: str
     config: dict[str, Any]
     training: dict[str, Any] | None
+    recipe: dict[str, Any]
     report: SelectionReport | RetrievalReport | StudyReport | None
     started: str
     responses: Mapping[str, Responses] = field(default_factory=dict, repr=False)
@@ -131,8 +135,10 @@ def _read_run(folder: Path, title: str, root: Path) -> FinishedRun:
     if kind in SELECTION_KINDS:
         responses = read_responses(folder, kind, report)
     settings = _read_settings(folder)
-    training = _training_settings(settings, root)
-    return FinishedRun(folder, title, kind, name, settings, training, report, started, responses)
+    training, recipe = _training_settings(settings, root)
+    return FinishedRun(
+        folder, title, kind, name, settings, training, recipe, report, started, responses
+    )
 
 
 def _read_settings(folder: Path, file_name: str = "config.yaml") -> dict[str, Any]:
@@ -143,13 +149,19 @@ def _read_settings(folder: Path, file_name: str = "config.yaml") -> dict[str, An
             raise ValueError(str(error)) from error
 
 
-def _training_settings(settings: Mapping[str, Any], root: Path) -> dict[str, Any] | None:
-    """Return the settings of the run that trained the model of an evaluation; see `FinishedRun`."""
+def _training_settings(
+    settings: Mapping[str, Any], root: Path
+) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+    """Return `training` and `recipe` of the model of an evaluation; see `FinishedRun`."""
     model = settings.get("model") or (settings.get("matcher") or {}).get("model")
     if model is None:
-        return None
+        return None, {}
     path = Path(str(model))
     # If the runs were moved, or the working directory is another, the model is below `root`.
     folders = [path, root / Path(*path.parts[1:])]
     found = [folder for folder in folders if (folder / "config.yaml").is_file()]
-    return _read_settings(found[0], settings_file(found[0]).name) if found else {}
+    if not found:
+        return {}, {}
+    recipe = _read_settings(found[0])
+    file = settings_file(found[0]).name
+    return (recipe if file == "config.yaml" else _read_settings(found[0], file)), recipe

@@ -18,6 +18,7 @@ from data.oracle.contacts import group_contacts
 from data.oracle.extrapolation import extrapolate, project
 from data.records import ALTERNATIVE, Collision, Scene, SelectionItem, original_scene_id
 from data.seeded_order import named_rng
+from teacher.predicates.extraction import name_moment
 from teacher.predicates.facts import RelationalPredicates
 from teacher.predicates.places import contact_distance
 from teacher.predicates.vocabulary import describe_item
@@ -37,19 +38,25 @@ class Grounding:
 
     - oracle: those of the item.
     - extrapolated: the same with another target, in which the objects have kept the velocities of
-      the prefix's last frame. Objects on straight paths that meet are said to collide, and move on.
-      The distractors are described as they are.
+      the prefix's last frame, or of the frame after an intervention that the question states.
+      Objects on straight paths that meet are said to collide, and move on. The distractors are
+      described as they are.
     - shuffled: those of a training item of another scene, drawn with `cfg.seed`, that has the same
-      family and answer.
+      family and answer and, if there is one, the same words for the moment.
     """
 
     def __init__(self, store: Store, cfg: TeacherConfig) -> None:
         self._store, self._cfg = store, cfg
         self._donors = store.training_items() if cfg.grounding == "shuffled" else []
 
-    def describe(self, item: SelectionItem) -> RelationalPredicates | None:
+    def describe(
+        self, item: SelectionItem, predicates: RelationalPredicates | None = None
+    ) -> RelationalPredicates | None:
         """Return the predicates from which the rationale of an item is written; None if a prefix is
         too short, or if no other item can be drawn.
+
+        Args:
+            predicates: Those of the item, if they are known.
 
         Raises:
             UserError: The scenes record no camera, so that no frame can be extrapolated.
@@ -61,7 +68,7 @@ class Grounding:
         if cfg.grounding == "shuffled":
             drawn = find_donors(item, self._donors, cfg.seed)
             return next(filter(None, (describe_item(donor, store, cfg) for donor in drawn)), None)
-        return describe_item(item, store, cfg)
+        return predicates or describe_item(item, store, cfg)
 
 
 def extrapolate_target(
@@ -69,7 +76,9 @@ def extrapolate_target(
 ) -> tuple[SelectionItem, Callable[[str], Scene]]:
     """Return an item whose target is a frame of an extrapolated scene, and the function that
     returns a scene by its id, including this one."""
-    guess = extrapolate_scene(store.scene(item.target.scene_id), item.prefix_stop, store)
+    # An intervention changes the state of the frame after the prefix.
+    stop = item.prefix_stop + (item.target.scene_id != item.scene_id)
+    guess = extrapolate_scene(store.scene(item.target.scene_id), stop, store)
     candidates = list(item.candidates)
     candidates[item.answer] = replace(item.target, scene_id=guess.scene_id)
 
@@ -81,7 +90,8 @@ def extrapolate_target(
 
 def extrapolate_scene(scene: Scene, stop: int, store: Store) -> Scene:
     """Return a scene whose objects keep their velocities and orientations after frame `stop`, and
-    pass through each other."""
+    pass through each other. After it, an object is in view if its centre is, or if it has been in
+    view at `stop` and rests."""
     seconds = np.arange(1, scene.frames - stop)[:, None, None] / scene.fps
     positions = _continued(scene.positions, stop, extrapolate(scene, stop, seconds))
     image = project(positions, scene, store.manifest["config"])
@@ -92,6 +102,7 @@ def extrapolate_scene(scene: Scene, stop: int, store: Store) -> Scene:
             code="no-camera",
         )
     inside = ((image >= 0) & (image < scene.image_size)).all(axis=-1)
+    inside |= scene.in_view[stop] & (positions == positions[stop]).all(axis=-1)
     contacts = [c for c in scene.collisions if c.frame <= stop]
     return replace(
         scene,
@@ -110,12 +121,16 @@ def extrapolate_scene(scene: Scene, stop: int, store: Store) -> Scene:
 def find_donors(
     item: SelectionItem, items: Sequence[SelectionItem], seed: int
 ) -> Iterator[SelectionItem]:
-    """Yield the items of other scenes with the same family and answer, in random order."""
-    for k in named_rng(seed, "donor", item.item_id).permutation(len(items)):
-        other = items[k]
-        alike = (other.family, other.answer) == (item.family, item.answer)
-        if alike and original_scene_id(other.scene_id) != original_scene_id(item.scene_id):
-            yield other
+    """Yield the items of other scenes with the same family and answer, in random order: first those
+    whose moment has the same words."""
+    order = named_rng(seed, "donor", item.item_id).permutation(len(items))
+    others = [
+        other
+        for other in (items[k] for k in order)
+        if (other.family, other.answer) == (item.family, item.answer)
+        and original_scene_id(other.scene_id) != original_scene_id(item.scene_id)
+    ]
+    yield from sorted(others, key=lambda other: name_moment(other) != name_moment(item))
 
 
 def _continued(values: np.ndarray, stop: int, later: np.ndarray | None = None) -> np.ndarray:
@@ -126,7 +141,10 @@ def _continued(values: np.ndarray, stop: int, later: np.ndarray | None = None) -
 
 
 def _meetings(scene: Scene, positions: np.ndarray, stop: int) -> tuple[Collision, ...]:
-    """Return the contacts that begin after frame `stop`, for given positions."""
+    """Return the contacts that begin after frame `stop`, for given positions; none in a scene that
+    does not record contacts."""
+    if not scene.records_contacts:
+        return ()
     touching = {}
     for i, j in combinations(range(len(scene.objects)), 2):
         apart = np.linalg.norm(positions[stop:, i, :2] - positions[stop:, j, :2], axis=-1)

@@ -1,11 +1,18 @@
 """Invalid settings raise a SettingsError whose message names the key."""
 
 import pytest
+from hydra.core.global_hydra import GlobalHydra
 
-from conf.compose import REMOVED_KEYS, check_run_settings, compose
+from conf.compose import (
+    REMOVED_KEYS,
+    check_run_settings,
+    compose,
+    compose_config,
+    open_hydra,
+)
 from conf.errors import SettingsError
 from conf.multirun.sweep import Sweep
-from conf.schema import BuildCommand, ContrastiveCommand, Quota, SftCommand
+from conf.schema import BuildCommand, ContrastiveCommand, ExportCommand, Quota, SftCommand
 from tests.user_errors import raises_user_error
 
 
@@ -154,3 +161,21 @@ def test_valid_sweep_is_accepted():
     sweep = ["student=tiny,qwen3_vl_8b", "+exp=cot,answer_only", "seed=range(0,2)"]
     jobs = Sweep("train.sft", SftCommand, sweep).jobs
     assert len(jobs) == 8
+
+
+def test_a_running_command_composes_further_settings() -> None:
+    """As `data.export also=[...]` does, inside the Hydra of its own command."""
+    with open_hydra("data.export", ExportCommand):
+        running = GlobalHydra.instance().hydra
+        found = compose("data.build", BuildCommand, ["benchmark=tiny_contact"])
+        assert found.benchmark.name == "tiny_contact"
+        with pytest.raises(SettingsError, match="benchmark/nothing"):
+            compose("data.build", BuildCommand, ["benchmark=nothing"])
+        assert GlobalHydra.instance().hydra is running
+        assert compose_config("data.export", ["folder=out"]).folder == "out"
+    assert not GlobalHydra.instance().is_initialized()
+
+
+def test_a_benchmark_is_exported_once() -> None:
+    with pytest.raises(SettingsError, match="also: tiny is named twice"):
+        compose("data.export", ExportCommand, ["also=[small,tiny]"])

@@ -22,6 +22,7 @@ SCHEMAS = {
     "data.export": schema.ExportCommand,
     "data.gallery": schema.GalleryCommand,
     "teacher.narrate": schema.NarrateCommand,
+    "teacher.claims_benchmark": schema.ClaimsCommand,
     "teacher.serve": schema.ServeCommand,
     "train.base": schema.TinyBaseCommand,
     "train.sft": schema.SftCommand,

@@ -147,3 +147,42 @@ def test_a_scene_without_a_camera_cannot_be_extrapolated(tmp_path: Path) -> None
 def test_sufficient_rationales_need_the_facts_of_the_simulator() -> None:
     problems = [*teacher("shuffled", sufficient=True).find_problems("teacher.")]
     assert any("teacher.sufficient=true and teacher.grounding=shuffled" in p for p in problems)
+
+
+def test_a_guess_starts_from_the_intervention(micro_store: Store) -> None:
+    """The frame after the prefix is the first that an intervention changes."""
+    item = next(i for i in micro_store.training_items() if i.prefix_stop + 2 < i.target_frame)
+    scene, stop = micro_store.scene(item.scene_id), item.prefix_stop
+    moved = {"positions": scene.positions.copy(), "velocities": scene.velocities.copy()}
+    moved["positions"][stop + 1 :, 0, 0] += 1
+    moved["velocities"][stop + 1 :, 0] *= 3
+    other = replace(scene, scene_id=f"{scene.scene_id}-alt-faster", **moved)
+    candidates = list(item.candidates)
+    candidates[item.answer] = replace(item.target, scene_id=other.scene_id)
+    changed = replace(item, candidates=tuple(candidates))
+    store = SimpleNamespace(
+        manifest=micro_store.manifest,
+        name="changed",
+        scene=lambda i: other if i == other.scene_id else micro_store.scene(i),
+    )
+    guessed, scene_of = extrapolate_target(changed, store)
+    guess = scene_of(guessed.target.scene_id)
+    expected = other.positions[stop + 1] + other.velocities[stop + 1] / scene.fps
+    np.testing.assert_allclose(guess.positions[stop + 2], expected, atol=1e-6)
+    plain, _ = extrapolate_target(item, micro_store)
+    assert guessed.candidates[item.answer] != plain.candidates[item.answer]
+
+
+def test_nothing_is_said_of_contacts_where_none_are_recorded() -> None:
+    scene = synthetic.scene([(-1, 0), (1, 0)], [(1, 0), (-1, 0)])
+    store = SimpleNamespace(manifest=CLEVRER, name="synthetic")
+    assert extrapolate_scene(scene, 10, store).collisions
+    unknown = replace(scene, records_contacts=False, collisions=())
+    assert not extrapolate_scene(unknown, 10, store).collisions
+
+
+def test_false_facts_do_not_replace_the_table_of_rationales(micro_store: Store) -> None:
+    narrate_store(micro_store, teacher("oracle"))
+    before = micro_store.rationales()
+    assert narrate_store(micro_store, teacher("shuffled")).rationales != before
+    assert micro_store.rationales() == before

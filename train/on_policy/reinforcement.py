@@ -249,7 +249,7 @@ class MediaGRPOTrainer(GRPOTrainer):
         if self._claim_weight:
             credits = pad_sequence(self._token_credits, True).to(counted.device)
             counted = counted | credits.any(dim=1, keepdim=True)
-            advantages = self._claim_weight * self._standardize(credits)
+            advantages = self._claim_weight * self._scale(credits)
             output["advantages"] = output["advantages"][:, None] + advantages
         # Tokens that it masks are read by the model, but not in the loss.
         output["tool_mask"] = counted.expand_as(output["completion_mask"])
@@ -260,16 +260,13 @@ class MediaGRPOTrainer(GRPOTrainer):
         # TRL shuffles and splits the tensors of its output by their rows.
         return {**output, ROW: torch.arange(len(inputs), device=self.accelerator.device)}
 
-    def _standardize(self, credits: Tensor) -> Tensor:
-        """Return the credits (B, T) of the tokens of claims less their mean over all ranks, in
-        units of their standard deviation; 0 for other tokens."""
-        claimed = credits != 0
-        found = credits[claimed]
-        sums = torch.stack([claimed.sum(), found.sum(), found.square().sum()]).float()
-        count, total, squares = self.accelerator.reduce(sums)
-        mean = total / count.clamp(min=1)
-        deviation = (squares / count.clamp(min=1) - mean**2).clamp(min=0).sqrt()
-        return claimed * (credits - mean) / (deviation + 1e-6)
+    def _scale(self, credits: Tensor) -> Tensor:
+        """Return the credits (B, T) in units of their root mean square over the tokens of all
+        claims, on all ranks. No mean is subtracted: a true claim would be punished if others have
+        larger credits."""
+        sums = torch.stack([(credits != 0).sum(), credits.square().sum()]).float()
+        count, squares = self.accelerator.reduce(sums)
+        return credits / (squares / count.clamp(min=1)).sqrt().clamp(min=1e-6)
 
     def _calculate_rewards(self, inputs: list[dict[str, Any]], *rest: Any) -> Tensor:
         """Return the rewards of all ranks' responses, (N, rewards), and note for each response

@@ -58,7 +58,8 @@ class StudentMerge:
     def trained_outputs(self, items: Items) -> ModelOutputs:
         """Return the outputs of the trained student, the adapters over their base."""
         precision = self.settings.train.precision
-        model, processor = loading.load_trained(self.settings.student, precision, self.saved)
+        options = self.settings.student, precision, self.saved
+        model, processor = loading.load_trained(*options, merge=False)
         # Prevent a CPU from repacking 4-bit weights for inference, which changes the rounding.
         compat.keep_differentiable(model)
         return self._outputs(model, processor, items, precision == "bf16")

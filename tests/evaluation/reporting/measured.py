@@ -89,6 +89,7 @@ def select_run(
     model: str | None = None,
     mode: str = "answer",
     suite: str | None = None,
+    prompt_regime: str | None = None,
 ) -> Path:
     """Write a run of evaluation.select on `items` (None: all test items), and return its folder.
 
@@ -99,10 +100,12 @@ def select_run(
     settings = SelectCommand(
         benchmark=benchmark, student=STUDENT, store=str(store.folder.parent),
         model=None if model is None else f"{root}/sft/{model}", suite=suite,
+        prompt_regime=prompt_regime,
     )  # fmt: skip
     finish(folder, settings)
     answers = [score_response(item, mode, GeneratedText(respond(item), False)) for item in items]
-    choices = Choices.from_answers(model or "small base", mode, None, answers)
+    title = (model or "small base") + f", prompt of {prompt_regime}" * bool(prompt_regime)
+    choices = Choices.from_answers(title, mode, None, answers)
     asked = [(mode, None, "k1")]
     report = build_selection_report([choices], items, store.name, store.identity, 0, suite, asked)
     write_report(report, folder, items[0].suite)

@@ -13,6 +13,7 @@ import pytest
 from conf.schema import ExportStudyCommand
 from data.records import FAMILIES, SelectionItem
 from data.store import Store
+from evaluation.reporting import measurements
 from tests.evaluation.reporting import measured
 from tests.evaluation.reporting.measured import finish, read_table, retrieve_run, run_report
 from tests.evaluation.study.test_agreement import summarize, vote
@@ -44,11 +45,14 @@ def test_results_of_a_model_on_two_benchmarks_share_a_row(runs):
 
 def test_trainings_with_several_seeds_are_compared(runs, micro, micro_store, report):
     right, wrong = measured.right, measured.always_a
-    for name, regime, respond in (("ours", "cot", right), ("plain", "answer_only", wrong)):
+    for name, regime, respond in (("ours", "cot", right), ("plain", "cot_no_match_layout", wrong)):
         for seed in range(3):
             run = f"{name}-{seed}"
             measured.trained_student(runs, micro, run, regime, seed)
             measured.select_run(runs, micro_store, micro, run, respond, model=run)
+            if name == "ours":
+                other = {"model": run, "mode": "reasoning", "prompt_regime": "cot_no_match_layout"}
+                measured.select_run(runs, micro_store, micro, f"{run}-other", wrong, **other)
     folder = report(items=1)
     table = read_table(folder, "seeds-micro")
     share = 100 * np.mean(
@@ -59,12 +63,27 @@ def test_trainings_with_several_seeds_are_compared(runs, micro, micro_store, rep
     assert ours.split("|")[5].strip() == "100.0"
     assert plain.split("|")[5].strip() == f"{share:.1f}"
     assert plain.split("|")[6].strip() == " ".join([f"{share:.1f}"] * 3)
+    [other] = [row for row in table.splitlines() if "cot_no_match_layout" in row]
+    assert other.startswith("| ours (reasoning, cot_no_match_layout) |")
+    assert other.split("|")[5].strip() == f"{share:.1f}"
     # Runs of one seed have no row, and neither has the student whose items differ.
     assert "cot (reasoning)" not in table
     differences = read_table(folder, "seed-differences-micro")
-    [row] = [line for line in differences.splitlines() if " minus " in line]
-    assert row.startswith("| ours (answer) minus plain (answer) |")
+    start = "| ours (answer) minus plain (answer) |"
+    [row] = [line for line in differences.splitlines() if line.startswith(start)]
     assert row.split("|")[5].strip() == f"{100 - share:+.1f}"
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "stripped"),
+    [
+        ("cot-0", 0, "cot"), ("cot_seed1", 1, "cot"), ("cot, seed=2", 2, "cot"),
+        ("cot_300", 0, "cot_300"), ("lr-10", 0, "lr-10"), ("v2", 2, "v2"), ("3", 3, "3"),
+        ("checkpoints/sft/qwen3_vl_2b-cot-2", 2, "checkpoints/sft/qwen3_vl_2b-cot"),
+    ],
+)  # fmt: skip
+def test_only_the_seed_at_the_end_of_a_name_is_left_out(name, seed, stripped) -> None:
+    assert measurements._strip_seed(name, seed) == stripped
 
 
 def by_family(store: Store) -> dict[str, list[SelectionItem]]:
