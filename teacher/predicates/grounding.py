@@ -20,6 +20,7 @@ from data.records import ALTERNATIVE, Collision, Scene, SelectionItem, original_
 from data.seeded_order import named_rng
 from teacher.predicates.extraction import name_moment
 from teacher.predicates.facts import RelationalPredicates
+from teacher.predicates.motion import STATIONARY
 from teacher.predicates.places import contact_distance
 from teacher.predicates.vocabulary import describe_item
 
@@ -102,7 +103,8 @@ def extrapolate_scene(scene: Scene, stop: int, store: Store) -> Scene:
             code="no-camera",
         )
     inside = ((image >= 0) & (image < scene.image_size)).all(axis=-1)
-    inside |= scene.in_view[stop] & (positions == positions[stop]).all(axis=-1)
+    rests = np.linalg.norm(scene.velocities[stop], axis=-1) < STATIONARY
+    inside |= scene.in_view[stop] & rests
     contacts = [c for c in scene.collisions if c.frame <= stop]
     return replace(
         scene,

@@ -173,6 +173,22 @@ def test_a_guess_starts_from_the_intervention(micro_store: Store) -> None:
     assert guessed.candidates[item.answer] != plain.candidates[item.answer]
 
 
+def test_an_object_that_rests_stays_in_view(micro_store: Store) -> None:
+    item = micro_store.training_items()[0]
+    scene, stop = micro_store.scene(item.scene_id), item.prefix_stop
+    # Its centre is beside the image, and a part of it is in the image.
+    positions, velocities = scene.positions.copy(), scene.velocities.copy()
+    positions[:, 0, :2], velocities[:, 0] = (0.0, 9.0), 0.0
+    in_view = scene.in_view.copy()
+    in_view[:, 0] = True
+    still = replace(scene, positions=positions, velocities=velocities, in_view=in_view)
+    assert extrapolate_scene(still, stop, micro_store).in_view[:, 0].all()
+    velocities = velocities.copy()
+    velocities[:, 0, 1] = 1.0
+    moving = replace(still, velocities=velocities)
+    assert not extrapolate_scene(moving, stop, micro_store).in_view[stop + 1 :, 0].any()
+
+
 def test_nothing_is_said_of_contacts_where_none_are_recorded() -> None:
     scene = synthetic.scene([(-1, 0), (1, 0)], [(1, 0), (-1, 0)])
     store = SimpleNamespace(manifest=CLEVRER, name="synthetic")
