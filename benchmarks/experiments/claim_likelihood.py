@@ -66,7 +66,8 @@ def main() -> None:
     print_header("source", "supported", "contradicted", *(f"AUC, {name}" for name in SCORES))
     for source, rows in [*claims.groupby("source"), ("all", claims)]:
         true = (rows.verdict == "supported").to_numpy()
-        cells = [f"{100 * auc(rows[name].to_numpy(), true):.1f}" for name in SCORES]
+        found = [auc(rows[name].to_numpy(), true) for name in SCORES]
+        cells = ["-" if np.isnan(share) else f"{100 * share:.1f}" for share in found]
         print_row(source, true.sum(), (~true).sum(), *cells)
 
 
