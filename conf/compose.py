@@ -40,46 +40,6 @@ CONFIG_NAMES = {"train.export": "export_model", "evaluation.study.export": "expo
 OVERLAYS = ("exp", "sweep")
 """Groups of overlays: files that change a few settings on top of a command's presets. An overlay is
 added with `+`, as in `+exp=cot`, whereas a preset replaces another one, as in `student=tiny`."""
-REMOVED_KEYS: dict[str, str] = {
-    "benchmark.standin": "use benchmark=standin_movi_a or benchmark=standin_physion",
-    "benchmark.min_objects": "use benchmark.world.objects.min_count instead",
-    "benchmark.max_objects": "use benchmark.world.objects.max_count instead",
-    "benchmark.max_collisions": "use benchmark.world.start.max_collisions instead",
-    "format": "leave it out: data.export writes a Hugging Face dataset",
-    "shown": "use examples instead",
-    "url": "data.export does not need it, because the Hub writes the metadata of a dataset; the "
-    "address of a server is server.url or teacher.url",
-    "published": "data.export does not need it, because the Hub writes the metadata of a dataset",
-    "cards": "use gpus instead",
-    "train.keep": "use train.keep_checkpoints instead",
-    "train.packing": "leave it out: samples of similar length are padded together",
-    "train.false_words": "leave it out: it did not raise the accuracy",
-    "train.best": "use train.best_metric instead",
-    "teacher.patience": "use teacher.unreachable_timeout instead",
-    "server.patience": "use server.unreachable_timeout instead",
-    "index": "leave it out: retrieval ranks exactly",
-    "probes": "leave it out: retrieval ranks exactly",
-    "images.url": "leave it out: descriptions are matched as texts",
-    "images.model": "leave it out: descriptions are matched as texts",
-    "train.batches": "leave it out: batches are random",
-    "train.scene_queries": "leave it out: batches are random",
-    "train.mini_batch_tokens": "set train.mini_batch to a number of queries or frames",
-    "train.distinct_frames": "leave it out: each document is embedded once",
-    "train.shared_prefixes": "leave it out: each query is embedded on its own",
-    "train.mask_identical": "leave it out: identical frames are always masked",
-    "train.mask_near": "leave it out: frames near the target count as negatives",
-    "train.hard_weight": "leave it out: all negatives count equally",
-    "retriever.late.pool": "leave it out: every vector is kept",
-    "train.mine_every": "leave it out: hard negatives are the benchmark's",
-    "train.mine_margin": "leave it out: hard negatives are the benchmark's",
-    "benchmark.retrieval.standard": "leave it out: the test queries of retrieval.builders are the "
-    "standard test",
-    "benchmark.selection.observation": "leave it out: event items observe 21 frames and window "
-    "items 16",
-    "frames_gb": "use frames=none: frames are then rendered when they are needed",
-    "parallel": "leave it out: workers are processes of this machine",
-}
-"""Keys that no longer exist, each with the advice that ends the key's error message."""
 
 
 def register(command: str, schema: type) -> None:
@@ -263,8 +223,6 @@ def _type_hint(message: str) -> str | None:
 
 
 def _unknown_key(command: str, key: str) -> str:
-    if key in REMOVED_KEYS:
-        return f"{key} was removed: {REMOVED_KEYS[key]}"
     if key.partition(".")[0] == "world":
         return (
             f"{command} has no key {key}: give benchmark.{key}, or begin your file in conf/world/ "

@@ -1,23 +1,43 @@
-"""Export benchmarks as a Hugging Face dataset."""
+"""Export benchmarks as a Hugging Face dataset, or their training samples for other trainers."""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from conf.compose import compose
 from conf.entry import Run, command
 from conf.files import write_text
 from conf.schema import BuildCommand, ExportCommand
 
+if TYPE_CHECKING:
+    from data.publish.folders import Shard
+
 log = logging.getLogger(__name__)
 
 
 @command("data.export", ExportCommand)
 def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
+    from data.publish.hub import push_folder
+    from data.publish.huggingface import summarize
+
+    shards = export_dataset(cfg) if cfg.format == "dataset" else export_rows(cfg)
+    summary = summarize(shards)
+    text = f"{cfg.folder}\n{summary.to_string(float_format='{:,.1f}'.format)}"
+    log.info("%s", text)
+    write_text(run.folder / "report.txt", text + "\n")
+    if cfg.push is not None:
+        log.info("uploaded: %s", push_folder(Path(cfg.folder), cfg.push))
+    rows = {f"rows/{'/'.join(name)}": float(count) for name, count in summary["rows"].items()}
+    return rows | {"bytes": float(sum(shard["bytes"] for shard in shards))}
+
+
+def export_dataset(cfg: ExportCommand) -> list[Shard]:
+    """Write the tables of all benchmarks."""
     from data.build import ensure_benchmark, ensure_items
     from data.parallel import Workers
-    from data.publish.huggingface import ensure_export, summarize
+    from data.publish.huggingface import ensure_export
 
     root, benchmarks = Path(cfg.store), {cfg.benchmark.name: cfg.benchmark}
     for name in cfg.also:
@@ -28,13 +48,15 @@ def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
         else ensure_items(benchmark, root, Workers(cfg.workers))
         for name, benchmark in benchmarks.items()
     }
-    shards = ensure_export(stores, Path(cfg.folder), cfg.images)
-    summary = summarize(shards)
-    text = f"{cfg.folder}\n{summary.to_string(float_format='{:,.1f}'.format)}"
-    log.info("%s", text)
-    write_text(run.folder / "report.txt", text + "\n")
-    rows = {f"rows/{'/'.join(name)}": float(count) for name, count in summary["rows"].items()}
-    return rows | {"bytes": float(sum(shard["bytes"] for shard in shards))}
+    return ensure_export(stores, Path(cfg.folder), cfg.images)
+
+
+def export_rows(cfg: ExportCommand) -> list[Shard]:
+    """Write the training samples of a benchmark."""
+    from data.build import ensure_benchmark
+    from train.common.training_rows import ensure_rows
+
+    return ensure_rows(cfg, ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ COMMANDS = {
     "data.build": "build a benchmark: scenes, items, queries, frames",
     "data.statistics": "report a benchmark's statistics and the accuracy of baselines",
     "data.gallery": "draw contact sheets of items and queries",
-    "data.export": "write a Hugging Face dataset",
+    "data.export": "write a Hugging Face dataset, or rows for other trainers",
     "teacher.narrate": "write rationales with the built-in narrator or a served model",
     "teacher.claims_benchmark": "write claims of students and of false texts, with verdicts",
     "teacher.serve": "serve a model with vLLM",

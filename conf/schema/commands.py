@@ -90,8 +90,25 @@ class ExportCommand(CommandConfig):
     """Folder to write to; it must not contain an earlier export."""
     images: bool = True
     """Include the images of the frames; otherwise a row only names its scenes and frames."""
+    format: str = setting("dataset", ("dataset", "trl", "sharegpt", "swift", "embedding"))
+    """dataset (all tables as parquet files), or training samples as rows for other trainers: trl,
+    sharegpt (LLaMA-Factory), swift (ms-swift) or embedding (sentence-transformers)."""
+    push: str | None = None
+    """Dataset repository on the Hugging Face hub, ORGANISATION/NAME, to which the export is
+    uploaded; null does not upload it."""
+    student: StudentConfig = MISSING
+    """Model to train on the rows, of which student.frames and student.image_size are used."""
+    teacher: TeacherConfig = MISSING
+    """Settings of the rationales in the rows."""
+    train: SftTrainConfig = field(default_factory=SftTrainConfig)
+    """Training settings of the preset, of which only train.regime is used."""
 
     def find_problems(self, group: str) -> Iterator[str]:
+        if self.format != "dataset" and (self.also or not self.images):
+            yield (
+                f"{group}format={self.format}: rows are of one benchmark and have images; leave "
+                f"{group}also and {group}images out"
+            )
         if not self.folder:
             yield f"{group}folder= is empty: name a folder, such as folder=exports/tiny"
         names = [self.benchmark.name, *self.also]

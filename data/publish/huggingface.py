@@ -8,17 +8,14 @@ The configurations of a benchmark are its tables: selection, matched_anchor, int
 retrieval, database and rationales, as far as it has them. In a dataset of several benchmarks, their
 names begin with that of their benchmark, such as tiny-selection.
 
-The dataset is written to a hidden folder beside `<folder>`, one shard after another, and renamed
-when it is complete. A killed export resumes with the shards that it has written.
+A killed export resumes with the shards that it has written (see `data.publish.folders`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
-import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -29,9 +26,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from conf.errors import UserError
-from conf.files import read_json_if_valid, write_bytes
-from conf.runs import lock_file
+from conf.files import write_bytes
 from conf.schema.benchmark import PAIRED, POOLS
 from data.publish.columns import (
     DESCRIPTIONS,
@@ -40,16 +35,15 @@ from data.publish.columns import (
     arrow_schema,
     list_columns,
 )
+from data.publish.folders import Shard, describe_file, write_folder
 from data.records import SPLITS, RetrievalQuery, SelectionItem
-from data.store import DATABASES, Store, hash_file
+from data.store import DATABASES, Store
 from data.versions import component_versions
 
 if TYPE_CHECKING:
     import pandas as pd
 
-log = logging.getLogger(__name__)
-
-EXPORT_RECORD, CARD = "export.json", "README.md"
+CARD = "README.md"
 EXPORT_VERSION = "5"
 """Changes whenever the same store would give another dataset."""
 GROUP_IMAGES = 512
@@ -78,9 +72,6 @@ ORIGINS: dict[str, dict[str, str]] = {
     },
 }  # fmt: skip
 """Licence and source of the scenes by simulator, as the card states them."""
-Shard = dict[str, Any]
-"""Entry of a parquet file in export.json: configuration, split, path relative to the export's
-folder, rows, bytes and sha256."""
 
 
 def ensure_export(stores: Mapping[str, Store], folder: Path, images: bool) -> list[Shard]:
@@ -100,28 +91,18 @@ def ensure_export(stores: Mapping[str, Store], folder: Path, images: bool) -> li
         "version": EXPORT_VERSION,
         "images": images,
     }
-    if folder.exists():
-        shards = _verify(folder, plan)
-        log.info("%s already holds this export", folder)
-        return shards
-    partial = folder.with_name(f".{folder.name}.partial")
-    busy = f"another process is writing {folder}: run this command again when it has finished"
-    with lock_file(partial.with_suffix(".lock"), busy):
-        partial.mkdir(exist_ok=True)
-        if not plan.items() <= read_json_if_valid(partial / EXPORT_RECORD).items():
-            for path in partial.iterdir():
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-        _write_record(partial, plan)
+
+    def write(unfinished: Path) -> list[Shard]:
         shards: list[Shard] = []
         builders = {name: RowBuilder(store, images) for name, store in stores.items()}
         rows = sum(len(table.records) for table in tables)
         with tqdm(total=rows, desc="exporting", unit="row", mininterval=1.0) as bar:
             for table in tables:
-                shards += _write_table(partial, table, builders[table.benchmark], bar)
-        write_bytes(partial / CARD, render_card(stores, shards, images).encode())
-        _write_record(partial, plan | {"shards": shards, "card": hash_file(partial / CARD)})
-        partial.rename(folder)
-    return shards
+                shards += _write_table(unfinished, table, builders[table.benchmark], bar)
+        write_bytes(unfinished / CARD, render_card(stores, shards, images).encode())
+        return shards
+
+    return write_folder(folder, plan, write, [CARD])
 
 
 @dataclass(frozen=True)
@@ -206,14 +187,8 @@ def _write_table(
                     writer.write_table(pa.Table.from_pylist(rows, schema))
                     bar.update(len(rows))
             os.replace(unfinished, path)
-        yield {
-            "configuration": table.configuration,
-            "split": table.split,
-            "path": path.relative_to(folder).as_posix(),
-            "rows": len(part),
-            "bytes": path.stat().st_size,
-            "sha256": hash_file(path),
-        }
+        labels = {"configuration": table.configuration, "split": table.split, "rows": len(part)}
+        yield labels | describe_file(folder, path)
 
 
 def render_card(stores: Mapping[str, Store], shards: Sequence[Shard], images: bool) -> str:
@@ -266,37 +241,6 @@ def _count_rows(records: Iterable[SelectionItem | RetrievalQuery], *axes: str) -
     counts = Counter((*(getattr(r, axis) for axis in axes), r.split) for r in records)
     keys = dict.fromkeys(key[:-1] for key in counts)
     return [(*key, *(counts[*key, split] for split in SPLITS)) for key in keys]
-
-
-def _write_record(folder: Path, record: dict[str, Any]) -> None:
-    write_bytes(folder / EXPORT_RECORD, json.dumps(record, indent=1).encode())
-
-
-def _verify(folder: Path, plan: dict[str, Any]) -> list[Shard]:
-    """Return the shards of an undamaged export of `plan`."""
-    record = read_json_if_valid(folder / EXPORT_RECORD)
-    if "shards" not in record:
-        raise UserError(
-            f"{folder} exists but contains no readable export: choose another folder with "
-            "folder=FOLDER",
-            code="folder-in-use",
-        )
-    for key, value in plan.items():
-        if record.get(key) != value:
-            raise UserError(
-                f"{folder} contains an export with {key}={record.get(key)}, not {key}={value}: "
-                f"choose another folder with folder=FOLDER, or delete {folder}",
-                code="other-settings",
-            )
-    expected = {CARD: record["card"]} | {s["path"]: s["sha256"] for s in record["shards"]}
-    for name, sha256 in expected.items():
-        path = folder / name
-        problem = "missing" if not path.exists() else "damaged" if hash_file(path) != sha256 else ""
-        if problem:
-            raise UserError(
-                f"{path} is {problem}: delete {folder} and export again", code=f"{problem}-file"
-            )
-    return record["shards"]
 
 
 def summarize(shards: Sequence[Shard]) -> pd.DataFrame:

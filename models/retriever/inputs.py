@@ -78,13 +78,19 @@ def query_input(
         clip = load_clip(query.scene_id, indices, frames)
         array = torch.from_numpy(clip.pixels).permute(0, 3, 1, 2)
         return {"video": {"array": array, "video_metadata": clip.metadata}, "text": query.question}
-    images = [frames.image(query.scene_id, index) for index in indices]
     if form == "separate":
+        images = [frames.image(query.scene_id, index) for index in indices]
         return SeparateQuery(images, query.question)
+    return query_messages(query, frames, cfg.frames)
+
+
+def query_messages(query: Query, frames: FrameReader, count: int) -> list[dict[str, Any]]:
+    """Return a query as a chat message: `count` frames of its prefix as images, each after its
+    time, and the question."""
     fps, content = frames.scene(query.scene_id).fps, []
-    for index, image in zip(indices, images, strict=True):
+    for index in sample_prefix_frames(query.prefix_start, query.prefix_stop, count):
         content.append({"type": "text", "text": write_time(index / fps)})
-        content.append({"type": "image", "image": image})
+        content.append({"type": "image", "image": frames.image(query.scene_id, index)})
     content.append({"type": "text", "text": query.question})
     return [{"role": "user", "content": content}]
 

@@ -4,7 +4,6 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from conf.compose import (
-    REMOVED_KEYS,
     check_run_settings,
     compose,
     compose_config,
@@ -35,12 +34,6 @@ from tests.user_errors import raises_user_error
 def test_unknown_key_suggests_the_nearest(override, suggested):
     with raises_user_error("unknown-key", contains=f"did you mean {suggested}?"):
         compose("train.sft", SftCommand, [override])
-
-
-def test_removed_key_names_its_replacement(monkeypatch):
-    monkeypatch.setitem(REMOVED_KEYS, "train.old", "use train.new instead")
-    with raises_user_error("unknown-key", contains=("train.old", "use train.new instead")):
-        compose("train.sft", SftCommand, ["train.old=1"])
 
 
 @pytest.mark.parametrize(
