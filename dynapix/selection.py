@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from conf.files import expand_path, write_json, write_json_lines, write_text
 from conf.schema.benchmark import PAIRED
 from data.records import LETTERS
 from dynapix.benchmark import Benchmark, Item, refuse_repeated
+from dynapix.integrations.logs import Log, read_inspect, read_lmms_eval
 from dynapix.saved_runs import saved_run
 from evaluation.metrics.arrays import to_array
 from evaluation.metrics.future_moment import FutureMoment, measure_future_moment
@@ -58,6 +60,7 @@ class Outcome:
         credit: 1 for a correct choice, 1/m if the target is one of m candidates with the highest
             score, and 0 otherwise.
         reason: Why a text has no letter, or why the item failed.
+        truncated: Whether the text ended at the limit of tokens, if that is known.
     """
 
     item_id: str
@@ -66,6 +69,7 @@ class Outcome:
     letter: str | None
     credit: float
     reason: str | None = None
+    truncated: bool = False
 
     @property
     def failed(self) -> bool:
@@ -140,10 +144,7 @@ def _predict_batch(predict: Callable[[Any], Any], batch: list[Item], single: boo
 
 def _read(item: Item, prediction: Any) -> Outcome:
     if isinstance(prediction, str):
-        parsed = parse_choice(prediction)
-        reason = str(parsed.reason) if parsed.letter is None else None
-        right = float(parsed.letter == item.answer)
-        return Outcome(item.item_id, prediction, None, parsed.letter, right, reason)
+        return _read_text(item, prediction)
     try:
         scores = to_array(prediction, float)
     except Exception:  # A library's own error must not lose the earlier predictions.
@@ -155,6 +156,25 @@ def _read(item: Item, prediction: Any) -> Outcome:
     [letter], credit = choose_letters(scores[None]), credit_choices(scores[None], [item.index])
     reason = None if letter else "tied scores"
     return Outcome(item.item_id, None, tuple(scores.tolist()), letter, float(credit[0]), reason)
+
+
+def _read_text(item: Item, text: str, truncated: bool = False) -> Outcome:
+    parsed = parse_choice(text, truncated)
+    reason = str(parsed.reason) if parsed.letter is None else None
+    right = float(parsed.letter == item.answer)
+    return Outcome(item.item_id, text, None, parsed.letter, right, reason, truncated)
+
+
+def _find_items(benchmark: Benchmark, names: Sequence[str], source: Path) -> dict[str, Item]:
+    """Return the items with some ids, in this order. Raises UserError if one is missing."""
+    every = {item.item_id: item for item in (*benchmark.selection, *benchmark.interventions)}
+    if missing := [name for name in names if name not in every]:
+        raise UserError(
+            f"{source} has {len(missing)} items that the {benchmark.split} split of "
+            f"{benchmark.name} does not have, such as {missing[0]}",
+            code="different-items",
+        )
+    return {name: every[name] for name in names}
 
 
 def _failure(item: Item, reason: str) -> Outcome:
@@ -294,7 +314,7 @@ class Result:
                         "mode": TEXT,
                         "item_id": o.item_id,
                         "text": o.text or "",
-                        "truncated": False,
+                        "truncated": o.truncated,
                     }
                     for o in self.outcomes
                 ]
@@ -325,8 +345,9 @@ class Result:
             kind, name, seed = record["kind"], record["name"], record["seed"]
             file = "answers.jsonl" if kind == "select" else "scores.jsonl"
             rows = [json.loads(line) for line in (folder / file).read_text().splitlines()]
-            prediction = "text" if kind == "select" else "scores"
-            predictions = [(row["item_id"], row[prediction]) for row in rows]
+            texts = kind == "select"
+            predictions = [(row["item_id"], row["text" if texts else "scores"]) for row in rows]
+            truncated = {row["item_id"] for row in rows if texts and row["truncated"]}
             lines = (folder / "failures.jsonl").read_text().splitlines()
             failed = {row["item_id"]: row["reason"] for row in map(json.loads, lines)}
             build = report["build"]
@@ -339,20 +360,61 @@ class Result:
                 f"{folder} is a result on another benchmark or build than {benchmark.store.folder}",
                 code="different-builds",
             )
-        every = (*benchmark.selection, *benchmark.interventions)
-        by_id = {item.item_id: item for item in every}
-        if missing := [name for name, _ in predictions if name not in by_id]:
-            raise UserError(
-                f"{folder} has {len(missing)} items that the {benchmark.split} split of "
-                f"{benchmark.name} does not have, such as {missing[0]}",
-                code="different-items",
-            )
-        items = [by_id[name] for name, _ in predictions]
+        by_id = _find_items(benchmark, [name for name, _ in predictions], folder)
         outcomes = [
-            _failure(by_id[name], failed[name]) if name in failed else _read(by_id[name], value)
+            _failure(by_id[name], failed[name])
+            if name in failed
+            else _read_text(by_id[name], value, name in truncated)
+            if texts
+            else _read(by_id[name], value)
             for name, value in predictions
         ]
-        return cls(benchmark, name, tuple(items), tuple(outcomes), seed)
+        return cls(benchmark, name, tuple(by_id.values()), tuple(outcomes), seed)
+
+    @classmethod
+    def from_inspect(cls, path: str | Path, benchmark: Benchmark, seed: int = 0) -> Result:
+        """Read the log of `inspect eval dynapix/selection`, *.eval or *.json.
+
+        Args:
+            benchmark: The benchmark that the log is on.
+
+        Raises:
+            UserError: The file is not a finished log, or its items are not those of `benchmark`.
+        """
+        return cls._from_log(read_inspect(Path(path)), benchmark, Path(path), seed)
+
+    @classmethod
+    def from_lmms_eval(cls, path: str | Path, benchmark: Benchmark, seed: int = 0) -> Result:
+        """Read the samples that lmms-eval logs of the task dynapix_selection; see `from_inspect`.
+
+        Such a log does not say whether a response ended at the limit of tokens.
+        """
+        return cls._from_log(read_lmms_eval(Path(path)), benchmark, Path(path), seed)
+
+    @classmethod
+    def _from_log(cls, log: Log, benchmark: Benchmark, path: Path, seed: int) -> Result:
+        by_id = _find_items(benchmark, [*log.responses], path)
+        outcomes = tuple(
+            _read_text(by_id[name], response.text, response.truncated)
+            for name, response in log.responses.items()
+        )
+        return cls(benchmark, log.model, tuple(by_id.values()), outcomes, seed)
+
+    def to_eval_results(
+        self, dataset: str, task: str = "selection", notes: str | None = None
+    ) -> list[dict[str, Any]]:
+        """Return the macro accuracy in percent as an entry of `.eval_results/*.yaml` in a model's
+        repository on the Hugging Face hub.
+
+        Args:
+            dataset: The benchmark's dataset on the hub, ORGANISATION/NAME.
+            task: Id of the task in the dataset's `eval.yaml`.
+            notes: Settings of the evaluation in a few words.
+        """
+        today = datetime.now(UTC).date().isoformat()
+        entry = {"dataset": {"id": dataset, "task_id": task}, "date": today}
+        value = round(100 * self.accuracy.macro.value, 2)
+        return [{**entry, "value": value} | ({"notes": notes} if notes else {})]
 
     def __str__(self) -> str:
         from evaluation.reporting.tables import pair_table, selection_table

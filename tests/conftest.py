@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,11 @@ def micro_config(**changes: object) -> BenchmarkConfig:
     }
     return BenchmarkConfig(**{**settings, **changes})
 
+
+# `make test-integrations` names this folder, whose tests need an environment of their own.
+collect_ignore = (
+    [] if any("integrations" in argument for argument in sys.argv) else ["integrations"]
+)
 
 LONGEST = (
     "train/common/test_ranks.py",

@@ -153,12 +153,19 @@ class FrameReader:
 
 
 def resize_frames(pixels: np.ndarray, size: int) -> np.ndarray:
-    """Resize (T, height, width, 3) uint8 frames to (T, size, size, 3), as inputs of a model."""
-    import torch
-    from torchvision.transforms.v2 import InterpolationMode
-    from torchvision.transforms.v2.functional import resize
+    """Resize (T, height, width, 3) uint8 frames to (T, size, size, 3), as inputs of a model.
 
-    # Pillow's result differs by at most 2 (of 255), and takes five times as long.
+    Without torchvision, Pillow resizes them, which takes five times as long. Of the values, 0.02%
+    then differ, by at most 2 of 255.
+    """
+    try:
+        import torch
+        from torchvision.transforms.v2 import InterpolationMode
+        from torchvision.transforms.v2.functional import resize
+    except ModuleNotFoundError:
+        images = [Image.fromarray(frame) for frame in pixels]
+        resized = [image.resize((size, size), Image.Resampling.BICUBIC) for image in images]
+        return np.stack([np.asarray(image) for image in resized])
     channels_first = torch.from_numpy(pixels).permute(0, 3, 1, 2)
     resized = resize(channels_first, [size, size], InterpolationMode.BICUBIC, antialias=True)
     return resized.permute(0, 2, 3, 1).contiguous().numpy()

@@ -272,21 +272,11 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
     for url in server.urls:
         try:
             with open_client(openai.OpenAI, url, timeout=10) as client:
-                models = {m.id: m.model_extra or {} for m in client.models.list()}
+                origins[url] = _find_origin(client, server.model, url)
         except openai.AuthenticationError as error:
             raise authentication_error(url, error) from error
         except (openai.OpenAIError, *MALFORMED_REPLY_ERRORS) as error:
             problems[url] = error
-            continue
-        if server.model not in models:
-            raise UserError(
-                f"{url} does not serve server.model={server.model}: give one of the models that it "
-                f"serves ({', '.join(models) or 'none'})",
-                code="unknown-model",
-            )
-        served = models[server.model]
-        parent = models.get(served.get("parent"), {}).get("root")
-        origins[url] = {"root": served.get("root"), "parent": parent}
     if not origins:
         lines = [
             f"{url} does not list its models ({_describe(error)})"
@@ -302,6 +292,43 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
             code="different-models",
         )
     return origin
+
+
+def _find_origin(client: openai.OpenAI, name: str, url: str) -> dict[str, str | None]:
+    """Return what a server reports of the origin of a model; see `served_origin`."""
+    try:
+        models = {m.id: m.model_extra or {} for m in client.models.list()}
+    except openai.InternalServerError:
+        # `transformers serve` fails to list its models if there is no cache of the hub.
+        if not _serves_folder(client, name):
+            raise
+        return {"root": None, "parent": None}
+    if name in models:
+        served = models[name]
+        parent = models.get(served.get("parent"), {})
+        return {"root": served.get("root"), "parent": parent.get("root")}
+    # The list of `transformers serve` lacks models that are not in that cache.
+    if _serves_folder(client, name):
+        return {"root": None, "parent": None}
+    raise UserError(
+        f"{url} does not serve server.model={name}: give one of the models that it serves "
+        f"({', '.join(models) or 'none'})",
+        code="unknown-model",
+    )
+
+
+def _serves_folder(client: openai.OpenAI, name: str) -> bool:
+    """Return whether a model is a folder, and a server responds to a short request to it."""
+    message = {"role": "user", "content": "Hello"}
+    if not Path(name).is_dir():
+        return False
+    try:
+        client.with_options(timeout=60).chat.completions.create(
+            model=name, messages=[message], max_tokens=1
+        )
+    except openai.OpenAIError:
+        return False
+    return True
 
 
 def _describe(error: Exception) -> str:

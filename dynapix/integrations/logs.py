@@ -1,0 +1,113 @@
+"""Read the responses in the logs of evaluation harnesses."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from conf.errors import UserError
+
+ZSTANDARD, LOCAL_HEADER = 93, 30
+"""Zip files: the number of a compression that Python reads from 3.14 on; bytes before a name."""
+
+
+@dataclass(frozen=True)
+class LoggedResponse:
+    """A response in a log: its text, and whether it ended at the limit of tokens."""
+
+    text: str
+    truncated: bool
+
+
+@dataclass(frozen=True)
+class Log:
+    """A model's responses by item id."""
+
+    model: str
+    responses: dict[str, LoggedResponse]
+
+
+def read_inspect(path: Path) -> Log:
+    """Read a log of `inspect eval`, a file *.eval or *.json.
+
+    Raises:
+        UserError: The file is not such a log, its evaluation did not finish, or it asked items
+            several times.
+    """
+    try:
+        if zipfile.is_zipfile(path):
+            header, samples = _read_archive(path)
+        else:
+            header = json.loads(path.read_text())
+            samples = header["samples"]
+        status, model = header["status"], header["eval"]["model"]
+        rows = [(s["id"], s["epoch"], s["output"]) for s in samples]
+        responses = {name: _read_output(output) for name, _, output in rows}
+    except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
+        raise UserError(
+            f"{path} is not a log of inspect eval, or it is damaged: {error}", code="damaged-file"
+        ) from error
+    if status != "success":
+        raise UserError(
+            f"{path}: the evaluation has the status {status}: finish it with inspect eval-retry",
+            code="unfinished-run",
+        )
+    if any(epoch > 1 for _, epoch, _ in rows):
+        raise UserError(
+            f"{path} has several epochs: evaluate again with --epochs 1", code="repeated-items"
+        )
+    return Log(model, responses)
+
+
+def _read_archive(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    with zipfile.ZipFile(path) as archive, open(path, "rb") as file:
+
+        def read(info: zipfile.ZipInfo) -> dict[str, Any]:
+            if info.compress_type != ZSTANDARD:
+                return json.loads(archive.read(info))
+            file.seek(info.header_offset)
+            # The local header ends with the lengths of the name and of further fields.
+            lengths = struct.unpack("<26x2H", file.read(LOCAL_HEADER))
+            file.seek(sum(lengths), os.SEEK_CUR)
+            packed = file.read(info.compress_size)
+            return json.loads(pa.decompress(packed, info.file_size, "zstd", asbytes=True))
+
+        infos = archive.infolist()
+        samples = [read(info) for info in infos if info.filename.startswith("samples/")]
+        return read(archive.getinfo("header.json")), samples
+
+
+def _read_output(output: dict[str, Any]) -> LoggedResponse:
+    choice = output["choices"][0]
+    content = choice["message"]["content"]
+    if not isinstance(content, str):
+        content = "".join(part["text"] for part in content if part["type"] == "text")
+    return LoggedResponse(content, choice["stop_reason"] == "max_tokens")
+
+
+def read_lmms_eval(path: Path) -> Log:
+    """Read a log of lmms-eval with `--log_samples`, a file *_samples_dynapix_selection.jsonl.
+
+    Raises:
+        UserError: The file is not such a log.
+    """
+    responses = {}
+    try:
+        for line in path.read_text().splitlines():
+            row = json.loads(line)
+            # The task writes the id before the question.
+            item_id, text = row["input"].partition(": ")[0], row["filtered_resps"]
+            responses[item_id] = LoggedResponse(text if isinstance(text, str) else text[0], False)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise UserError(
+            f"{path} is not a log of lmms-eval's samples, or it is damaged: {error}",
+            code="damaged-file",
+        ) from error
+    return Log(path.parent.name, responses)

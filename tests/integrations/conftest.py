@@ -1,0 +1,90 @@
+"""A served student, and its answers in `evaluation.select`."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from conf.compose import compose
+from conf.entry import Run
+from conf.files import read_json_lines, write_json
+from conf.runs import open_run
+from conf.schema import ExportModelCommand, SelectCommand, ServerConfig, SftCommand
+from data.store import Store
+from evaluation import select
+from tests.teacher.server_process import ROOT, transformers_server
+from train import export, sft
+
+HARNESSES = ROOT / ".venv-harnesses" / "bin"
+
+
+@dataclass(frozen=True)
+class Served:
+    """A student on a server.
+
+    Attributes:
+        model: Its name on the server.
+        texts: Its responses in answer mode, by item id, that `evaluation.select` measured.
+        accuracy: The macro accuracy that `evaluation.select` measured.
+    """
+
+    url: str
+    model: str
+    store: Store
+    texts: dict[str, str]
+    accuracy: float
+
+
+@pytest.fixture(scope="session")
+def served(micro, micro_store, tmp_path_factory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("served")
+    overrides = ["student=tiny", "+exp=answer_only", "train.precision=fp32"]
+    settings = compose("train.sft", SftCommand, overrides)
+    train = replace(settings.train, max_steps=8, batch=8, evaluations=1, generated_items=0)
+    shared = {"store": str(micro_store.folder.parent), "checkpoints": str(folder), "workers": 1}
+    settings = replace(settings, benchmark=micro, train=train, run="answers", **shared)
+    trained = Run("answers", folder / "sft" / "answers")
+    open_run(trained, asdict(settings), "train.sft")
+    write_json(trained.folder / "metrics.json", sft.main.__wrapped__(settings, trained))
+    exported = ExportModelCommand(**{**shared, "run": "answers", "format": "fp32", "verify": False})
+    into = folder / "export_model"
+    into.mkdir()
+    export.main.__wrapped__(exported, Run("answers", into))
+    server = transformers_server(into / "student", folder)
+    server.start()
+    name = str(into / "student")
+    command = SelectCommand(
+        benchmark=micro, student=settings.student, model=str(trained.folder),
+        server=ServerConfig(url=server.url, model=name), modes=["answer"], **shared,
+    )  # fmt: skip
+    run = folder / "select" / "answers"
+    run.mkdir(parents=True)
+    metrics = select.main.__wrapped__(command, Run("answers", run))
+    rows = [row for row in read_json_lines(run / "answers.jsonl") if "item_id" in row]
+    texts = {row["item_id"]: row["text"] for row in rows}
+    # The student chooses several letters, so that equal answers are no accident.
+    assert len(set(texts.values())) > 1
+    yield Served(server.url, name, micro_store, texts, metrics["answer_macro"])
+    server.stop()
+
+
+@pytest.fixture
+def run_harness(served, tmp_path) -> Callable[..., str]:
+    """Runs a program of `.venv-harnesses` in an empty folder, and returns what it prints."""
+
+    def run(*command: str, **environment: str) -> str:
+        path = Path(HARNESSES / command[0])
+        changes = {"OPENAI_API_KEY": "none", "OPENAI_BASE_URL": served.url, **environment}
+        done = subprocess.run(
+            [path, *command[1:]], cwd=tmp_path, env={**os.environ, **changes}, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=300,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout
+        return done.stdout
+
+    return run
