@@ -39,7 +39,8 @@ def test_named_modules_exist() -> None:
         for module in re.findall(r"python -m\s+([\w.]+)", page.read_text()):
             is_benchmark = module.startswith("benchmarks.")
             path = ROOT / f"{module.replace('.', '/')}.py"
-            is_command = module in SCHEMAS or module == "dynapix"
+            is_program = (ROOT / module.replace(".", "/") / "__main__.py").exists()
+            is_command = module in SCHEMAS or is_program
             assert path.exists() if is_benchmark else is_command, f"{page.name}: {module}"
 
 
