@@ -158,7 +158,8 @@ def main() -> None:
         modes = f"modes=[{','.join(variant.modes)}]"
         evaluation = [*EVALUATION, modes, model]
         store, rows = open_benchmark(Path(args.store), args.benchmark), []
-        for control in (UNCHANGED, *(CONTROLS if variant.controls and seed == 0 else ())):
+        controls = [c for c in CONTROLS if c != MATCHED_ANCHOR or store.selection("test", c)]
+        for control in (UNCHANGED, *(controls if variant.controls and seed == 0 else ())):
             name, overlay = run, []
             if control != UNCHANGED:
                 name, overlay = f"{run}-{control}", [f"+exp={control}"]
@@ -227,7 +228,8 @@ def print_accuracies(
 def print_baselines(store: Store) -> None:
     print_header("strategy", *FAMILIES, "macro")
     for row in baseline_results(store.selection("test"), store, seed=0):
-        print_row(row.name, *(f"{100 * row.metrics[name]:.1f}" for name in (*FAMILIES, "macro")))
+        found = [row.metrics.get(name) for name in (*FAMILIES, "macro")]
+        print_row(row.name, *("-" if x is None else f"{100 * x:.1f}" for x in found))
 
 
 def print_differences(
@@ -261,7 +263,7 @@ def print_controls(
             cells.append(f"{100 * mean:.1f} ({difference})")
         pairs = credit_matrix(table[table.control == MATCHED_ANCHOR], name, mode)
         by_family = pairs.groupby("family").mean().mean(axis=1)
-        cells += [f"{100 * by_family[family]:.1f}" for family in ("event", "time")]
+        cells += [f"{100 * by_family[f]:.1f}" if len(pairs) else "-" for f in ("event", "time")]
         print_row(f"{name}, {mode}", *cells)
 
 
