@@ -22,6 +22,8 @@ def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
     from data.publish.hub import push_folder
     from data.publish.huggingface import summarize
 
+    if cfg.archive is not None:
+        return export_archive(cfg)
     shards = export_dataset(cfg) if cfg.format == "dataset" else export_rows(cfg)
     summary = summarize(shards)
     text = f"{cfg.folder}\n{summary.to_string(float_format='{:,.1f}'.format)}"
@@ -49,6 +51,17 @@ def export_dataset(cfg: ExportCommand) -> list[Shard]:
         for name, benchmark in benchmarks.items()
     }
     return ensure_export(stores, Path(cfg.folder), cfg.images)
+
+
+def export_archive(cfg: ExportCommand) -> dict[str, float]:
+    """Write a built benchmark as one file."""
+    from data.build import ensure_benchmark
+    from data.publish.archive import write_archive
+
+    path = Path(cfg.archive)
+    write_archive(ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers), path)
+    log.info("%s", path)
+    return {"bytes": float(path.stat().st_size)}
 
 
 def export_rows(cfg: ExportCommand) -> list[Shard]:

@@ -45,7 +45,8 @@ def load(
 
     Args:
         benchmark: The name of a preset, such as `tiny`, also with the name of a world, such as
-            `tiny-near`, or the folder of a built benchmark.
+            `tiny-near`, the folder of a built benchmark, or the path or address of an archive that
+            `python -m data.export archive=FILE` wrote, which is unpacked into `store`.
         split: `train` or `test`.
         store: The folder of the built benchmarks.
         frames: The number of frames of a prefix, evenly spaced. A shorter prefix has all its
@@ -66,13 +67,22 @@ def load(
         if value is not None and value < 1:
             raise UserError(f"{name}={value}: give 1 or more", code="invalid-setting")
     name, root = expand_path(str(benchmark)), Path(expand_path(str(store)))
+    opened = _open(name, root)
+    count = frames or opened.manifest["config"]["prefix_frames"]
+    return Benchmark(opened, split, count, image_size, pool)
+
+
+def _open(name: str, root: Path) -> Store:
+    """Return the benchmark of an archive, a folder, or a preset, which is built if necessary."""
+    if name.endswith(".zip") or name.startswith(("http://", "https://")):
+        # A progress bar needs one more package.
+        from data.publish.archive import open_archive
+
+        return open_archive(name, root)
     folder = Path(name)
     if not (folder / MANIFEST).exists():
         folder = root / name
-    is_built = (folder / MANIFEST).exists()
-    opened = open_store(folder) if is_built else _open_preset(name, root)
-    count = frames or opened.manifest["config"]["prefix_frames"]
-    return Benchmark(opened, split, count, image_size, pool)
+    return open_store(folder) if (folder / MANIFEST).exists() else _open_preset(name, root)
 
 
 def preset_names(group: str = "benchmark") -> list[str]:

@@ -93,6 +93,9 @@ class ExportCommand(CommandConfig):
     format: str = setting("dataset", ("dataset", "trl", "sharegpt", "swift", "embedding"))
     """dataset (all tables as parquet files), or training samples as rows for other trainers: trl,
     sharegpt (LLaMA-Factory), swift (ms-swift) or embedding (sentence-transformers)."""
+    archive: str | None = path(None)
+    """Zip file to write the built benchmark to, which `dynapix.load(FILE)` opens, instead of an
+    export."""
     push: str | None = None
     """Dataset repository on the Hugging Face hub, ORGANISATION/NAME, to which the export is
     uploaded; null does not upload it."""
@@ -108,6 +111,11 @@ class ExportCommand(CommandConfig):
             yield (
                 f"{group}format={self.format}: rows are of one benchmark and have images; leave "
                 f"{group}also and {group}images out"
+            )
+        if self.archive is not None and (self.also or self.push or self.format != "dataset"):
+            yield (
+                f"{group}archive={self.archive}: an archive holds one benchmark; leave "
+                f"{group}also, {group}push and {group}format out"
             )
         if not self.folder:
             yield f"{group}folder= is empty: name a folder, such as folder=exports/tiny"
