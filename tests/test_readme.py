@@ -93,8 +93,12 @@ def test_python_examples_run(micro_store, tmp_path, monkeypatch, capsys) -> None
     server = ChatServer(lambda request: f"Answer: {'ABCD'[len(server.requests) % 4]}")
     monkeypatch.setenv("OPENAI_BASE_URL", server.url)
     monkeypatch.setenv("OPENAI_API_KEY", "none")
+    monkeypatch.setenv("MPLBACKEND", "agg")
     examples = [code for page in PAGES for code in PYTHON.findall(page.read_text())]
     assert examples
+    notebook = json.loads((ROOT / "examples" / "evaluate.ipynb").read_text())
+    cells = [cell["source"] for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    examples.append("\n".join(map("".join, cells)))
     for code in examples:
         exec(compile(code, "example", "exec"), {})
     assert "Selection accuracy (%)" in capsys.readouterr().out
