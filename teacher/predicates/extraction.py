@@ -68,6 +68,8 @@ def extract_facts(
         for i in range(len(scene.objects))
     )
     contacts = [c.objects for c in collisions_in(scene, cut + 1, target)]
+    others = [*collisions_in(scene, cut, cut), *collisions_in(scene, target + 1, scene.frames)]
+    later = [c.objects for c in others]
     return Facts(
         instant="at the end of the observation" if cut == stop else "just before the contact",
         moment=moment,
@@ -78,6 +80,9 @@ def extract_facts(
         contacts=tuple(describe_meeting(scene, pair, cut) for pair in dict.fromkeys(contacts)),
         close=close_pairs(scene, target),
         records_contacts=scene.records_contacts,
+        later=tuple(
+            tuple(scene.objects[k].noun_phrase for k in pair) for pair in dict.fromkeys(later)
+        ),
     )
 
 

@@ -118,7 +118,8 @@ class Facts:
     the target. `courses` are pairs on a collision course at the cut. `contacts` are all pairs that
     collide from the cut to the target. `close` are pairs that are very close at the target. These
     three are unknown, and empty, if `records_contacts` is false. `heavier` are pairs of which the
-    first object is known to be heavier, by its material.
+    first object is known to be heavier, by its material. `later` are pairs that meet at the cut or
+    after the target: no rationale says so, but a text that does is not false.
     """
 
     instant: str
@@ -131,6 +132,7 @@ class Facts:
     close: tuple[Closeness, ...]
     records_contacts: bool = field(default=True, kw_only=True)
     heavier: tuple[tuple[str, str], ...] = field(default=(), kw_only=True)
+    later: tuple[tuple[str, str], ...] = field(default=(), kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -313,20 +313,20 @@ class CandidateReader(Reader):
 
     # Whole candidates.
 
-    def _agree(self, agrees: bool, tag: Tag) -> None:
+    def _agree(self, agrees: bool, tag: Tag, names: Sequence[str] = ()) -> None:
         for letter in self.letters:
-            self.add("agrees", (), "", agrees, TARGET, tag, letter)
+            self.add("agrees", names, "", agrees, TARGET, tag, letter)
 
-    def on_agree(self, tag: Tag) -> None:
+    def on_agree(self, tag: Tag, names: Sequence[str] = ()) -> None:
         if not self.letters or self.near().name == "object":
             raise UnreadableError
-        self._agree(not self.denied, tag)
+        self._agree(not self.denied, tag, names)
         self.skip({"agree"})
         self.take("prediction")
 
     def on_closest(self, tag: Tag) -> None:
         self.unplaced = None
-        self.on_agree(tag)
+        self.on_agree(tag, self.objects if len(self.objects) == 1 else ())
 
     def on_differ(self, tag: Tag) -> None:
         self._agree(self.denied, tag)

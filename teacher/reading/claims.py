@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from itertools import product
 from typing import NamedTuple
 
@@ -47,10 +47,10 @@ class Claim(NamedTuple):
     Kinds for an object: "mention" (it exists), "region", "direction", "speed", "still" (at rest),
     "extent", "sight", "leaves", "enters". For a pair: "course", "meeting", "time" (of the meeting),
     "close", "close region" (of a close pair), "place of either" (of the pair or its second object).
-    For a candidate: "agrees", "other objects"; objects: "region", "lacks", "extra", "displaced".
-    For two or three objects, of the scene or of a candidate: the kinds of relations (see
-    `teacher.predicates.relations`), and "weight". "unreadable" stands for a sentence that could not
-    be read, and always has the verdict "unknown".
+    For a candidate: "agrees" (of the place of its subject, if any), "other objects"; objects:
+    "region", "lacks", "extra", "displaced". For two or three objects, of the scene or of a
+    candidate: the kinds of relations (see `teacher.predicates.relations`), and "weight".
+    "unreadable" stands for a sentence that could not be read, and always has the verdict "unknown".
     """
 
     kind: str
@@ -79,6 +79,7 @@ class IndexedPredicates:
         self.courses = {frozenset(m.objects): m.when for m in predicates.courses}
         self.contacts = {frozenset(m.objects): m.when for m in predicates.contacts}
         self.close = {frozenset(c.objects): c.region for c in predicates.close}
+        self.later = [frozenset(pair) for pair in predicates.later]
         self.heavier = predicates.heavier
         self.records_contacts = predicates.records_contacts
         self.candidates = {c.letter: c for c in predicates.candidates}
@@ -161,19 +162,24 @@ class IndexedPredicates:
         if view is None or not set(claim.subjects) <= self.objects.keys():
             return None
         shown = {o.object for o in view.objects if o.target_sight == "shown"}
-        at_target = relation in view.statements if shown >= set(claim.subjects) else None
+        at_target = _holds(relation, view.statements) if shown >= set(claim.subjects) else None
         if claim.candidate is not None or claim.when in (TARGET, BETWEEN):
             # A candidate that lacks an object does not show it in any relation.
-            return False if claim.candidate is not None and at_target is None else at_target
+            lacks = claim.candidate is not None and not shown >= set(claim.subjects)
+            return False if lacks else at_target
         shown = {o.object for o in self.objects.values() if o.sight == "shown"}
-        at_cut = relation in self.observed if shown >= set(claim.subjects) else None
+        at_cut = _holds(relation, self.observed) if shown >= set(claim.subjects) else None
         return at_cut if claim.when == CUT else _either(at_cut, at_target)
 
     def _truth_in_candidate(self, letter: str, claim: Claim) -> bool | None:
         if letter not in self.candidates:
             return None
         if claim.kind == "agrees":
-            return self.candidates[letter].agrees
+            agrees = self.candidates[letter].agrees
+            # A wrong candidate may show the object of the claim as close to its place.
+            distance = self._find_distance(letter, *claim.subjects[:1])
+            is_close = distance is not None and describe_distance(distance, self.bounds) is None
+            return None if is_close and not agrees else agrees
         if claim.kind == "other objects":
             return self.candidates[letter].other_objects
         differences = self.differences[letter]
@@ -193,15 +199,21 @@ class IndexedPredicates:
     def _find_extent(self, letter: str, name: str) -> str | None:
         """Return how far from its place at the target a candidate shows an object, in words; None
         if it shows the object there, or if the predicates do not tell."""
-        views = [self.views[v] for v in (letter, self.answer) if v in self.views]
-        places = [v.places.image[name] for v in views if name in v.places.image]
-        if self.bounds is not None and len(places) == 2:
-            extent = describe_distance(math.dist(*places), self.bounds)
+        distance = self._find_distance(letter, name)
+        if distance is not None:
+            extent = describe_distance(distance, self.bounds)
             if extent is not None:
                 return extent
         # The largest difference of a candidate has an extent even if it is small.
         difference = self.differences[letter].get(name)
         return None if difference is None else difference.extent
+
+    def _find_distance(self, letter: str, name: str | None = None) -> float | None:
+        """Return the distance of an object in a candidate from its place at the target, as a share
+        of the image; None if one of them does not show it, or if the predicates have no views."""
+        views = [self.views[v] for v in (letter, self.answer) if v in self.views]
+        places = [v.places.image[name] for v in views if name in v.places.image]
+        return math.dist(*places) if len(places) == 2 else None
 
     def _find_region(self, letter: str, name: str) -> str | None:
         """Return the region where the view of a candidate shows an object; None if it does not show
@@ -234,6 +246,15 @@ def _same(value: str, actual: str | None) -> bool | None:
         return True
     side = value.removeprefix("near the ")
     return None if side in actual else False
+
+
+def _holds(relation: Relation, statements: Collection[Relation]) -> bool | None:
+    """Return whether a relation is among the statements of a frame; None if a stricter one is: what
+    is right against an object is near it, too."""
+    if relation in statements:
+        return True
+    stricter = relation._replace(value="against")
+    return None if relation.value == "near" and stricter in statements else False
 
 
 def _either(*found: bool | None) -> bool | None:
@@ -304,7 +325,10 @@ def _course(predicates: IndexedPredicates, claim: Claim) -> bool | None:
     if claim.value == COARSE and _has_pair(predicates.contacts, claim):
         # "Headed for contact" also describes a pair that meets without a collision course.
         return True if claim.affirmed else None
-    return False
+    # The predicates have no courses of an object that is hit at the cut, which has no heading.
+    facts = [predicates.objects[name] for name in claim.subjects if name in predicates.objects]
+    is_hit = any(o.heading is None and o.speed not in (None, "stationary") for o in facts)
+    return None if is_hit else False
 
 
 def _meeting(predicates: IndexedPredicates, claim: Claim) -> bool | None:
@@ -317,13 +341,15 @@ def _meeting(predicates: IndexedPredicates, claim: Claim) -> bool | None:
     met = [when for pair, when in predicates.courses.items() if set(claim.subjects) <= pair]
     if _has_pair(predicates.contacts, claim) or any(when not in (None, "unseen") for when in met):
         return True
-    return None if "unseen" in met else False
+    return None if "unseen" in met or _has_pair(predicates.later, claim) else False
 
 
 def _time(predicates: IndexedPredicates, claim: Claim) -> bool | None:
     pair = frozenset(claim.subjects)
     when = predicates.contacts.get(pair) or predicates.courses.get(pair)
-    return None if when in (None, "unseen") else when == claim.value
+    # What is imminent comes soon, too.
+    is_wide = when == "imminent" and claim.value == "soon"
+    return None if when in (None, "unseen") or is_wide else when == claim.value
 
 
 def _close(predicates: IndexedPredicates, claim: Claim) -> bool | None:

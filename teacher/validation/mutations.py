@@ -70,6 +70,7 @@ def replace_partners(text: str, predicates: Predicates, rng: Random) -> Iterator
     """Replace the second object in clauses of the motion analysis that state that a pair meets."""
     names = [facts.object for facts in predicates.objects]
     met = {frozenset(m.objects) for m in (*predicates.courses, *predicates.contacts)}
+    met |= {frozenset(pair) for pair in predicates.later}
     start, stop = text.find("Motion analysis:"), text.find("Prediction:")
     for clause in re.finditer(r"[^.;]+[.;]", text[start:stop]):
         begin, end = start + clause.start(), start + clause.end()
@@ -122,8 +123,9 @@ HEIGHTS = {
     "below": ["above", "level with"],
     "level with": ["above", "below"],
 }
+# An object that is right against another is also near it.
 GAPS = {
-    "right against": ["near", "well apart from"],
+    "right against": ["well apart from"],
     "near": ["right against", "well apart from"],
     "well apart from": ["near", "right against"],
 }
@@ -133,6 +135,8 @@ EXTREMES = {
     "leftmost": "rightmost", "rightmost": "leftmost", "topmost": "lowest", "lowest": "topmost"
 }  # fmt: skip
 
+# What is imminent comes soon, too.
+FALSE_TIMES = {"imminent": ["later"], "soon": ["imminent", "later"], "later": ["imminent", "soon"]}
 # An object that is far off is also clearly off.
 FALSE_EXTENTS = {
     "slightly": ["clearly", "far"],
@@ -187,6 +191,12 @@ def replace_passed(text: str, predicates: Predicates, rng: Random) -> Iterator[M
             yield text[:start] + name + text[stop:], (start, start + len(name))
 
 
+def replace_times(text: str, rng: Random) -> Iterator[Mutation]:
+    """Replace a word for the time of a contact by one that is false."""
+    for match in re.finditer(rf"\b(?:{'|'.join(FALSE_TIMES)})\b(?!-)", text):
+        yield replace_match(text, match, rng.choice(FALSE_TIMES[match[0]]))
+
+
 def replace_extents(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
     """Replace "slightly", "clearly" or "far" before "off" by a word that is false."""
     for match in re.finditer(rf"\b(?:{'|'.join(FALSE_EXTENTS)})(?= off\b)", text):
@@ -220,7 +230,7 @@ MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = 
     "direction": lambda text, p, rng: replace_words(text, COMPASS, rng, p),
     "region": lambda text, p, rng: replace_words(text, ALL_REGIONS, rng),
     "speed": lambda text, p, rng: replace_words(text, MOVING, rng, p),
-    "time": lambda text, p, rng: replace_words(text, ("imminent", "soon", "later"), rng),
+    "time": lambda text, p, rng: replace_times(text, rng),
     "color": replace_colors,
     "pair": replace_partners,
     "answer": replace_answer,

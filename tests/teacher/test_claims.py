@@ -12,6 +12,7 @@ prose.jsonl: rationales written by a language model, with the predicates that it
 
 import json
 import re
+from collections import Counter
 from dataclasses import replace
 from itertools import product
 from math import dist
@@ -308,3 +309,46 @@ def test_validator_rejects_contradictions():
     text, _ = next(MUTATIONS["color"](text, predicates, Random(0)))
     reasons = validate_rationale(text, predicates, item, cfg).reasons
     assert {reason.split(":")[0] for reason in reasons} == {"contradicts"}
+
+
+NEARNESS = {"right against": "supported", "near": "unknown", "well apart from": "contradicted"}
+"""Words for a gap, with their verdicts of two objects that are against each other."""
+
+
+def verdicts_of(section: str, text: str, predicates, kind: str) -> set[str]:
+    claims = extract_claims(f"{SECTION[section]}: {text}", predicates)
+    return {claim.verdict for claim in claims if claim.kind == kind}
+
+
+def test_what_holds_more_strictly_or_later_is_not_contradicted() -> None:
+    """A reader of 600 contradicted claims found that such ones were true."""
+    found = Counter()
+    for _, predicates in random_cases(400, RelationBounds()):
+        for kind, names, value in predicates.target.statements:
+            if kind == "gap" and value == "against":
+                for words, verdict in NEARNESS.items():
+                    text = f"The {names[0]} will be {words} the {names[1]}."
+                    assert verdicts_of("P", text, predicates, kind) == {verdict}
+                    found["near"] += 1
+        meetings = [*predicates.courses, *predicates.contacts]
+        known = {frozenset(m.objects) for m in meetings}
+        for pair in predicates.later:
+            if frozenset(pair) not in known:
+                text = f"The {pair[0]} and the {pair[1]} are about to meet."
+                assert verdicts_of("M", text, predicates, "meeting") == {"unknown"}
+                found["later"] += 1
+        for m in (m for m in meetings if m.when == "imminent"):
+            text = f"Contact between the {m.objects[0]} and the {m.objects[1]} comes"
+            assert verdicts_of("M", f"{text} soon.", predicates, "time") == {"unknown"}
+            assert verdicts_of("M", f"{text} later.", predicates, "time") == {"contradicted"}
+            found["soon"] += 1
+        for name, place in [*predicates.target.places.image.items()][:1]:
+            for view in predicates.views:
+                text = f"The {name} is closest to its expected place in candidate {view.letter}."
+                distance = dist(view.places.image.get(name, (9, 9)), place)
+                is_close = distance < predicates.bounds.displaced
+                is_right = view.letter == predicates.answer
+                verdict = "supported" if is_right else "unknown" if is_close else "contradicted"
+                assert verdicts_of("O", text, predicates, "agrees") == {verdict}
+                found["closest"] += is_close and not is_right
+    assert all(found[kind] > 2 for kind in ("near", "later", "soon", "closest")), found
