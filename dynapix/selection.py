@@ -381,7 +381,7 @@ class Result:
         Raises:
             UserError: The file is not a finished log, or its items are not those of `benchmark`.
         """
-        return cls._from_log(read_inspect(Path(path)), benchmark, Path(path), seed)
+        return cls._from_log(read_inspect, path, benchmark, seed)
 
     @classmethod
     def from_lmms_eval(cls, path: str | Path, benchmark: Benchmark, seed: int = 0) -> Result:
@@ -389,11 +389,15 @@ class Result:
 
         Such a log does not say whether a response ended at the limit of tokens.
         """
-        return cls._from_log(read_lmms_eval(Path(path)), benchmark, Path(path), seed)
+        return cls._from_log(read_lmms_eval, path, benchmark, seed)
 
     @classmethod
-    def _from_log(cls, log: Log, benchmark: Benchmark, path: Path, seed: int) -> Result:
-        by_id = _find_items(benchmark, [*log.responses], path)
+    def _from_log(
+        cls, read: Callable[[Path], Log], path: str | Path, benchmark: Benchmark, seed: int
+    ) -> Result:
+        file = Path(expand_path(str(path)))
+        log = read(file)
+        by_id = _find_items(benchmark, [*log.responses], file)
         outcomes = tuple(
             _read_text(by_id[name], response.text, response.truncated)
             for name, response in log.responses.items()

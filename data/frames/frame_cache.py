@@ -152,6 +152,13 @@ class FrameReader:
         return pixels if self._size is None else resize_frames(pixels, self._size)
 
 
+def encode_png(image: Image.Image) -> bytes:
+    """Return an image as a PNG, compressed quickly."""
+    png = io.BytesIO()
+    image.save(png, "PNG", compress_level=1)
+    return png.getvalue()
+
+
 def resize_frames(pixels: np.ndarray, size: int) -> np.ndarray:
     """Resize (T, height, width, 3) uint8 frames to (T, size, size, 3), as inputs of a model.
 

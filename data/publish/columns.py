@@ -6,7 +6,6 @@ frames of prefixes, candidates, targets, hard negatives and databases.
 
 from __future__ import annotations
 
-import io
 import json
 from dataclasses import asdict
 from functools import lru_cache
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from conf.schema.benchmark import PAIRED
-from data.frames.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader, encode_png
 from data.records import FrameRef, Rationale, RetrievalQuery, SelectionItem, sample_prefix_frames
 from data.store import Store
 
@@ -120,6 +119,5 @@ class RowBuilder:
 
     def _encode_png(self, frame: FrameRef) -> dict[str, Any]:
         """Encode a frame in the form that `datasets.Image` stores."""
-        png = io.BytesIO()
-        self._frames.image(frame.scene_id, frame.frame).save(png, "PNG", compress_level=1)
-        return {"bytes": png.getvalue(), "path": f"{frame.scene_id}-{frame.frame:03d}.png"}
+        png = encode_png(self._frames.image(frame.scene_id, frame.frame))
+        return {"bytes": png, "path": f"{frame.scene_id}-{frame.frame:03d}.png"}

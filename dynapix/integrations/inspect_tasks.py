@@ -30,10 +30,8 @@ from inspect_ai.solver import TaskState, generate
 
 from conf.errors import UserError
 from dynapix.benchmark import Item, load
+from dynapix.integrations import TOKENS
 from models.student.answer_parser import parse_choice
-
-TOKENS = {"reasoning": 512, "answer": 16}
-"""Maximum numbers of tokens of a response by mode, as in `evaluation.select`."""
 
 
 @task

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Sequence
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from data.frames.frame_cache import encode_png
 from models.student.prompts import Clip, Sample
 
 if TYPE_CHECKING:
@@ -44,9 +44,7 @@ def image_part(pixels: np.ndarray) -> dict[str, Any]:
 
 
 def _encode_png(pixels: np.ndarray) -> str:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG", compress_level=1)
-    return base64.b64encode(buffer.getvalue()).decode()
+    return base64.b64encode(encode_png(Image.fromarray(pixels))).decode()
 
 
 def find_difference(own: Sequence[int], served: Sequence[int], tokenizer: Any) -> str | None:

@@ -14,7 +14,6 @@ whose images are in `images/`, named by the hash of their pixels; `datasets` loa
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
@@ -29,7 +28,7 @@ from tqdm import tqdm
 from conf.files import write_bytes
 from conf.schema import ExportCommand
 from data.checks.queries import read_queries
-from data.frames.frame_cache import FrameReader
+from data.frames.frame_cache import FrameReader, encode_png
 from data.publish.folders import Shard, describe_file, write_folder
 from data.records import RetrievalQuery
 from data.store import Store
@@ -115,7 +114,7 @@ class PictureFolder:
         digest = hashlib.sha256(repr(pixels.shape).encode() + pixels.tobytes()).hexdigest()
         name = f"{IMAGES}/{digest[:32]}.png"
         if not (self._folder / name).exists():
-            write_bytes(self._folder / name, write_png(Image.fromarray(pixels)))
+            write_bytes(self._folder / name, encode_png(Image.fromarray(pixels)))
         return name
 
     def add_all(self, images: Iterable[np.ndarray]) -> list[str]:
@@ -168,13 +167,7 @@ def query_row(query: RetrievalQuery, frames: FrameReader, count: int) -> Row:
 
 def store_image(image: Image.Image) -> dict[str, Any]:
     """Return an image in the form that `datasets.Image` stores."""
-    return {"bytes": write_png(image), "path": None}
-
-
-def write_png(image: Image.Image) -> bytes:
-    png = io.BytesIO()
-    image.save(png, "PNG", compress_level=1)
-    return png.getvalue()
+    return {"bytes": encode_png(image), "path": None}
 
 
 def _write_table(path: Path, rows: Iterator[Row]) -> None:

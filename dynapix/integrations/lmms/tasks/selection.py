@@ -24,10 +24,8 @@ from PIL import Image
 
 from conf.errors import UserError
 from dynapix.benchmark import Item, load
+from dynapix.integrations import TOKENS
 from models.student.answer_parser import parse_choice
-
-TOKENS = {"reasoning": 512, "answer": 16}
-"""Maximum numbers of tokens of a response by mode, as in `evaluation.select`."""
 
 
 class SelectionTask(ConfigurableMessagesTask):
