@@ -137,10 +137,10 @@ test: setup vllm-env ## Run all tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 # The harnesses use torch and transformers of .venv, so that these are installed once.
-$(HARNESSES_READY): pyproject.toml tests/integrations/excludes.txt | $(READY)
+$(HARNESSES_READY): pyproject.toml $(wildcard tests/integrations/*.txt) | $(READY)
 	$(BIN)/uv venv --quiet --allow-existing --python $(PYTHON) .venv-harnesses
-	$(BIN)/uv pip install --quiet --python .venv-harnesses/bin/python --editable '.[inspect,lmms]' openai \
-		--excludes tests/integrations/excludes.txt
+	$(BIN)/uv pip install --quiet --python .venv-harnesses/bin/python --editable '.[inspect,lmms,mteb,verifiers]' \
+		--excludes tests/integrations/excludes.txt --overrides tests/integrations/overrides.txt
 	$(BIN)/python -c "$(PRINT_PACKAGES)" > "$$(.venv-harnesses/bin/python -c "$(PRINT_PACKAGES)")/base.pth"
 	@touch $(HARNESSES_READY)
 

@@ -11,8 +11,10 @@ import numpy as np
 from conf.errors import UserError
 from conf.files import expand_path, write_json, write_text
 from dynapix.benchmark import Benchmark, Query, refuse_repeated
+from dynapix.integrations.logs import read_mteb
 from dynapix.saved_runs import saved_run
 from evaluation.metrics.arrays import to_array
+from evaluation.metrics.ranking import share_above
 from evaluation.metrics.results import RetrievalReport, RetrievalResult, retrieval_results
 from evaluation.retrieval.exact_search import Ranks, exact_ranks, write_ranks
 
@@ -69,6 +71,42 @@ class RetrievalScores:
             write_json(folder / "report.json", asdict(RetrievalReport(store.identity, self.rows)))
             write_text(folder / "report.txt", f"{self}\n")
         return folder
+
+    @classmethod
+    def from_mteb(cls, path: str | Path, benchmark: Benchmark, seed: int = 0) -> RetrievalScores:
+        """Read the predictions that MTEB saves of `dynapix.integrations.mteb_task.RetrievalTask`
+        with `prediction_folder`.
+
+        Args:
+            benchmark: The benchmark of the task.
+
+        Raises:
+            UserError: The file does not contain such predictions, or these are of other queries or
+                frames than those of `benchmark`.
+        """
+        file = Path(expand_path(str(path)))
+        name, found = read_mteb(file)
+        queries, frames = list(benchmark.retrieval), [f.name for f in benchmark.database]
+        try:
+            scores = np.array([[found[q.query_id][f] for f in frames] for q in queries])
+        except KeyError as error:
+            raise UserError(
+                f"{file} lacks the scores of {error}: it is of another benchmark than "
+                f"{benchmark.store.folder}, or of a part of it",
+                code="different-builds",
+            ) from error
+        index = {frame: k for k, frame in enumerate(frames)}
+
+        def choose(names: list[str]) -> np.ndarray:
+            return scores[np.arange(len(queries)), [index[n] for n in names]][:, None]
+
+        targets = choose([q.target.name for q in queries])
+        counts = np.stack([(scores > targets).sum(1), (scores == targets).sum(1)])[:, None]
+        twins = [t.name for q in queries if (t := q.record.factual_twin)]
+        twin_above = share_above(choose(twins), targets).T if twins else None
+        ranks = Ranks.from_counts((None,), counts, len(frames), 0, 0.0, twin_above)
+        rows = retrieval_results(benchmark.name, name, ranks, [q.record for q in queries], seed)
+        return cls(rows, ranks, name, benchmark, queries, seed)
 
 
 def evaluate_retrieval(

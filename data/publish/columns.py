@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 
 from conf.schema.benchmark import PAIRED
 from data.frames.frame_cache import FrameReader, encode_png
+from data.publish.leaderboard import write_question
 from data.records import FrameRef, Rationale, RetrievalQuery, SelectionItem, sample_prefix_frames
 from data.store import Store
 
@@ -28,6 +29,8 @@ COLUMNS = OmegaConf.to_container(
 )
 DESCRIPTIONS: dict[str, str] = COLUMNS.pop("descriptions")
 COLUMNS |= dict.fromkeys(PAIRED, COLUMNS["selection"])
+LEADERBOARD = "leaderboard"
+"""The table of `data.publish.leaderboard`."""
 ENCODED_FRAMES = 1_000
 """Number of encoded frames that are kept in memory, at up to 100 KB each."""
 ExportedRecord = SelectionItem | RetrievalQuery | FrameRef | Rationale
@@ -88,16 +91,19 @@ class RowBuilder:
         # Items of one scene share many frames, and encoding takes most of an export's time.
         self._encode = lru_cache(maxsize=ENCODED_FRAMES)(self._encode_png)
 
-    def images_per_row(self, configuration: str) -> int:
-        """Return the maximum number of images in a row of a configuration."""
-        if not self.images or configuration == "rationales":
+    def images_per_row(self, kind: str) -> int:
+        """Return the maximum number of images in a row of a table."""
+        if not self.images or kind == "rationales":
             return 0
-        if configuration == "database":
+        if kind == "database":
             return 1
-        return self._prefix_frames + (self._negatives + 1 if configuration == "retrieval" else 4)
+        return self._prefix_frames + (self._negatives + 1 if kind == "retrieval" else 4)
 
-    def row(self, record: ExportedRecord, split: str) -> dict[str, Any]:
-        """Return a record's values by column. For a frame, `split` is the name of its database."""
+    def row(self, record: ExportedRecord, kind: str, split: str) -> dict[str, Any]:
+        """Return a record's values by column of the table `kind`. For a frame, `split` is the name
+        of its database."""
+        if kind == LEADERBOARD:
+            return write_question(record, self._frames, self._prefix_frames)
         if isinstance(record, Rationale):
             row = asdict(record) | {"split": split}
             return {name: row[name] for name in COLUMNS["rationales"]}

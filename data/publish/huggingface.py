@@ -1,12 +1,13 @@
 """Write benchmarks as a Hugging Face dataset, which can be loaded without this repository.
 
     <folder>/README.md      the dataset card, which names the files of each split
+             eval.yaml      the task of inspect_ai for a leaderboard on the hub
              export.json    the exported benchmarks' identities, and the SHA-256 of every file
              <configuration>/<split>-00000-of-00002.parquet
 
 The configurations of a benchmark are its tables: selection, matched_anchor, interventions,
-retrieval, database and rationales, as far as it has them. In a dataset of several benchmarks, their
-names begin with that of their benchmark, such as tiny-selection.
+retrieval, database, leaderboard and rationales, as far as it has them. In a dataset of several
+benchmarks, their names begin with that of their benchmark, such as tiny-selection.
 
 A killed export resumes with the shards that it has written (see `data.publish.folders`).
 """
@@ -30,12 +31,14 @@ from conf.files import write_bytes
 from conf.schema.benchmark import PAIRED, POOLS
 from data.publish.columns import (
     DESCRIPTIONS,
+    LEADERBOARD,
     ExportedRecord,
     RowBuilder,
     arrow_schema,
     list_columns,
 )
 from data.publish.folders import Shard, describe_file, write_folder
+from data.publish.leaderboard import EVAL_FILE, write_eval_file
 from data.records import SPLITS, RetrievalQuery, SelectionItem
 from data.store import DATABASES, Store
 from data.versions import component_versions
@@ -44,7 +47,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CARD = "README.md"
-EXPORT_VERSION = "5"
+EXPORT_VERSION = "6"
 """Changes whenever the same store would give another dataset."""
 GROUP_IMAGES = 512
 """Images in a parquet row group (about 30 MB at 480 x 320 px), which an export keeps in memory."""
@@ -84,7 +87,8 @@ def ensure_export(stores: Mapping[str, Store], folder: Path, images: bool) -> li
         UserError: `folder` contains something else or a damaged export, or another process is
             writing to it.
     """
-    tables = list_tables(stores)
+    tables = list_tables(stores, images)
+    leaderboards = [table.configuration for table in tables if table.kind == LEADERBOARD]
     plan = {
         "benchmarks": {name: store.identity for name, store in stores.items()},
         "rationales": digest_rationales(tables),
@@ -100,9 +104,11 @@ def ensure_export(stores: Mapping[str, Store], folder: Path, images: bool) -> li
             for table in tables:
                 shards += _write_table(unfinished, table, builders[table.benchmark], bar)
         write_bytes(unfinished / CARD, render_card(stores, shards, images).encode())
+        if leaderboards:
+            write_bytes(unfinished / EVAL_FILE, write_eval_file(leaderboards))
         return shards
 
-    return write_folder(folder, plan, write, [CARD])
+    return write_folder(folder, plan, write, [CARD, *([EVAL_FILE] if leaderboards else [])])
 
 
 @dataclass(frozen=True)
@@ -123,15 +129,15 @@ class ExportedTable:
     records: Sequence[ExportedRecord]
 
 
-def list_tables(stores: Mapping[str, Store]) -> list[ExportedTable]:
-    """Return the tables of benchmarks that are not empty."""
+def list_tables(stores: Mapping[str, Store], images: bool) -> list[ExportedTable]:
+    """Return the tables of benchmarks that are not empty; the leaderboards need `images`."""
     tables = []
     for benchmark, store in stores.items():
         prefix = f"{benchmark}-" if len(stores) > 1 else ""
         tables += [
             ExportedTable(benchmark, kind, prefix + kind, split, records)
             for (kind, split), records in _list_records(store).items()
-            if records
+            if records and (images or kind != LEADERBOARD)
         ]
     return tables
 
@@ -145,6 +151,7 @@ def _list_records(store: Store) -> dict[tuple[str, str], list[ExportedRecord]]:
     for split in SPLITS:
         queries = [q for pool in POOLS for q in store.retrieval(split, pool)]
         records["retrieval", split] = [*queries]
+    records[LEADERBOARD, "test"] = [*store.selection("test")]
     records |= {("database", name): [*store.database(name)] for name in DATABASES}
     # Rationales are written for training items.
     return records | {("rationales", "train"): [*store.rationales()]}
@@ -183,7 +190,9 @@ def _write_table(
                 pq.ParquetWriter(file, schema, compression="zstd") as writer,
             ):
                 for start in range(0, len(part), group):
-                    rows = [builder.row(r, table.split) for r in part[start : start + group]]
+                    rows = [
+                        builder.row(r, table.kind, table.split) for r in part[start : start + group]
+                    ]
                     writer.write_table(pa.Table.from_pylist(rows, schema))
                     bar.update(len(rows))
             os.replace(unfinished, path)
@@ -198,7 +207,7 @@ def render_card(stores: Mapping[str, Store], shards: Sequence[Shard], images: bo
     rows: dict[str, Counter[str]] = {}
     for shard in shards:
         rows.setdefault(shard["configuration"], Counter())[shard["split"]] += shard["rows"]
-    kinds = {t.configuration: t.kind for t in list_tables(stores)}
+    kinds = {t.configuration: t.kind for t in list_tables(stores, images)}
     columns, shown = list_columns(images), dict.fromkeys(kinds[name] for name in rows)
     text = (files("data.publish") / "templates/dataset_card.md").read_text()
     benchmarks = [_describe_benchmark(name, store) for name, store in stores.items()]

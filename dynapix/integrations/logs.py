@@ -1,4 +1,4 @@
-"""Read the responses in the logs of evaluation harnesses."""
+"""Read the responses and scores in the logs of evaluation harnesses."""
 
 from __future__ import annotations
 
@@ -111,3 +111,23 @@ def read_lmms_eval(path: Path) -> Log:
             code="damaged-file",
         ) from error
     return Log(path.parent.name, responses)
+
+
+def read_mteb(path: Path) -> tuple[str, dict[str, dict[str, float]]]:
+    """Read the predictions that MTEB saves of the task DynaPixRetrieval, a file
+    *_predictions.json. Return the model, and the score of each frame by the query's id.
+
+    Raises:
+        UserError: The file does not contain such predictions.
+    """
+    try:
+        log = json.loads(path.read_text())
+        [scores] = log["default"].values()
+        for frames in scores.values():
+            frames.items()
+        return str(log["mteb_model_meta"]["model_name"]), scores
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} does not contain predictions of MTEB, or it is damaged: {error}",
+            code="damaged-file",
+        ) from error

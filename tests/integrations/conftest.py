@@ -1,4 +1,4 @@
-"""A served student, and its answers in `evaluation.select`."""
+"""A served student and a trained retriever, and their results in `evaluation`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,19 @@ from conf.compose import compose
 from conf.entry import Run
 from conf.files import read_json_lines, write_json
 from conf.runs import open_run
-from conf.schema import ExportModelCommand, SelectCommand, ServerConfig, SftCommand
+from conf.schema import (
+    ContrastiveCommand,
+    ContrastiveTrainConfig,
+    ExportModelCommand,
+    RetrieveCommand,
+    SelectCommand,
+    ServerConfig,
+    SftCommand,
+)
 from data.store import Store
-from evaluation import select
+from evaluation import retrieve, select
 from tests.teacher.server_process import ROOT, transformers_server
-from train import export, sft
+from train import contrastive, export, sft
 
 HARNESSES = ROOT / ".venv-harnesses" / "bin"
 
@@ -31,6 +39,7 @@ class Served:
         model: Its name on the server.
         texts: Its responses in answer mode, by item id, that `evaluation.select` measured.
         accuracy: The macro accuracy that `evaluation.select` measured.
+        weights: Folder of the student's merged weights.
     """
 
     url: str
@@ -38,6 +47,7 @@ class Served:
     store: Store
     texts: dict[str, str]
     accuracy: float
+    weights: Path
 
 
 @pytest.fixture(scope="session")
@@ -69,22 +79,46 @@ def served(micro, micro_store, tmp_path_factory) -> Iterator[Served]:
     texts = {row["item_id"]: row["text"] for row in rows}
     # The student chooses several letters, so that equal answers are no accident.
     assert len(set(texts.values())) > 1
-    yield Served(server.url, name, micro_store, texts, metrics["answer_macro"])
+    yield Served(server.url, name, micro_store, texts, metrics["answer_macro"], into / "student")
     server.stop()
 
 
 @pytest.fixture
-def run_harness(served, tmp_path) -> Callable[..., str]:
+def run_harness(tmp_path) -> Callable[..., str]:
     """Runs a program of `.venv-harnesses` in an empty folder, and returns what it prints."""
 
     def run(*command: str, **environment: str) -> str:
         path = Path(HARNESSES / command[0])
-        changes = {"OPENAI_API_KEY": "none", "OPENAI_BASE_URL": served.url, **environment}
         done = subprocess.run(
-            [path, *command[1:]], cwd=tmp_path, env={**os.environ, **changes}, text=True,
+            [path, *command[1:]], cwd=tmp_path, env={**os.environ, **environment}, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=300,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout
         return done.stdout
 
     return run
+
+
+@pytest.fixture(scope="session")
+def ranked(micro, micro_store, tmp_path_factory) -> Path:
+    """The folder of a trained retriever, which `evaluation.retrieve` measured in `ranked`."""
+    folder = tmp_path_factory.mktemp("ranked")
+    train = ContrastiveTrainConfig(max_steps=2, batch=8, precision="fp32", evaluations=1)
+    shared = {"store": str(micro_store.folder.parent), "checkpoints": str(folder), "workers": 1}
+    # The harness runs in another folder than this one.
+    base = Path(
+        compose("train.contrastive", ContrastiveCommand, ["retriever=tiny"]).retriever.model
+    )
+    overrides = ["retriever=tiny", f"retriever.model={base.absolute()}", "retriever.image_size=96"]
+    preset = compose("train.contrastive", ContrastiveCommand, overrides).retriever
+    settings = ContrastiveCommand(benchmark=micro, retriever=preset, train=train, **shared)
+    trained = Run("moving", folder / "contrastive" / "moving")
+    open_run(trained, asdict(settings), "train.contrastive")
+    write_json(trained.folder / "metrics.json", contrastive.main.__wrapped__(settings, trained))
+    command = RetrieveCommand(
+        benchmark=micro, retriever=preset, model=str(trained.folder), **shared
+    )
+    run = trained.folder / "ranked"
+    run.mkdir()
+    retrieve.main.__wrapped__(command, Run("ranked", run))
+    return trained.folder

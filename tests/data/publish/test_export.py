@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import re
 import shutil
 from dataclasses import fields, replace
@@ -11,8 +13,10 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from datasets import load_dataset
 from huggingface_hub import DatasetCard
+from PIL import Image
 
 from conf.schema import TeacherConfig
 from conf.schema.benchmark import MATCHED_ANCHOR, POOLS
@@ -20,6 +24,7 @@ from data.frames.frame_cache import FrameReader
 from data.publish import huggingface
 from data.publish.columns import DESCRIPTIONS, dataset_features
 from data.publish.huggingface import ensure_export, render_card
+from data.publish.leaderboard import CELL_WIDTH, EVAL_FILE, GAP
 from data.records import SPLITS, Rationale, RetrievalQuery, SelectionItem, sample_prefix_frames
 from data.store import Store
 from teacher.narrate import narrate_store
@@ -277,3 +282,27 @@ def test_the_card_counts_the_rows_of_every_suite(exported, loaded) -> None:
     rows = {s: sum(len(loaded[name].get(s, ())) for name in tables) for s in SPLITS}
     assert sum(int(train) for train, _ in counted) == rows["train"]
     assert sum(int(test) for _, test in counted) == rows["test"]
+
+
+def test_the_leaderboard_asks_the_test_items(micro_store, exported) -> None:
+    rows = load_dataset(str(exported), "leaderboard", split="test")
+    items = micro_store.selection("test")
+    assert rows["item_id"] == [item.item_id for item in items]
+    assert rows["answer"] == [item.letter for item in items]
+    for row, item in zip(rows, items, strict=True):
+        assert item.question in row["question"]
+    png = base64.b64decode(rows[0]["image"].removeprefix("data:image/png;base64,"))
+    sheet, frames = Image.open(io.BytesIO(png)), FrameReader(micro_store)
+    target = items[0].candidates[items[0].answer]
+    frame = frames.image(target.scene_id, target.frame)
+    width = min(frame.width, CELL_WIDTH)
+    height = round(frame.height * width / frame.width)
+    left = items[0].answer * (width + GAP)
+    cell = sheet.crop((left, sheet.height - height, left + width, sheet.height))
+    assert np.array_equal(np.asarray(cell), np.asarray(frame.resize((width, height))))
+    [task] = yaml.safe_load((exported / EVAL_FILE).read_text())["tasks"]
+    assert {*task["field_spec"].values()} <= {*rows.column_names}
+    pattern = task["scorers"][0]["args"]["pattern"]
+    for text in ("So it is B.\nAnswer: B", "**Answer: B**", "answer: (B)", "Answer: **B**."):
+        assert re.findall(pattern, text) == ["B"]
+    assert not re.findall(pattern, "Answer: Blue")
