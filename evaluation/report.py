@@ -18,6 +18,7 @@ PAGE = "report.html"
 
 @command("evaluation.report", ReportCommand)
 def main(cfg: ReportCommand, run: Run) -> None:
+    from dynapix.integrations.saved_logs import save_log
     from evaluation.reporting.item_browser import browse_items
     from evaluation.reporting.measurements import (
         deduplicate,
@@ -29,6 +30,8 @@ def main(cfg: ReportCommand, run: Run) -> None:
     from evaluation.reporting.runs import RETRIEVAL_KINDS, SELECTION_KINDS, gather_runs
     from evaluation.reporting.sections import build_sections
 
+    for path in cfg.logs:
+        log.info("%s is saved in %s", path, save_log(path, Path(cfg.store), Path(cfg.saved)))
     root = Path(cfg.checkpoints)
     runs, left_out = gather_runs(root, Path(cfg.saved), cfg.runs)
     for sentence in left_out:

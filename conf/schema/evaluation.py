@@ -130,6 +130,9 @@ class ReportCommand(CommandConfig):
     saved: str = path("runs")
     """Folder of the results that the `save` methods of `dynapix.Result` and
     `dynapix.RetrievalScores` wrote."""
+    logs: list[str] = field(default_factory=list)
+    """Logs of other harnesses on benchmarks in `store`, which are saved in `saved`: of inspect_ai
+    (*.eval), lmms-eval (the samples, *.jsonl) and MTEB (*_predictions.json)."""
     items: int = setting(120, least=0)
     """Maximum number of items shown per benchmark, sampled evenly from the subtypes and from
     correct and wrong answers."""

@@ -13,6 +13,8 @@ import dynapix
 from conf.files import read_json_lines
 from conf.schema import TeacherConfig
 from data.publish.huggingface import ensure_export
+from dynapix.integrations.saved_logs import save_log
+from evaluation.reporting.runs import gather_runs
 from teacher.predicates.vocabulary import describe_item
 from tests.evaluation.models import released
 from tests.integrations.conftest import Served
@@ -61,6 +63,11 @@ def test_inspect(served, run_harness, tmp_path) -> None:
     assert entry["value"] == round(100 * served.accuracy, 2)
     assert entry["dataset"] == {"id": "someone/moving-objects", "task_id": "selection"}
 
+    store, saved = served.store.folder.parent, tmp_path / "saved"
+    check_result(dynapix.Result.load(save_log(log, store, saved), bench), served)
+    with raises_user_error("different-builds", contains=log.name):
+        save_log(log, tmp_path, saved)
+
     log.write_bytes(log.read_bytes()[:-100])
     with raises_user_error("damaged-file", contains=log.name):
         dynapix.Result.from_inspect(log, bench)
@@ -79,6 +86,8 @@ def test_lmms_eval(served, run_harness, tmp_path) -> None:
     [samples] = tmp_path.glob("logs/*/*_samples_dynapix_selection.jsonl")
     result = dynapix.Result.from_lmms_eval(samples, open_benchmark(served))
     check_result(result, served)
+    saved = save_log(samples, served.store.folder.parent, tmp_path / "saved")
+    check_result(dynapix.Result.load(saved, open_benchmark(served)), served)
     [totals] = tmp_path.glob("logs/*/*_results.json")
     scores = json.loads(totals.read_text())["results"]["dynapix_selection"]
     assert scores["macro,none"] == pytest.approx(served.accuracy), shown
@@ -118,7 +127,9 @@ def test_mteb(ranked, micro_store, run_harness, tmp_path) -> None:
     assert result.ranks.above[0].tolist() == above
     for k in (1, 10):
         assert result.metrics[f"recall@{k}"] == pytest.approx(scores[f"recall_at_{k}"], abs=1e-4)
-    result.save(tmp_path / "runs" / "mteb")
+    assert (save_log(file, bench.store.folder.parent, tmp_path / "runs") / "ranks.jsonl").exists()
+    runs, _ = gather_runs(tmp_path, tmp_path / "runs", None)
+    assert [run.kind for run in runs] == ["retrieve"]
 
     file.write_text(file.read_text()[:-9])
     with raises_user_error("damaged-file", contains=file.name):

@@ -1,0 +1,64 @@
+"""Save the logs of harnesses as results that `python -m evaluation.report` shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from conf.errors import UserError
+from conf.files import expand_path
+from conf.schema.benchmark import POOLS
+from data.store import MANIFEST, hash_file
+from dynapix.benchmark import Benchmark, load
+from dynapix.integrations.logs import read_inspect, read_lmms_eval, read_mteb
+from dynapix.retrieval import RetrievalScores
+from dynapix.selection import Result
+
+FORMATS = {
+    "_predictions.json": ("mteb", lambda path: [*read_mteb(path)[1]], RetrievalScores.from_mteb),
+    ".jsonl": ("lmms-eval", lambda path: [*read_lmms_eval(path).responses], Result.from_lmms_eval),
+    ".eval": ("inspect", lambda path: [*read_inspect(path).responses], Result.from_inspect),
+    ".json": ("inspect", lambda path: [*read_inspect(path).responses], Result.from_inspect),
+}
+"""For each ending of a log's name: the harness, the ids in a log, and the result."""
+
+
+def save_log(path: str | Path, store: Path, saved: Path) -> Path:
+    """Save the log of a harness in a folder of its own below `saved`, and return the folder.
+
+    Args:
+        path: A log of inspect_ai (*.eval, *.json), the samples that lmms-eval logs (*.jsonl), or
+            the predictions of MTEB (*_predictions.json).
+        store: Folder of the built benchmarks, one of which the log is on.
+
+    Raises:
+        UserError: The file is no such log, or no benchmark in `store` has its items.
+    """
+    file = Path(expand_path(str(path)))
+    endings = [ending for ending in FORMATS if file.name.endswith(ending)]
+    if not endings or not file.is_file():
+        raise UserError(
+            f"logs: {file} is no log of a harness: give a file that ends in {', '.join(FORMATS)}",
+            code="missing-file",
+        )
+    harness, read_ids, read = FORMATS[endings[0]]
+    result = read(file, find_benchmark(file, read_ids(file), store))
+    # Two logs of one model are two results, and a log that is given again is the same result.
+    name = f"{harness}-{Path(result.name).name}-{hash_file(file)[:8]}"
+    return result.save(saved / name)
+
+
+def find_benchmark(log: Path, ids: Iterable[str], store: Path) -> Benchmark:
+    """Return the benchmark in a folder that has the items or queries with these ids."""
+    wanted = {*ids}
+    for manifest in sorted(store.glob(f"*/{MANIFEST}")):
+        for pool in POOLS:
+            bench = load(manifest.parent, pool=pool)
+            known = {i.item_id for i in (*bench.selection, *bench.interventions)}
+            if wanted and wanted <= known | {query.query_id for query in bench.retrieval}:
+                return bench
+    raise UserError(
+        f"{log} is on none of the benchmarks in {store}: build its benchmark there, or give their "
+        "folder with store=FOLDER",
+        code="different-builds",
+    )
