@@ -112,10 +112,11 @@ class ExportCommand(CommandConfig):
                 f"{group}format={self.format}: rows are of one benchmark and have images; leave "
                 f"{group}also and {group}images out"
             )
-        if self.archive is not None and (self.also or self.push or self.format != "dataset"):
+        changed = self.also or self.push or self.format != "dataset" or not self.images
+        if self.archive is not None and changed:
             yield (
-                f"{group}archive={self.archive}: an archive holds one benchmark; leave "
-                f"{group}also, {group}push and {group}format out"
+                f"{group}archive={self.archive}: an archive is a whole benchmark; leave "
+                f"{group}also, {group}push, {group}format and {group}images out"
             )
         if not self.folder:
             yield f"{group}folder= is empty: name a folder, such as folder=exports/tiny"
