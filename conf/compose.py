@@ -56,6 +56,17 @@ def config_name(command: str) -> str:
 
 def compose(command: str, schema: type, overrides: list[str]) -> Any:
     """Compose the settings of one run as an instance of `schema`. Raises SettingsError."""
+    settings, _ = compose_run(command, schema, overrides)
+    return settings
+
+
+def compose_run(command: str, schema: type, overrides: list[str]) -> tuple[Any, DictConfig]:
+    """Compose the settings of one run as an instance of `schema`, and as a dictionary together with
+    Hydra's own settings (`hydra.*`).
+
+    Raises:
+        SettingsError: The settings are invalid.
+    """
     with open_hydra(command, schema):
         overrides = [adapt_override(override, schema) for override in overrides]
         refuse_empty_dicts(overrides)
@@ -67,9 +78,8 @@ def compose(command: str, schema: type, overrides: list[str]) -> Any:
             )
         own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
         settings = validate_settings(own, schema)
-        # Hydra opens the log before the command's own errors are reported.
         refuse_broken_link(f"{cfg.hydra.run.dir}/run.log")
-        return settings
+        return settings, cfg
 
 
 def refuse_empty_dicts(overrides: list[str]) -> None:
@@ -98,13 +108,6 @@ def adapt_override(override: str, schema: type) -> str:
             groups = [t for t in (hint, *get_args(hint)) if is_dataclass(t)]
             hint = get_type_hints(groups[0]).get(name) if groups else None
     return f"{key}{equals}{quote_texts(value, hint)}"
-
-
-def check_run_settings(command: str, schema: type, overrides: list[str]) -> None:
-    """Check the settings of a single run. Raises SettingsError, also for a `+sweep=` preset."""
-    if presets := [o for o in overrides if o.startswith("+sweep=")]:
-        raise SettingsError(f"{presets[0]} is a sweep: run it with -m", code="needs-multirun")
-    compose(command, schema, overrides)
 
 
 def list_presets(command: str, schema: type) -> dict[str, list[str]]:

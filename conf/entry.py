@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
+import argparse
 import functools
 import logging
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 try:
-    import hydra
+    from hydra.core.utils import configure_log
 except ModuleNotFoundError as error:
     raise SystemExit(
         f"error: commands need {error.name}: pip install -e '.[simulate]'  [missing-package]"
     ) from None
-from hydra._internal.utils import get_args_parser
-from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from conf.compose import (
-    adapt_override,
-    check_run_settings,
-    config_name,
-    register,
-    validate_settings,
-)
+from conf.compose import compose_run, register
 from conf.errors import SettingsError, UserError
 from conf.failures import open_closed_streams, report_failures
 from conf.files import write_json
@@ -38,11 +29,6 @@ from conf.runs import Run, lock_folder, open_run, rank, run_name, world_size
 
 Metrics = dict[str, float]
 Main = Callable[[Any, Run], Metrics | None]
-
-HYDRA_MODES = ("run", "multirun", "cfg", "info", "shell_completion")
-"""Hydra's command-line options, without `--`, that exclude each other."""
-REFUSED_OPTIONS = ("config_dir", "config_path", "config_name", "experimental_rerun")
-"""Hydra's command-line options that read settings from elsewhere, which are not checked."""
 
 
 def command(name: str, schema: type, ranks: bool = False) -> Callable[[Main], Callable[[], None]]:
@@ -78,30 +64,40 @@ def command(name: str, schema: type, ranks: bool = False) -> Callable[[Main], Ca
     return decorate
 
 
+class Parser(argparse.ArgumentParser):
+    """Parses a command line. Raises SettingsError for an option that does not exist."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(prog=f"python -m {name}", add_help=False, allow_abbrev=False)
+        self.add_argument("overrides", nargs="*")
+        for option in ("help", "multirun"):
+            self.add_argument(f"--{option}", f"-{option[0]}", action="store_true")
+        self.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
+        self.add_argument("--package", "-p")
+        self.add_argument("--resolve", action="store_true")
+
+    def error(self, message: str) -> NoReturn:
+        raise SettingsError(
+            f"{message}: the options are --help, -m for a sweep, and --cfg job|hydra|all with "
+            "--package KEY and --resolve; settings are given as KEY=VALUE",
+            code="unsupported-option",
+        )
+
+
 def _start(name: str, schema: type, main: Main) -> None:
-    """Read the command line: print the help, run a sweep, or check all settings and start Hydra."""
+    """Read the command line: print the help or the settings, run a sweep, or run `main`."""
     register(name, schema)
-    sys.argv[1:] = [adapt_override(argument, schema) for argument in sys.argv[1:]]
-    args = get_args_parser().parse_intermixed_args()
-    # Hydra's own parser accepts overrides only behind the options.
-    options = [argument for argument in sys.argv[1:] if argument not in args.overrides]
-    sys.argv[1:] = [*options, *args.overrides]
+    args = Parser(name).parse_intermixed_args()
     if args.help:
         print(help_text(name, schema, args.overrides))
         return
-    for option in REFUSED_OPTIONS:
-        if value := getattr(args, option):
-            raise SettingsError(
-                f"--{option.replace('_', '-')} {value}: settings are read from the folder conf/ of "
-                "DynaPix only; put a preset there, such as conf/student/mine.yaml for student=mine",
-                "unsupported-option",
-            )
-    modes = [f"--{mode}" for mode in HYDRA_MODES if getattr(args, mode)]
-    if len(modes) > 1:
-        raise SettingsError(f"{modes[0]} with {modes[1]}: give one of them", "conflicting-options")
-    if args.resolve and not args.cfg:
-        raise SettingsError("--resolve: add --cfg job to print settings", "conflicting-options")
-    if args.multirun or "hydra.mode=MULTIRUN" in args.overrides:
+    if args.multirun and args.cfg:
+        raise SettingsError("-m with --cfg: give one of them", "conflicting-options")
+    if (args.resolve or args.package) and not args.cfg:
+        raise SettingsError(
+            "--resolve and --package need --cfg job, which prints settings", "conflicting-options"
+        )
+    if args.multirun:
         if world_size() > 1:
             raise UserError(
                 "a sweep starts its own processes: run it with python, not with torchrun or "
@@ -110,33 +106,41 @@ def _start(name: str, schema: type, main: Main) -> None:
             )
         run_sweep(name, schema, args.overrides)
         return
-    if not (args.hydra_help or args.info or args.shell_completion):
-        check_run_settings(name, schema, args.overrides)
-
-    def task(cfg: DictConfig) -> Metrics | None:
-        with report_failures(HydraConfig.get().run.dir):
-            return _run(name, schema, main, cfg)
-
-    # Hydra uses the last part of the function's module as hydra.job.name, which names the folder of
-    # the command's runs.
-    task.__module__ = name
-    # Without this variable Hydra catches exceptions and prints its own shortened traceback.
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    start = hydra.main(version_base="1.3", config_path="pkg://conf", config_name=config_name(name))
-    try:
-        start(task)()
-    except HydraException as error:
-        # The settings have been checked, so an option such as --package is wrong.
-        raise SettingsError(str(error).strip().partition("\n")[0]) from error
+    if presets := [o for o in args.overrides if o.startswith("+sweep=")]:
+        raise SettingsError(f"{presets[0]} is a sweep: run it with -m", code="needs-multirun")
+    settings, cfg = compose_run(name, schema, args.overrides)
+    if args.cfg:
+        print(format_settings(cfg, args.cfg, args.package, args.resolve), end="")
+        return
+    folder = Path(os.path.relpath(cfg.hydra.run.dir))
+    with report_failures(cfg.hydra.run.dir):
+        folder.mkdir(parents=True, exist_ok=True)
+        configure_log(cfg.hydra.job_logging, cfg.hydra.verbose)
+        overrides = tuple(cfg.hydra.overrides.task)
+        _run(name, main, settings, Run(run_name(settings.run, list(overrides)), folder, overrides))
 
 
-def _run(name: str, schema: type, main: Main, cfg: DictConfig) -> Metrics | None:
+def format_settings(cfg: DictConfig, kind: str, package: str | None, resolve: bool) -> str:
+    """Return the settings of a run (job), those of Hydra (hydra) or both (all) as YAML.
+
+    Args:
+        package: Key of the only group of settings to return.
+        resolve: Whether references to other settings are replaced by their values.
+
+    Raises:
+        SettingsError: There is no such group.
+    """
+    keys = [key for key in cfg if kind == "all" or (key == "hydra") == (kind == "hydra")]
+    shown = OmegaConf.masked_copy(cfg, keys)
+    if package not in (None, "_global_"):
+        shown = OmegaConf.select(cfg, package)
+        if not OmegaConf.is_config(shown):
+            raise SettingsError(f"--package {package} is no group of settings", "unknown-key")
+    return OmegaConf.to_yaml(shown, resolve=resolve)
+
+
+def _run(name: str, main: Main, settings: Any, run: Run) -> Metrics | None:
     """Run one job: lock and open its folder, call `main`, write its metrics."""
-    settings = validate_settings(cfg, schema)
-    hydra_cfg = HydraConfig.get()
-    overrides = list(hydra_cfg.overrides.task)
-    folder = Path(os.path.relpath(hydra_cfg.runtime.output_dir))
-    run = Run(run_name(settings.run, overrides), folder, tuple(overrides))
     if rank() > 0:
         # Only the main rank locks and opens the folder. The other ranks log only errors.
         logging.disable(logging.WARNING)

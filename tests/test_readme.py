@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import dynapix
-from conf.compose import check_run_settings, config_name
+from conf.compose import compose, config_name
 from conf.multirun.sweep import Sweep
 from conf.runs import TRAINER_FOLDERS, run_name
 from tests.conf.test_presets import SCHEMAS
@@ -47,7 +47,7 @@ def test_named_modules_exist() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("command", "overrides"), COMMANDS, ids=lambda v: str(v).replace("/", "-"))
 def test_settings_of_a_documented_command_are_valid(command: str, overrides: list[str]) -> None:
-    check = Sweep if "-m" in overrides else check_run_settings
+    check = Sweep if "-m" in overrides else compose
     settings = [o.replace("=RUN", "=checkpoints/sft/exp-cot") for o in overrides if o != "-m"]
     check(command, SCHEMAS[command], settings)
 
