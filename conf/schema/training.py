@@ -117,6 +117,9 @@ class SftTrainConfig(StudentTrainConfig):
     weighting: str = setting("token", options=("token", "sample"))
     """What the loss is a mean over: the supervised tokens of a step, as in the paper, or its
     samples. An answer has about 1% of the tokens of a rationale."""
+    answers: int = setting(1, least=1)
+    """Number of samples in answer mode of each item in an epoch, beside one with the rationale. In
+    answer mode, a student learns more slowly and a sample costs less."""
     reuse_features: bool = False
     """Cache the frozen vision tower's features of each frame in up to half of the free memory. With
     an 8B model, the features of a frame take about 3 MB."""

@@ -62,18 +62,25 @@ class SupervisedItem:
         return " ".join(filter(None, parts))
 
     def lazy_sample(
-        self, frames: FrameReader, frame_count: int, order_seed: int | None = None
+        self,
+        frames: FrameReader,
+        frame_count: int,
+        order_seed: int | None = None,
+        repetition: int = 0,
     ) -> LazySample:
         """Return a sample that shows `frame_count` frames of the prefix.
 
         Args:
             order_seed: Seed with which the candidates are permuted in every epoch; None leaves
                 their order.
+            repetition: Number of the sample among those of the item in this mode. Each has another
+                order, so that only the first shares its prompt with the item's other mode.
         """
-        render = partial(self._render_in_epoch, frames, frame_count, order_seed)
+        render = partial(self._render_in_epoch, frames, frame_count, order_seed, repetition)
         pairs = -(-frame_count // 2)
         picture_count = 0 if self.facts else pairs + len(LETTERS)
-        return LazySample(self.text, picture_count, self.item.item_id, render, self.item.family)
+        name = f"{self.item.item_id}/{repetition}" if repetition else self.item.item_id
+        return LazySample(self.text, picture_count, name, render, self.item.family)
 
     def render(self, frames: FrameReader, frame_count: int) -> Sample:
         if self.facts:
@@ -83,14 +90,20 @@ class SupervisedItem:
         )
 
     def _render_in_epoch(
-        self, frames: FrameReader, frame_count: int, order_seed: int | None, epoch: int
+        self,
+        frames: FrameReader,
+        frame_count: int,
+        order_seed: int | None,
+        repetition: int,
+        epoch: int,
     ) -> Sample:
-        item = self if order_seed is None else self.permuted(order_seed, epoch)
+        item = self if order_seed is None else self.permuted(order_seed, epoch, repetition)
         return item.render(frames, frame_count)
 
-    def permuted(self, seed: int, epoch: int) -> SupervisedItem:
+    def permuted(self, seed: int, epoch: int, repetition: int = 0) -> SupervisedItem:
         """Return a copy with permuted candidates, and with their new letters in its texts."""
-        order = seeded_rng(seed, epoch, self.item.item_id).permutation(len(LETTERS)).tolist()
+        key = (epoch, self.item.item_id, repetition) if repetition else (epoch, self.item.item_id)
+        order = seeded_rng(seed, *key).permutation(len(LETTERS)).tolist()
         return replace(
             self,
             item=reorder_candidates(self.item, order),
@@ -174,16 +187,21 @@ def load_datasets(
     by_item = {r.item_id: r for r in rationales}
 
     def samples_of(
-        items: list[SelectionItem], order_seed: int | None = None
+        items: list[SelectionItem], order_seed: int | None = None, answers: int = 1
     ) -> dict[str, list[LazySample]]:
         by_mode = supervised_items(store, items, by_item, train.regime, cfg.teacher, train.facts)
         return {
-            mode: [s.lazy_sample(frames, frame_count, order_seed) for s in supervised]
+            mode: [
+                s.lazy_sample(frames, frame_count, order_seed, repetition)
+                for repetition in range(answers if mode == "answer" else 1)
+                for s in supervised
+            ]
             for mode, supervised in by_mode.items()
         }
 
     order_seed = cfg.seed if train.permute_candidates else None
-    training, validation = samples_of(training_items, order_seed), samples_of(validation_items)
+    training = samples_of(training_items, order_seed, train.answers)
+    validation = samples_of(validation_items)
     samples = [sample for part in training.values() for sample in part]
     # With facts, items without rationale are left out.
     source = "teacher.narrate" if train.facts else "data.build"

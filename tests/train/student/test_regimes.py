@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from conf.schema import TeacherConfig
+from conf.schema import SftCommand, SftTrainConfig, TeacherConfig
 from conf.schema.training import REGIMES
 from data.records import LETTERS
 from data.store import Store
@@ -18,7 +21,12 @@ from teacher.predicates.extraction import extract_predicates
 from teacher.sections import SECTIONS, split_sections
 from teacher.validation.claim_extraction import extract_claims
 from teacher.validation.validator import validate_rationale
-from train.student.dataset import SupervisedItem, supervised_items, tokenizer_corpus
+from train.student.dataset import (
+    SupervisedItem,
+    load_datasets,
+    supervised_items,
+    tokenizer_corpus,
+)
 from train.student.lazy_samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
@@ -109,6 +117,24 @@ def test_an_order_depends_on_seed_epoch_and_item(micro_store, frames, student_cf
         for k, s in enumerate(supervised):
             expected = s.permuted(0, 1) if permute else s
             assert dataset[k].response == expected.response
+
+
+def test_repeated_answers_have_orders_of_their_own(micro, micro_store, student_cfg) -> None:
+    train = SftTrainConfig(answers=3, permute_candidates=True, validation_items=8)
+    cfg = SftCommand(benchmark=micro, student=student_cfg, teacher=TEACHER, train=train)
+    rationales = list(ensure_rationales(micro_store, TEACHER))
+    repeated, validation = load_datasets(cfg, micro_store, rationales)
+    once = load_datasets(replace(cfg, train=replace(train, answers=1)), micro_store, rationales)
+    counts = Counter(s.item_id.partition("/")[0] for s in repeated.samples)
+    for item_id, count in Counter(s.item_id for s in once[0].samples).items():
+        # An item without a rationale has answers only.
+        assert counts[item_id] == count + 2
+    assert {m: len(d) for m, d in validation.items()} == {m: len(d) for m, d in once[1].items()}
+    letters = [
+        [s.render(0).response for s in repeated.samples if s.item_id.endswith(f"/{k}")]
+        for k in (1, 2)
+    ]
+    assert letters[0] != letters[1]
 
 
 @pytest.mark.parametrize("patch", [16, 12])
