@@ -19,7 +19,7 @@ except ModuleNotFoundError as error:
     ) from None
 from omegaconf import DictConfig, OmegaConf
 
-from conf.compose import compose_run, register
+from conf.compose import compose_run
 from conf.errors import SettingsError, UserError
 from conf.failures import open_closed_streams, report_failures
 from conf.files import write_json
@@ -86,7 +86,6 @@ class Parser(argparse.ArgumentParser):
 
 def _start(name: str, schema: type, main: Main) -> None:
     """Read the command line: print the help or the settings, run a sweep, or run `main`."""
-    register(name, schema)
     args = Parser(name).parse_intermixed_args()
     if args.help:
         print(help_text(name, schema, args.overrides))

@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -120,3 +121,19 @@ def test_no_file_names_a_package_registry() -> None:
             continue
         text = path.read_text(errors="ignore")
         assert not any(host in text for host in hosts), name
+
+
+def test_the_wheel_has_every_file_of_the_packages() -> None:
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    shipped = {
+        path
+        for package, patterns in settings["package-data"].items()
+        for pattern in patterns
+        for path in (ROOT / package.replace(".", "/")).glob(pattern)
+    }
+    listed = subprocess.run(
+        ["git", "ls-files", *PACKAGES], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    files = {ROOT / name for name in listed.stdout.splitlines() if not name.endswith(".py")}
+    assert len(files) > 50
+    assert not files - shipped

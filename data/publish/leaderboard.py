@@ -27,6 +27,7 @@ INSTRUCTION = (
     '"Answer:" and the letter.'
 )
 PATTERN = r"(?i)answer:\s*[*_(]*([A-D])\b"
+"""Finds the letter in a response. The hub allows only scorers of inspect_ai itself."""
 
 
 def write_question(item: SelectionItem, frames: FrameReader, count: int) -> dict[str, Any]:

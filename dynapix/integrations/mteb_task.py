@@ -33,9 +33,12 @@ from mteb.types import PromptType
 from PIL import Image
 
 from conf.errors import UserError
+from conf.files import expand_path
 from conf.schema import ContrastiveCommand
 from data.frames.frame_cache import encode_png
 from dynapix.benchmark import Benchmark
+from models.fingerprints import model_id, weights_digest
+from models.precision import resolve_precision
 from models.retriever.embedder import load_trained
 from models.retriever.inputs import embed
 from models.trained_runs import product_folder, read_trained_settings, run_title
@@ -132,7 +135,7 @@ class ClipEncoder(AbsEncoder):
     """
 
     def __init__(self, benchmark: Benchmark, run: str | Path, batch: int = 32) -> None:
-        folder = Path(run)
+        folder = Path(expand_path(str(run)))
         settings = read_trained_settings(folder, ContrastiveCommand, "retriever")
         self._preset, self._batch = settings.retriever, batch
         if self._preset.late is not None:
@@ -152,10 +155,15 @@ class ClipEncoder(AbsEncoder):
             )
         }
         saved = product_folder(folder, "retriever")
-        self.model = load_trained(self._preset, settings.train.precision, saved)
+        precision = resolve_precision(settings.train.precision)
+        self.model = load_trained(self._preset, precision, saved)
         self.mteb_model_meta = ModelMeta.create_empty(
             {
                 "name": f"dynapix/{run_title(folder)}",
+                # MTEB keeps results by name and revision, and a run may be trained again.
+                "revision": weights_digest(
+                    model_id(self._preset.model, self._preset.revision), saved
+                ),
                 "modalities": ["text", "image"],
                 "similarity_fn_name": ScoringFunction.COSINE,
             }

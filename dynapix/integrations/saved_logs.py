@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
+from itertools import product
 from pathlib import Path
 
 from conf.errors import UserError
 from conf.files import expand_path
 from conf.schema.benchmark import POOLS
+from data.records import SPLITS
 from data.store import MANIFEST, hash_file
 from dynapix.benchmark import Benchmark, load
 from dynapix.integrations.logs import read_inspect, read_lmms_eval, read_mteb
@@ -49,14 +52,26 @@ def save_log(path: str | Path, store: Path, saved: Path) -> Path:
 
 
 def find_benchmark(log: Path, ids: Iterable[str], store: Path) -> Benchmark:
-    """Return the benchmark in a folder that has the items or queries with these ids."""
-    wanted = {*ids}
+    """Return the only benchmark in a folder that has the items or queries with these ids."""
+    found, wanted = [], {*ids}
     for manifest in sorted(store.glob(f"*/{MANIFEST}")):
-        for pool in POOLS:
-            bench = load(manifest.parent, pool=pool)
-            known = {i.item_id for i in (*bench.selection, *bench.interventions)}
-            if wanted and wanted <= known | {query.query_id for query in bench.retrieval}:
-                return bench
+        # A benchmark of another version has other items.
+        with suppress(UserError):
+            for split, pool in product(SPLITS, POOLS):
+                bench = load(manifest.parent, split, pool=pool)
+                known = {i.item_id for i in (*bench.selection, *bench.interventions)}
+                if wanted and wanted <= known | {query.query_id for query in bench.retrieval}:
+                    found.append(bench)
+                    break
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UserError(
+            f"{log} may be on {' or '.join(str(b.store.folder) for b in found)}, which share its "
+            "items: save it with Result.from_inspect, Result.from_lmms_eval or "
+            "RetrievalScores.from_mteb, which take the benchmark",
+            code="different-builds",
+        )
     raise UserError(
         f"{log} is on none of the benchmarks in {store}: build its benchmark there, or give their "
         "folder with store=FOLDER",

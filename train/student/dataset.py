@@ -79,8 +79,11 @@ class SupervisedItem:
         render = partial(self._render_in_epoch, frames, frame_count, order_seed, repetition)
         pairs = -(-frame_count // 2)
         picture_count = 0 if self.facts else pairs + len(LETTERS)
-        name = f"{self.item.item_id}/{repetition}" if repetition else self.item.item_id
+        name = self._name(repetition)
         return LazySample(self.text, picture_count, name, render, self.item.family)
+
+    def _name(self, repetition: int) -> str:
+        return f"{self.item.item_id}/{repetition}" if repetition else self.item.item_id
 
     def render(self, frames: FrameReader, frame_count: int) -> Sample:
         if self.facts:
@@ -102,8 +105,7 @@ class SupervisedItem:
 
     def permuted(self, seed: int, epoch: int, repetition: int = 0) -> SupervisedItem:
         """Return a copy with permuted candidates, and with their new letters in its texts."""
-        key = (epoch, self.item.item_id, repetition) if repetition else (epoch, self.item.item_id)
-        order = seeded_rng(seed, *key).permutation(len(LETTERS)).tolist()
+        order = seeded_rng(seed, epoch, self._name(repetition)).permutation(len(LETTERS)).tolist()
         return replace(
             self,
             item=reorder_candidates(self.item, order),

@@ -18,6 +18,7 @@ from pathlib import Path
 import verifiers.v1 as vf
 
 from conf.compose import compose
+from conf.errors import UserError
 from conf.schema import BuildCommand, TeacherConfig
 from conf.schema.training import RewardWeights
 from data.build import ensure_benchmark
@@ -92,15 +93,18 @@ class SelectionTaskset(vf.Taskset[SelectionTask, SelectionConfig]):
     def __init__(self, config: SelectionConfig) -> None:
         super().__init__(config)
         if config.mode not in TOKENS:
-            raise ValueError(f"mode={config.mode}: choose {' or '.join(TOKENS)}")
+            raise SystemExit(f"error: mode={config.mode}: choose {' or '.join(TOKENS)}")
         self.INFINITE = config.seed is not None
 
     def load(self) -> Iterator[SelectionTask]:
         """Yield a task for each item that the oracle can describe."""
-        for bench in self._open_benchmarks():
-            for item in bench.selection:
-                if find_predicates(bench.store, item) is not None:
-                    yield SelectionTask(describe_task(item, bench, self.config.mode))
+        try:
+            for bench in self._open_benchmarks():
+                for item in bench.selection:
+                    if find_predicates(bench.store, item) is not None:
+                        yield SelectionTask(describe_task(item, bench, self.config.mode))
+        except UserError as error:
+            raise SystemExit(f"error: {error}") from None
 
     def _open_benchmarks(self) -> Iterator[Benchmark]:
         cfg = self.config
