@@ -164,7 +164,7 @@ format: setup ## Format the code and fix its style
 	$(BIN)/ruff check --fix .
 
 base: setup ## Train the tiny base from random weights into checkpoints/bases/tiny (hours)
-	OMP_NUM_THREADS=1 $(BIN)/torchrun --standalone --nproc-per-node 2 -m train.base run=tiny
+	OMP_NUM_THREADS=1 $(BIN)/torchrun --standalone --nproc-per-node 2 -m research.base run=tiny
 	rm -rf checkpoints/bases/tiny && mkdir -p checkpoints/bases/tiny
 	cp -r checkpoints/base/tiny/student/. checkpoints/bases/tiny/
 	cp $(addprefix checkpoints/base/tiny/,config.yaml run.json metrics.json metrics.jsonl curves.png) checkpoints/bases/tiny/

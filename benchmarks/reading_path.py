@@ -16,12 +16,12 @@ from types import FrameType
 from typing import Any
 from unittest.mock import patch
 
-from conf.compose import compose
-from conf.entry import Run
-from conf.schema import BuildCommand
-from data import build
-from data.parallel import Job, Workers
-from data.store import save_rows
+from dynapix.conf.compose import compose
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import BuildCommand
+from dynapix.data import build
+from dynapix.data.parallel import Job, Workers
+from dynapix.data.store import save_rows
 
 ROOT = Path(__file__).resolve().parent.parent
 SETTINGS = (

@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.arguments import positive_int
-from data.records import Scene
-from data.sim.camera import Camera, pixel_rays
-from data.sim.shapes import intersect_object, rotation_matrix
-from data.sources import clevrer
+from dynapix.data.records import Scene
+from dynapix.data.sim.camera import Camera, pixel_rays
+from dynapix.data.sim.shapes import intersect_object, rotation_matrix
+from dynapix.data.sources import clevrer
 
 FOREGROUND = 30
 """Least difference from the background, of 255, in one of the channels."""

@@ -26,13 +26,13 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.arguments import positive_int
-from conf.compose import compose
-from conf.failures import report_failures
-from conf.schema import BuildCommand, TeacherConfig
-from data.build import ensure_benchmark
-from data.checks.counts import summarize_store
-from data.publish.contact_sheets import SheetRows, draw_sheet
-from teacher.narrate import narrate_store
+from dynapix.conf.compose import compose
+from dynapix.conf.failures import report_failures
+from dynapix.conf.schema import BuildCommand, TeacherConfig
+from dynapix.data.build import ensure_benchmark
+from dynapix.data.checks.counts import summarize_store
+from dynapix.data.publish.contact_sheets import SheetRows, draw_sheet
+from dynapix.teacher.narrate import narrate_store
 
 WIDTH, HEIGHT = 480, 320
 RATES = (30, 15)

@@ -27,10 +27,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from conf.errors import SettingsError
-from conf.files import expand_path, refuse_broken_link
-from conf.runs import flatten, resolve_run_name, run_name, runs_folder
-from conf.typed_text import quote_texts, register_presets
+from dynapix.conf.errors import SettingsError
+from dynapix.conf.files import expand_path, refuse_broken_link
+from dynapix.conf.runs import flatten, resolve_run_name, run_name, runs_folder
+from dynapix.conf.typed_text import quote_texts, register_presets
 
 for resolver in (expand_path, run_name, resolve_run_name, runs_folder):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
@@ -116,7 +116,7 @@ def list_presets(command: str, schema: type) -> dict[str, list[str]]:
     with open_hydra(command, schema) as loader:
         groups = {g: loader.get_group_options(g) for g in loader.list_groups("")}
     for group in OVERLAYS:
-        paths = {name: files("conf") / group / f"{name}.yaml" for name in groups[group]}
+        paths = {name: files("dynapix.conf") / group / f"{name}.yaml" for name in groups[group]}
         groups[group] = [name for name, p in paths.items() if f"{command} " in p.read_text()]
     used = {*OVERLAYS, *(field.name for field in fields(schema))}
     if "benchmark" in used:
@@ -151,7 +151,9 @@ def open_hydra(command: str, schema: type) -> Iterator[ConfigLoader]:
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_module("conf", job_name=config_name(command), version_base="1.3"):
+        with initialize_config_module(
+            "dynapix.conf", job_name=config_name(command), version_base="1.3"
+        ):
             try:
                 yield GlobalHydra.instance().config_loader()
             except (HydraException, OmegaConfBaseException) as error:

@@ -19,13 +19,13 @@ except ModuleNotFoundError as error:
     ) from None
 from omegaconf import DictConfig, OmegaConf
 
-from conf.compose import compose_run
-from conf.errors import SettingsError, UserError
-from conf.failures import open_closed_streams, report_failures
-from conf.files import write_json
-from conf.help import help_text
-from conf.multirun.sweep import run_sweep
-from conf.runs import Run, lock_folder, open_run, rank, run_name, world_size
+from dynapix.conf.compose import compose_run
+from dynapix.conf.errors import SettingsError, UserError
+from dynapix.conf.failures import open_closed_streams, report_failures
+from dynapix.conf.files import write_json
+from dynapix.conf.help import help_text
+from dynapix.conf.multirun.sweep import run_sweep
+from dynapix.conf.runs import Run, lock_folder, open_run, rank, run_name, world_size
 
 Metrics = dict[str, float]
 Main = Callable[[Any, Run], Metrics | None]

@@ -16,8 +16,8 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import NoReturn
 
-from conf.errors import SettingsError, UserError
-from conf.runs import rank, world_size
+from dynapix.conf.errors import SettingsError, UserError
+from dynapix.conf.runs import rank, world_size
 
 MAIN_RANK_GRACE = 3.0
 """Time (s) that other ranks wait before they print an error, so that the main rank prints first."""

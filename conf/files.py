@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from conf.errors import UserError
+from dynapix.conf.errors import UserError
 
 
 def expand_path(path: str) -> str:

@@ -13,7 +13,7 @@ from dataclasses import asdict, fields, is_dataclass
 from functools import cache
 from typing import Any
 
-from conf.compose import OVERLAYS, compose, list_presets
+from dynapix.conf.compose import OVERLAYS, compose, list_presets
 
 COLUMN = 46
 """Column at which the descriptions of settings begin."""

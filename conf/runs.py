@@ -18,8 +18,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from conf.errors import SettingsError, UserError
-from conf.files import expand_path, read_json, write_json, write_text
+from dynapix.conf.errors import SettingsError, UserError
+from dynapix.conf.files import expand_path, read_json, write_json, write_text
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from conf.errors import UserError
+from dynapix.conf.errors import UserError
 
 
 def check_trackers(report_to: Sequence[str]) -> None:

@@ -23,7 +23,7 @@ from hydra.plugins.config_source import ConfigResult
 from omegaconf import OmegaConf
 from omegaconf._utils import get_yaml_loader
 
-from conf.schema.settings import Settings
+from dynapix.conf.schema.settings import Settings
 
 # A word between the brackets and commas of a value. Quoted texts and ranges match without a word.
 WORDS = re.compile(

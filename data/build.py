@@ -12,24 +12,29 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from conf.entry import Run, command
-from conf.errors import SettingsError, UserError
-from conf.files import is_writable, read_json, refuse_broken_link, write_bytes, write_json
-from conf.runs import compare_settings, flatten, lock_file
-from conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
-from data.checks.counts import count_records, summarize_store
-from data.frames.prerender import FRAMES_RECORD, prerender_frames
-from data.items.cells import family_quotas, list_subtypes, load_cached, make_items_and_queries
-from data.items.database import make_databases
-from data.items.futures import contact
-from data.items.futures.interventions import CHANGES
-from data.items.queries import BUILDERS
-from data.oracle.displacement import visible_positions
-from data.parallel import Workers
-from data.records import CONTACT, COUNTERFACTUAL, SPLITS, Scene, SelectionItem
-from data.render.blender import check_blender
-from data.sources.scenes import make_scenes
-from data.store import (
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import SettingsError, UserError
+from dynapix.conf.files import is_writable, read_json, refuse_broken_link, write_bytes, write_json
+from dynapix.conf.runs import compare_settings, flatten, lock_file
+from dynapix.conf.schema import BenchmarkConfig, BuildCommand, WorldConfig
+from dynapix.data.checks.counts import count_records, summarize_store
+from dynapix.data.frames.prerender import FRAMES_RECORD, prerender_frames
+from dynapix.data.items.cells import (
+    family_quotas,
+    list_subtypes,
+    load_cached,
+    make_items_and_queries,
+)
+from dynapix.data.items.database import make_databases
+from dynapix.data.items.futures import contact
+from dynapix.data.items.futures.interventions import CHANGES
+from dynapix.data.items.queries import BUILDERS
+from dynapix.data.oracle.displacement import visible_positions
+from dynapix.data.parallel import Workers
+from dynapix.data.records import CONTACT, COUNTERFACTUAL, SPLITS, Scene, SelectionItem
+from dynapix.data.render.blender import check_blender
+from dynapix.data.sources.scenes import make_scenes
+from dynapix.data.store import (
     FRAMES_FOLDER,
     MANIFEST,
     PARTS,
@@ -42,7 +47,7 @@ from data.store import (
     save_rows,
     with_checksum,
 )
-from data.versions import component_versions
+from dynapix.data.versions import component_versions
 
 log = logging.getLogger(__name__)
 
@@ -211,7 +216,7 @@ def world_changes(world: WorldConfig) -> dict[str, Any]:
 
 def check_quota_names(cfg: BenchmarkConfig) -> None:
     """Raises SettingsError if a quota is set for an unknown family, subtype or builder."""
-    from conf.compose import nearest_key
+    from dynapix.conf.compose import nearest_key
 
     subtypes = list_subtypes(cfg)
     named = {f"selection.{name}": (own, subtypes[name]) for name, own in family_quotas(cfg).items()}

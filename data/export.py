@@ -6,21 +6,21 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from conf.compose import compose
-from conf.entry import Run, command
-from conf.files import write_text
-from conf.schema import BuildCommand, ExportCommand
+from dynapix.conf.compose import compose
+from dynapix.conf.entry import Run, command
+from dynapix.conf.files import write_text
+from dynapix.conf.schema import BuildCommand, ExportCommand
 
 if TYPE_CHECKING:
-    from data.publish.folders import Shard
+    from dynapix.data.publish.folders import Shard
 
 log = logging.getLogger(__name__)
 
 
 @command("data.export", ExportCommand)
 def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
-    from data.publish.hub import push_folder
-    from data.publish.huggingface import summarize
+    from dynapix.data.publish.hub import push_folder
+    from dynapix.data.publish.huggingface import summarize
 
     if cfg.archive is not None:
         return export_archive(cfg)
@@ -37,9 +37,9 @@ def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
 
 def export_dataset(cfg: ExportCommand) -> list[Shard]:
     """Write the tables of all benchmarks."""
-    from data.build import ensure_benchmark, ensure_items
-    from data.parallel import Workers
-    from data.publish.huggingface import ensure_export
+    from dynapix.data.build import ensure_benchmark, ensure_items
+    from dynapix.data.parallel import Workers
+    from dynapix.data.publish.huggingface import ensure_export
 
     root, benchmarks = Path(cfg.store), {cfg.benchmark.name: cfg.benchmark}
     for name in cfg.also:
@@ -55,8 +55,8 @@ def export_dataset(cfg: ExportCommand) -> list[Shard]:
 
 def export_archive(cfg: ExportCommand) -> dict[str, float]:
     """Write a built benchmark as one file."""
-    from data.build import ensure_benchmark
-    from data.publish.archive import write_archive
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.data.publish.archive import write_archive
 
     path = Path(cfg.archive)
     write_archive(ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers), path)
@@ -66,8 +66,8 @@ def export_archive(cfg: ExportCommand) -> dict[str, float]:
 
 def export_rows(cfg: ExportCommand) -> list[Shard]:
     """Write the training samples of a benchmark."""
-    from data.build import ensure_benchmark
-    from train.common.training_rows import ensure_rows
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.train.common.training_rows import ensure_rows
 
     return ensure_rows(cfg, ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers))
 

@@ -7,17 +7,17 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from conf.entry import Run, command
-from conf.files import write_bytes, write_text
-from conf.schema import GalleryCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.files import write_bytes, write_text
+from dynapix.conf.schema import GalleryCommand
 
 log = logging.getLogger(__name__)
 
 
 @command("data.gallery", GalleryCommand)
 def main(cfg: GalleryCommand, run: Run) -> dict[str, float]:
-    from data.build import ensure_benchmark
-    from data.publish.gallery import draw_sheets, render_page
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.data.publish.gallery import draw_sheets, render_page
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     sheets = []

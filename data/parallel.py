@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from conf.errors import UserError, import_extra
+from dynapix.conf.errors import UserError, import_extra
 
 log = logging.getLogger(__name__)
 

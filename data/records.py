@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from conf.schema.world import RADIUS
+from dynapix.conf.schema.world import RADIUS
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter

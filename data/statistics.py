@@ -6,20 +6,20 @@ import json
 import logging
 from pathlib import Path
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.files import write_text
-from conf.schema import StatisticsCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_text
+from dynapix.conf.schema import StatisticsCommand
 
 log = logging.getLogger(__name__)
 
 
 @command("data.statistics", StatisticsCommand)
 def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
-    from data.build import ensure_items
-    from data.checks.observer import observe_benchmark
-    from data.checks.statistics import compute_statistics, format_statistics
-    from data.parallel import Workers
+    from dynapix.data.build import ensure_items
+    from dynapix.data.checks.observer import observe_benchmark
+    from dynapix.data.checks.statistics import compute_statistics, format_statistics
+    from dynapix.data.parallel import Workers
 
     # Small images are rendered for the shortcuts; the frames of the benchmark are not needed.
     workers = Workers(cfg.workers)
@@ -35,7 +35,7 @@ def main(cfg: StatisticsCommand, run: Run) -> dict[str, float]:
     statistics = compute_statistics(store, cfg.blind)
     text = format_statistics(statistics)
     if observers is not None:
-        from data.checks.observer_curve import (
+        from dynapix.data.checks.observer_curve import (
             format_observers,
             observer_curves,
             plot_observers,

@@ -35,10 +35,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from conf.errors import UserError
-from conf.files import read_json_if_valid, write_bytes
-from conf.schema.benchmark import INTERVENTIONS
-from data.records import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import read_json_if_valid, write_bytes
+from dynapix.conf.schema.benchmark import INTERVENTIONS
+from dynapix.data.records import (
     Collision,
     FrameRef,
     Landing,
@@ -49,7 +49,7 @@ from data.records import (
     SelectionItem,
     original_scene_id,
 )
-from data.versions import component_versions
+from dynapix.data.versions import component_versions
 
 if TYPE_CHECKING:
     import pyarrow as pa

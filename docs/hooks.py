@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import dynapix
-from conf import schema
-from conf.help import description
+from dynapix.conf import schema
+from dynapix.conf.help import description
 
 GROUPS = {
     "benchmark": schema.BenchmarkConfig,

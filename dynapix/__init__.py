@@ -16,15 +16,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from conf.errors import UserError
     from dynapix.benchmark import Benchmark, Frame, Item, Query, load
+    from dynapix.conf.errors import UserError
+    from dynapix.evaluation.metrics.ranking import rank_metrics
+    from dynapix.models.student.answer_parser import ParsedAnswer, parse_choice
     from dynapix.observers import Observers, observer
     from dynapix.rationales import RationaleScore, score_rationale, sufficiency
     from dynapix.retrieval import RetrievalScores, evaluate_retrieval
     from dynapix.selection import Comparison, Failure, Outcome, Result, evaluate
-    from evaluation.metrics.ranking import rank_metrics
-    from models.student.answer_parser import ParsedAnswer, parse_choice
-    from teacher.numbers.detection import find_numbers
+    from dynapix.teacher.numbers.detection import find_numbers
 
 _HOMES = {
     "Benchmark": "dynapix.benchmark",
@@ -34,19 +34,19 @@ _HOMES = {
     "Item": "dynapix.benchmark",
     "Observers": "dynapix.observers",
     "Outcome": "dynapix.selection",
-    "ParsedAnswer": "models.student.answer_parser",
+    "ParsedAnswer": "dynapix.models.student.answer_parser",
     "Query": "dynapix.benchmark",
     "RationaleScore": "dynapix.rationales",
     "Result": "dynapix.selection",
     "RetrievalScores": "dynapix.retrieval",
-    "UserError": "conf.errors",
+    "UserError": "dynapix.conf.errors",
     "evaluate": "dynapix.selection",
     "evaluate_retrieval": "dynapix.retrieval",
-    "find_numbers": "teacher.numbers.detection",
+    "find_numbers": "dynapix.teacher.numbers.detection",
     "load": "dynapix.benchmark",
     "observer": "dynapix.observers",
-    "parse_choice": "models.student.answer_parser",
-    "rank_metrics": "evaluation.metrics.ranking",
+    "parse_choice": "dynapix.models.student.answer_parser",
+    "rank_metrics": "dynapix.evaluation.metrics.ranking",
     "score_rationale": "dynapix.rationales",
     "sufficiency": "dynapix.rationales",
 }

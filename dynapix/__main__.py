@@ -17,7 +17,6 @@ COMMANDS = {
     "train.distill": "train a student further on its own responses",
     "train.reinforce": "train a student further with rewards from the oracle",
     "train.contrastive": "train a retriever",
-    "train.base": "train the tiny base from random weights",
     "train.export": "export a trained model",
     "evaluation.select": "evaluate a student or a base on selection items",
     "evaluation.similarity": "evaluate a retriever on selection items",

@@ -12,11 +12,11 @@ from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
 
-from conf.errors import UserError
-from conf.files import expand_path
-from conf.schema.benchmark import INTERVENTIONS, POOLS, store_name
-from data.frames.frame_cache import FrameReader
-from data.records import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import expand_path
+from dynapix.conf.schema.benchmark import INTERVENTIONS, POOLS, store_name
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import (
     FAMILIES,
     SPLITS,
     FrameRef,
@@ -24,10 +24,10 @@ from data.records import (
     SelectionItem,
     sample_prefix_frames,
 )
-from data.store import MANIFEST, Store, open_store
-from models.student.chat_requests import build_messages
-from models.student.prompts import MODES, selection_sample, show_frames_as_images
-from teacher.journal import read_accepted
+from dynapix.data.store import MANIFEST, Store, open_store
+from dynapix.models.student.chat_requests import build_messages
+from dynapix.models.student.prompts import MODES, selection_sample, show_frames_as_images
+from dynapix.teacher.journal import read_accepted
 
 Record = TypeVar("Record")
 
@@ -76,7 +76,7 @@ def _open(name: str, root: Path) -> Store:
     """Return the benchmark of an archive, a folder, or a preset, which is built if necessary."""
     if name.endswith(".zip") or name.startswith(("http://", "https://")):
         # A progress bar needs one more package.
-        from data.publish.archive import open_archive
+        from dynapix.data.publish.archive import open_archive
 
         return open_archive(name, root)
     folder = Path(name)
@@ -87,7 +87,7 @@ def _open(name: str, root: Path) -> Store:
 
 def preset_names(group: str = "benchmark") -> list[str]:
     """Return the names of the presets of a group of settings, such as `benchmark` or `world`."""
-    return sorted(p.name.removesuffix(".yaml") for p in (files("conf") / group).iterdir())
+    return sorted(p.name.removesuffix(".yaml") for p in (files("dynapix.conf") / group).iterdir())
 
 
 def _open_preset(name: str, root: Path) -> Store:
@@ -103,9 +103,9 @@ def _open_preset(name: str, root: Path) -> Store:
             code="unknown-benchmark",
         )
     try:
-        from conf.compose import compose
-        from conf.schema import BuildCommand
-        from data.build import ensure_benchmark
+        from dynapix.conf.compose import compose
+        from dynapix.conf.schema import BuildCommand
+        from dynapix.data.build import ensure_benchmark
     except ImportError as error:
         folder = root / store_name(preset, world or _preset_world(preset))
         if (folder / MANIFEST).exists():
@@ -124,7 +124,7 @@ def _preset_world(preset: str) -> str:
     """Return the world of a benchmark's preset, without Hydra."""
     import yaml
 
-    text = (files("conf") / "benchmark" / f"{preset}.yaml").read_text(encoding="utf-8")
+    text = (files("dynapix.conf") / "benchmark" / f"{preset}.yaml").read_text(encoding="utf-8")
     for default in yaml.safe_load(text).get("defaults", ()):
         if isinstance(default, dict):
             return default["override /world"]

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
-from conf.errors import UserError
 from dynapix.benchmark import Benchmark
+from dynapix.conf.errors import UserError
 from dynapix.selection import Result
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from data.checks.observer_curve import ObserverError
+    from dynapix.data.checks.observer_curve import ObserverError
 
 SEED = 0
 """Seed of the resampling of scenes."""
@@ -39,8 +39,8 @@ def observer(bench: Benchmark, *, error: float = 1.0, workers: int = 2) -> Obser
         raise UserError(
             f"observers need {missing}: pip install -e '.[simulate]'", code="missing-package"
         )
-    from data.checks.observer import ERRORS, observe_benchmark
-    from data.parallel import Workers
+    from dynapix.data.checks.observer import ERRORS, observe_benchmark
+    from dynapix.data.parallel import Workers
 
     if error not in (0, *ERRORS):
         options = ", ".join(f"{each:g}" for each in (0, *ERRORS))
@@ -73,7 +73,7 @@ class Observers:
         error, with the columns `accuracy`, `low` and `high`."""
         import pandas as pd
 
-        from data.checks.observer_curve import observer_curves
+        from dynapix.data.checks.observer_curve import observer_curves
 
         items = self.benchmark.store.selection(self.benchmark.split)
         rows = {
@@ -93,8 +93,8 @@ class Observers:
         Raises:
             UserError: The result is on another build or split, or the accuracy is not from 0 to 1.
         """
-        from data.checks.intervals import Interval
-        from data.checks.observer_curve import observer_curves
+        from dynapix.data.checks.intervals import Interval
+        from dynapix.data.checks.observer_curve import observer_curves
 
         items = self.benchmark.store.selection(self.benchmark.split)
         if isinstance(accuracy, Result):

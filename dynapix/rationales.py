@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from conf.errors import UserError
-from conf.schema import TeacherConfig
 from dynapix.benchmark import Item
-from teacher.numbers.detection import find_numbers
-from teacher.predicates.facts import RelationalPredicates
-from teacher.predicates.vocabulary import describe_item
-from teacher.reading.claims import VERDICTS, Claim
-from teacher.sufficiency import measure_sufficiency
-from teacher.validation.claim_extraction import extract_claims
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import TeacherConfig
+from dynapix.teacher.numbers.detection import find_numbers
+from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.predicates.vocabulary import describe_item
+from dynapix.teacher.reading.claims import VERDICTS, Claim
+from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.validation.claim_extraction import extract_claims
 
 
 @dataclass(frozen=True)

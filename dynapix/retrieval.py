@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from conf.errors import UserError
-from conf.files import expand_path, write_json, write_text
 from dynapix.benchmark import Benchmark, Query, refuse_repeated
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import expand_path, write_json, write_text
+from dynapix.evaluation.metrics.arrays import to_array
+from dynapix.evaluation.metrics.ranking import share_above
+from dynapix.evaluation.metrics.results import RetrievalReport, RetrievalResult, retrieval_results
+from dynapix.evaluation.retrieval.exact_search import Ranks, exact_ranks, write_ranks
 from dynapix.integrations.logs import read_mteb
 from dynapix.saved_runs import saved_run
-from evaluation.metrics.arrays import to_array
-from evaluation.metrics.ranking import share_above
-from evaluation.metrics.results import RetrievalReport, RetrievalResult, retrieval_results
-from evaluation.retrieval.exact_search import Ranks, exact_ranks, write_ranks
 
 Embeddings = np.ndarray | Mapping[str, Sequence[float]]
 """An array with a row for each query or frame, or vectors by `Query.query_id` or `Frame.name`."""
@@ -49,7 +49,7 @@ class RetrievalScores:
         return {name: measure.value for name, measure in self.rows[0].measures.items()}
 
     def __str__(self) -> str:
-        from evaluation.reporting.tables import retrieval_table
+        from dynapix.evaluation.reporting.tables import retrieval_table
 
         return str(retrieval_table(self.rows))
 

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from conf.errors import UserError
-from conf.files import write_json, write_text
-from data.store import Store
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_json, write_text
+from dynapix.data.store import Store
 
 
 @contextmanager

@@ -15,25 +15,25 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from conf.errors import UserError
-from conf.files import expand_path, write_json, write_json_lines, write_text
-from conf.schema.benchmark import PAIRED
-from data.records import LETTERS
 from dynapix.benchmark import Benchmark, Item, refuse_repeated
-from dynapix.integrations.logs import Log, read_inspect, read_lmms_eval
-from dynapix.saved_runs import saved_run
-from evaluation.metrics.arrays import to_array
-from evaluation.metrics.future_moment import FutureMoment, measure_future_moment
-from evaluation.metrics.results import SIMILARITY, SelectionReport, SelectionResult
-from evaluation.metrics.selection import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import expand_path, write_json, write_json_lines, write_text
+from dynapix.conf.schema.benchmark import PAIRED
+from dynapix.data.records import LETTERS
+from dynapix.evaluation.metrics.arrays import to_array
+from dynapix.evaluation.metrics.future_moment import FutureMoment, measure_future_moment
+from dynapix.evaluation.metrics.results import SIMILARITY, SelectionReport, SelectionResult
+from dynapix.evaluation.metrics.selection import (
     Choices,
     build_selection_report,
     choose_letters,
     credit_choices,
 )
-from evaluation.metrics.significance import PairedComparison, compare_runs
-from evaluation.reporting.run_responses import nearest_candidates
-from models.student.answer_parser import parse_choice
+from dynapix.evaluation.metrics.significance import PairedComparison, compare_runs
+from dynapix.evaluation.reporting.run_responses import nearest_candidates
+from dynapix.integrations.logs import Log, read_inspect, read_lmms_eval
+from dynapix.models.student.answer_parser import parse_choice
+from dynapix.saved_runs import saved_run
 
 TEXT = "text"
 """Mode of results whose predictions are letters or texts."""
@@ -202,7 +202,7 @@ class Comparison(tuple[PairedComparison, ...]):
     __slots__ = ()
 
     def __str__(self) -> str:
-        from evaluation.reporting.tables import paired_table
+        from dynapix.evaluation.reporting.tables import paired_table
 
         return str(paired_table(self))
 
@@ -421,7 +421,7 @@ class Result:
         return [{**entry, "value": value} | ({"notes": notes} if notes else {})]
 
     def __str__(self) -> str:
-        from evaluation.reporting.tables import pair_table, selection_table
+        from dynapix.evaluation.reporting.tables import pair_table, selection_table
 
         lines = [str(selection_table([self.accuracy], self.items[0].record.suite))]
         lines += [str(pair_table(self.report.pairs))] if self.report.pairs else []

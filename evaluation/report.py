@@ -7,9 +7,9 @@ import logging
 import shutil
 from pathlib import Path
 
-from conf.entry import Run, command
-from conf.files import write_text
-from conf.schema import ReportCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.files import write_text
+from dynapix.conf.schema import ReportCommand
 
 log = logging.getLogger(__name__)
 
@@ -18,17 +18,17 @@ PAGE = "report.html"
 
 @command("evaluation.report", ReportCommand)
 def main(cfg: ReportCommand, run: Run) -> None:
-    from dynapix.integrations.saved_logs import save_log
-    from evaluation.reporting.item_browser import browse_items
-    from evaluation.reporting.measurements import (
+    from dynapix.evaluation.reporting.item_browser import browse_items
+    from dynapix.evaluation.reporting.measurements import (
         deduplicate,
         distinguish_item_sets,
         read_measurements,
     )
-    from evaluation.reporting.overview import write_overview
-    from evaluation.reporting.page import render_page
-    from evaluation.reporting.runs import RETRIEVAL_KINDS, SELECTION_KINDS, gather_runs
-    from evaluation.reporting.sections import build_sections
+    from dynapix.evaluation.reporting.overview import write_overview
+    from dynapix.evaluation.reporting.page import render_page
+    from dynapix.evaluation.reporting.runs import RETRIEVAL_KINDS, SELECTION_KINDS, gather_runs
+    from dynapix.evaluation.reporting.sections import build_sections
+    from dynapix.integrations.saved_logs import save_log
 
     for path in cfg.logs:
         log.info("%s is saved in %s", path, save_log(path, Path(cfg.store), Path(cfg.saved)))

@@ -5,20 +5,20 @@ from __future__ import annotations
 
 import logging
 
-from conf.entry import Run, command
-from conf.runs import rank
-from conf.schema import RetrieveCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.runs import rank
+from dynapix.conf.schema import RetrieveCommand
 
 log = logging.getLogger(__name__)
 
 
 @command("evaluation.retrieve", RetrieveCommand, ranks=True)
 def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
-    from evaluation.embedders.embedder import open_retriever
-    from evaluation.metrics import results
-    from evaluation.reporting import tables
-    from evaluation.retrieval import exact_search, standard_test
-    from models.distributed import end_ranks
+    from dynapix.evaluation.embedders.embedder import open_retriever
+    from dynapix.evaluation.metrics import results
+    from dynapix.evaluation.reporting import tables
+    from dynapix.evaluation.retrieval import exact_search, standard_test
+    from dynapix.models.distributed import end_ranks
 
     preset, store, embedders = open_retriever(cfg, run)
     queries, database = standard_test.load_test(store, cfg.pool)

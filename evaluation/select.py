@@ -7,14 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.runs import rank
-from conf.schema import SelectCommand, SftCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import rank
+from dynapix.conf.schema import SelectCommand, SftCommand
 
 if TYPE_CHECKING:
-    from data.records import SelectionItem
-    from data.store import Store
+    from dynapix.data.records import SelectionItem
+    from dynapix.data.store import Store
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ PAIR_SOURCES = {
 
 @command("evaluation.select", SelectCommand, ranks=True)
 def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import check_modes, modes_of_regime, resolve_model
+    from dynapix.models.trained_runs import check_modes, modes_of_regime, resolve_model
 
     folder, trained = resolve_model(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     student, regime = trained.student, trained.train.regime
@@ -37,24 +37,28 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     if folder is not None:
         check_modes(folder, regime, modes)
     elif student.model is not None and not cfg.server.urls:
-        from models.checks import check_available
+        from dynapix.models.checks import check_available
 
         check_available("student", student.model)
     regime = cfg.prompt_regime or regime
 
-    from data.build import ensure_benchmark
-    from models.distributed import end_ranks, main_first
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.models.distributed import end_ranks, main_first
 
     with main_first():
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.frames.frame_cache import FrameReader
-    from evaluation.generators import response_log
-    from evaluation.generators.generator import item_sample, open_generator, response_settings
-    from evaluation.metrics.reasons import measure_reasons
-    from evaluation.metrics.results import variant_name
-    from evaluation.metrics.selection import Choices, build_selection_report
-    from evaluation.reporting.selection_report import write_report
+    from dynapix.data.frames.frame_cache import FrameReader
+    from dynapix.evaluation.generators import response_log
+    from dynapix.evaluation.generators.generator import (
+        item_sample,
+        open_generator,
+        response_settings,
+    )
+    from dynapix.evaluation.metrics.reasons import measure_reasons
+    from dynapix.evaluation.metrics.results import variant_name
+    from dynapix.evaluation.metrics.selection import Choices, build_selection_report
+    from dynapix.evaluation.reporting.selection_report import write_report
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = FrameReader(store, student.image_size)
@@ -130,9 +134,9 @@ def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> lis
     """
     import numpy as np
 
-    from conf.schema.benchmark import PAIRED
-    from data.items.controls import pair_items
-    from data.seeded_order import interleave
+    from dynapix.conf.schema.benchmark import PAIRED
+    from dynapix.data.items.controls import pair_items
+    from dynapix.data.seeded_order import interleave
 
     if limit is None:
         return items

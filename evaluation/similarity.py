@@ -5,29 +5,29 @@ from __future__ import annotations
 
 import logging
 
-from conf.entry import Run, command
-from conf.files import write_json_lines
-from conf.runs import rank
-from conf.schema import SimilarityCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.files import write_json_lines
+from dynapix.conf.runs import rank
+from dynapix.conf.schema import SimilarityCommand
 
 log = logging.getLogger(__name__)
 
 
 @command("evaluation.similarity", SimilarityCommand, ranks=True)
 def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
-    from data.records import FrameRef
-    from evaluation.embedders.embedder import open_retriever
-    from evaluation.metrics.results import SIMILARITY
-    from evaluation.metrics.selection import (
+    from dynapix.data.records import FrameRef
+    from dynapix.evaluation.embedders.embedder import open_retriever
+    from dynapix.evaluation.metrics.results import SIMILARITY
+    from dynapix.evaluation.metrics.selection import (
         Choices,
         build_selection_report,
         choose_letters,
         credit_choices,
     )
-    from evaluation.reporting.selection_report import write_report
-    from evaluation.retrieval import candidate_similarity
-    from evaluation.select import select_items
-    from models.distributed import end_ranks
+    from dynapix.evaluation.reporting.selection_report import write_report
+    from dynapix.evaluation.retrieval import candidate_similarity
+    from dynapix.evaluation.select import select_items
+    from dynapix.models.distributed import end_ranks
 
     preset, store, embedders = open_retriever(cfg, run)
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)

@@ -7,19 +7,19 @@ import logging
 from functools import partial
 from pathlib import Path
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.files import write_json_lines
-from conf.runs import rank
-from conf.schema import ContrastiveCommand, SftCommand, TwoStageCommand
-from conf.schema.evaluation import ROUTES
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_json_lines
+from dynapix.conf.runs import rank
+from dynapix.conf.schema import ContrastiveCommand, SftCommand, TwoStageCommand
+from dynapix.conf.schema.evaluation import ROUTES
 
 log = logging.getLogger(__name__)
 
 
 @command("evaluation.two_stage", TwoStageCommand, ranks=True)
 def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
-    from models.trained_runs import resolve_model
+    from dynapix.models.trained_runs import resolve_model
 
     folder, trained = resolve_model(cfg, cfg.benchmark, SftCommand, "student", run.overrides)
     matcher_folder, matcher_settings = resolve_model(
@@ -29,20 +29,20 @@ def main(cfg: TwoStageCommand, run: Run) -> dict[str, float]:
     routes = cfg.routes or (["cot_text"] if cfg.model is not None else list(ROUTES))
     check_routes(routes, folder, trained.train.regime, matcher_settings)
 
-    from data.build import ensure_benchmark
-    from models.distributed import end_ranks, main_first, share_from_main
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.models.distributed import end_ranks, main_first, share_from_main
 
     with main_first():
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
 
-    from data.frames.frame_cache import FrameReader
-    from evaluation.embedders.embedder import open_embedders
-    from evaluation.generators.generator import open_generator
-    from evaluation.metrics import results
-    from evaluation.metrics.ranking import query_metrics
-    from evaluation.reporting import tables
-    from evaluation.retrieval import standard_test, text_matching
-    from models.student.prompts import text_sample
+    from dynapix.data.frames.frame_cache import FrameReader
+    from dynapix.evaluation.embedders.embedder import open_embedders
+    from dynapix.evaluation.generators.generator import open_generator
+    from dynapix.evaluation.metrics import results
+    from dynapix.evaluation.metrics.ranking import query_metrics
+    from dynapix.evaluation.reporting import tables
+    from dynapix.evaluation.retrieval import standard_test, text_matching
+    from dynapix.models.student.prompts import text_sample
 
     queries, database = standard_test.load_test(store)
     matcher = next(
@@ -103,7 +103,7 @@ def check_routes(
 ) -> None:
     """Raise UserError if the matcher cannot match texts, or if `cot_text` is among the routes of a
     student that was not trained to write rationales."""
-    from models.trained_runs import modes_of_regime
+    from dynapix.models.trained_runs import modes_of_regime
 
     if matcher.retriever.late is not None:
         raise UserError(

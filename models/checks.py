@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 from huggingface_hub import constants
 from safetensors import safe_open
 
-from conf.errors import UserError
-from conf.proxies import proxy_hint
-from conf.schema import RetrieverConfig
-from models.fingerprints import find_commit
+from dynapix.conf.errors import UserError
+from dynapix.conf.proxies import proxy_hint
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.models.fingerprints import find_commit
 
 if TYPE_CHECKING:
     from torch import nn

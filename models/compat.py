@@ -34,8 +34,8 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
   `tool_mask` to the inputs of the loss, and changes their `advantages` while the loss computes the
   log-probabilities. Its datasets override `Dataset.__getitems__`.
 - `models.student.kv_cache` subclasses transformers' `DynamicLayer`.
-- `train.tiny_base.trace` records the outputs of `q_norm` and `k_norm` in Qwen3-VL's attention, and
-  the keyword `position_embeddings` that it takes.
+- `research.tiny_base.trace` records the outputs of `q_norm` and `k_norm` in Qwen3-VL's attention,
+  and the keyword `position_embeddings` that it takes.
 - `train.retriever.loss` uses `RandContext` of sentence-transformers.
 - `evaluation.embedders.languagebind` subclasses transformers' `CLIPEncoderLayer`.
 """

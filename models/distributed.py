@@ -9,8 +9,8 @@ from datetime import timedelta
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
-from conf.errors import UserError
-from conf.runs import rank, world_size
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import rank, world_size
 
 if TYPE_CHECKING:
     import torch

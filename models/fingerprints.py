@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
-from conf.schema import RetrieverConfig, StudentConfig
+from dynapix.conf.schema import RetrieverConfig, StudentConfig
 
 Preset = TypeVar("Preset", StudentConfig, RetrieverConfig)
 

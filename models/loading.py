@@ -26,9 +26,9 @@ from transformers import (
 )
 from transformers.utils import logging as transformers_logging
 
-from conf.errors import UserError
-from conf.schema import LoraConfig, RetrieverConfig, StudentConfig
-from models.checks import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import LoraConfig, RetrieverConfig, StudentConfig
+from dynapix.models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
     check_adapters,
@@ -38,13 +38,13 @@ from models.checks import (
     check_processor,
     first_line,
 )
-from models.compat import keep_differentiable, write_clips_as_released
-from models.distributed import is_sharded, lacks_weights, rank_device
-from models.layers.attention import choose_attention
-from models.student.chat_format import TIMED_PROCESSORS
-from models.tiny_qwen3_vl import build_model, build_processor
-from models.towers import choose_lora_targets, find_unquantized
-from models.trained_runs import EXPORT
+from dynapix.models.compat import keep_differentiable, write_clips_as_released
+from dynapix.models.distributed import is_sharded, lacks_weights, rank_device
+from dynapix.models.layers.attention import choose_attention
+from dynapix.models.student.chat_format import TIMED_PROCESSORS
+from dynapix.models.tiny_qwen3_vl import build_model, build_processor
+from dynapix.models.towers import choose_lora_targets, find_unquantized
+from dynapix.models.trained_runs import EXPORT
 
 DTYPES = {"bf16": torch.bfloat16, "fp32": torch.float32}
 CROPS = ("do_image_splitting", "crop_to_patches", "do_pan_and_scan")

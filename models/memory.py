@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 import torch
 
-from conf.errors import UserError
+from dynapix.conf.errors import UserError
 
 CGROUP = Path("/sys/fs/cgroup")
 """Folder of the files (cgroup v2) that describe the limits of a container."""

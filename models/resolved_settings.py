@@ -19,10 +19,16 @@ from pathlib import Path
 
 import yaml
 
-from conf.errors import UserError
-from conf.files import write_text
-from models.fingerprints import Preset, is_hub_model, model_id, pin_revisions, weights_digest
-from models.precision import resolve_precision
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_text
+from dynapix.models.fingerprints import (
+    Preset,
+    is_hub_model,
+    model_id,
+    pin_revisions,
+    weights_digest,
+)
+from dynapix.models.precision import resolve_precision
 
 RESOLVED = "resolved.yaml"
 

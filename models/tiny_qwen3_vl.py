@@ -20,7 +20,7 @@ from transformers import (
     Qwen3VLVideoProcessor,
 )
 
-from conf.schema import ArchitectureConfig
+from dynapix.conf.schema import ArchitectureConfig
 
 SPECIAL_TOKENS = (
     "<|endoftext|>",

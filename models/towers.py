@@ -11,8 +11,8 @@ import torch
 from torch import nn
 from transformers import PreTrainedConfig, PreTrainedModel
 
-from conf.errors import UserError
-from models.compat import four_bit_entries
+from dynapix.conf.errors import UserError
+from dynapix.models.compat import four_bit_entries
 
 TOWERS = ["vision", "language", "embeddings and head"]
 VISION = re.compile(

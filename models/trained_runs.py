@@ -13,11 +13,11 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from conf.errors import UserError
-from conf.files import read_json
-from conf.runs import TRAINER_FOLDERS
-from conf.schema import BenchmarkConfig
-from models.resolved_settings import read_resolved, with_resolved_commit
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import read_json
+from dynapix.conf.runs import TRAINER_FOLDERS
+from dynapix.conf.schema import BenchmarkConfig
+from dynapix.models.resolved_settings import read_resolved, with_resolved_commit
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from operator import add
 
-from data.records import LETTERS, SelectionItem
+from dynapix.data.records import LETTERS, SelectionItem
 
 ANALYSIS = re.compile(r"(?<=Candidate analysis:).*?(?=^\w[\w ]*:|\Z)", re.MULTILINE | re.DOTALL)
 CANDIDATE = re.compile(r"(?:\A|[.!?\n])\s*(?P<start>Candidate (?P<letter>[A-Z])\b)")

@@ -18,10 +18,10 @@ from typing import Any
 
 from jsonschema import Draft202012Validator
 
-from data.records import LETTERS, SelectionItem
-from teacher.narrator import list_clauses
-from teacher.predicates.facts import Predicates
-from teacher.sections import SECTIONS
+from dynapix.data.records import LETTERS, SelectionItem
+from dynapix.teacher.narrator import list_clauses
+from dynapix.teacher.predicates.facts import Predicates
+from dynapix.teacher.sections import SECTIONS
 
 CITED_VERSION = "4"
 """Changes with the form of cited rationales and the rules for the words around slots."""

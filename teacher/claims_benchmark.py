@@ -18,23 +18,23 @@ from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.files import read_json_lines, write_text
-from conf.schema import ClaimsCommand, TeacherConfig
-from data.records import SelectionItem
-from data.seeded_order import named_rng
-from teacher.narrator import NARRATOR_VERSION, write_rationale
-from teacher.predicates.facts import RelationalPredicates
-from teacher.predicates.vocabulary import describe_item, name_vocabulary
-from teacher.reading.claims import Claim
-from teacher.validation.claim_extraction import extract_claims
-from teacher.validation.mutations import MUTATIONS, RELATION_MUTATIONS
-from teacher.validation.reasons import CONTRADICTED, SUPPORTED
-from teacher.validation.validator import VALIDATOR_VERSION
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import read_json_lines, write_text
+from dynapix.conf.schema import ClaimsCommand, TeacherConfig
+from dynapix.data.records import SelectionItem
+from dynapix.data.seeded_order import named_rng
+from dynapix.teacher.narrator import NARRATOR_VERSION, write_rationale
+from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.predicates.vocabulary import describe_item, name_vocabulary
+from dynapix.teacher.reading.claims import Claim
+from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.mutations import MUTATIONS, RELATION_MUTATIONS
+from dynapix.teacher.validation.reasons import CONTRADICTED, SUPPORTED
+from dynapix.teacher.validation.validator import VALIDATOR_VERSION
 
 if TYPE_CHECKING:
-    from data.store import Store
+    from dynapix.data.store import Store
 
 log = logging.getLogger(__name__)
 
@@ -63,8 +63,8 @@ class JudgedText:
 def main(cfg: ClaimsCommand, run: Run) -> dict[str, float]:
     from tqdm import tqdm
 
-    from data.build import ensure_benchmark
-    from data.store import save_rows
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.data.store import save_rows
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     described = describe_test_items(store)
@@ -230,7 +230,7 @@ def write_card(store: Store, texts: Sequence[JudgedText], rows: Sequence[dict[st
         f"| {source} | {counts[SUPPORTED]:,} | {counts[CONTRADICTED]:,} |"
         for source, counts in by_source.items()
     ]
-    template = (files("teacher") / "templates" / "claims_card.md").read_text()
+    template = (files("dynapix.teacher") / "templates" / "claims_card.md").read_text()
     return template.format(
         benchmark=store.name,
         identity=store.identity,

@@ -10,11 +10,11 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from conf.errors import UserError
-from conf.runs import wait_for_lock
-from data.records import Rationale
-from data.store import RATIONALES, load_rows, save_rows
-from teacher.sections import SECTIONS
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import wait_for_lock
+from dynapix.data.records import Rationale
+from dynapix.data.store import RATIONALES, load_rows, save_rows
+from dynapix.teacher.sections import SECTIONS
 
 DIGEST = "sha256"
 """Key of the checksum in a line of the journal."""

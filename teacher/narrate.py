@@ -18,17 +18,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tqdm import tqdm
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.schema import NarrateCommand, TeacherConfig
-from data.records import Rationale, SelectionItem
-from data.seeded_order import interleave
-from data.store import RATIONALES
-from teacher.journal import Journal, save_accepted
-from teacher.narrator import write_rationale
-from teacher.predicates.grounding import Grounding
-from teacher.predicates.vocabulary import choose_vocabulary, describe_item, name_vocabulary
-from teacher.report import (
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import NarrateCommand, TeacherConfig
+from dynapix.data.records import Rationale, SelectionItem
+from dynapix.data.seeded_order import interleave
+from dynapix.data.store import RATIONALES
+from dynapix.teacher.journal import Journal, save_accepted
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.grounding import Grounding
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary, describe_item, name_vocabulary
+from dynapix.teacher.report import (
     Figures,
     describe_sufficiency,
     rejection_reasons,
@@ -36,11 +36,11 @@ from teacher.report import (
     summarize,
     write_report,
 )
-from teacher.servers.responses import Response
-from teacher.validation.grader import RationaleGrader
+from dynapix.teacher.servers.responses import Response
+from dynapix.teacher.validation.grader import RationaleGrader
 
 if TYPE_CHECKING:
-    from data.store import Store
+    from dynapix.data.store import Store
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ class Narration:
 
 @command("teacher.narrate", NarrateCommand)
 def main(cfg: NarrateCommand, run: Run) -> dict[str, float]:
-    from data.build import ensure_benchmark
+    from dynapix.data.build import ensure_benchmark
 
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     narration = narrate_store(store, cfg.teacher, cfg.limit)
@@ -169,7 +169,7 @@ def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) ->
                     record(_write_rationales(item, store, grader, grounding, attempt))
                     progress.bar.update()
             elif jobs:
-                from teacher.server_narrator import request_rationales
+                from dynapix.teacher.server_narrator import request_rationales
 
                 options = jobs, store, grader, record, progress.bar.update, progress.show_servers
                 unanswered = asyncio.run(request_rationales(*options))

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from conf.schema.servers import NARRATOR_WORDS
-from data.records import SelectionItem
-from teacher.predicates.facts import Predicates, RelationalPredicates
-from teacher.statement_choice import Decision, choose_statements
-from teacher.writers.paper import Detail, Writer, join_sentences
-from teacher.writers.relational import RelationalWriter
+from dynapix.conf.schema.servers import NARRATOR_WORDS
+from dynapix.data.records import SelectionItem
+from dynapix.teacher.predicates.facts import Predicates, RelationalPredicates
+from dynapix.teacher.statement_choice import Decision, choose_statements
+from dynapix.teacher.writers.paper import Detail, Writer, join_sentences
+from dynapix.teacher.writers.relational import RelationalWriter
 
 NARRATOR_VERSION = "16"
 SHORT, LONG, RELATIONAL_LONG = 110, NARRATOR_WORDS[1], 235

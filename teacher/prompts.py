@@ -12,17 +12,18 @@ from dataclasses import asdict
 from importlib.resources import files
 from typing import Any
 
-from conf.schema import TeacherConfig
-from data.records import SelectionItem
-from teacher.cited_rationales import CONNECTIVES, list_facts
-from teacher.predicates.facts import Predicates, Relation, RelationalPredicates
-from teacher.predicates.relations import find_topic
-from teacher.sections import SECTIONS
-from teacher.statement_choice import choose_statements
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.records import SelectionItem
+from dynapix.teacher.cited_rationales import CONNECTIVES, list_facts
+from dynapix.teacher.predicates.facts import Predicates, Relation, RelationalPredicates
+from dynapix.teacher.predicates.relations import find_topic
+from dynapix.teacher.sections import SECTIONS
+from dynapix.teacher.statement_choice import choose_statements
 
-SYSTEM = (files("teacher") / "templates" / "system_prompt.txt").read_text().rstrip()
-CITED = (files("teacher") / "templates" / "cited_prompt.txt").read_text().rstrip()
-RELATIONAL = (files("teacher") / "templates" / "relational_prompt.txt").read_text().rstrip() + "\n"
+TEMPLATES = files("dynapix.teacher") / "templates"
+SYSTEM = (TEMPLATES / "system_prompt.txt").read_text().rstrip()
+CITED = (TEMPLATES / "cited_prompt.txt").read_text().rstrip()
+RELATIONAL = (TEMPLATES / "relational_prompt.txt").read_text().rstrip() + "\n"
 """The part of the instructions that explains relational predicates."""
 _TEXTS = "\0".join([SYSTEM, CITED, RELATIONAL])
 PROMPT_VERSION = f"3-{hashlib.sha256(_TEXTS.encode()).hexdigest()[:8]}"

@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from conf.files import write_json, write_text
-from data.records import COLORS, MATERIALS, Rationale, SelectionItem
-from teacher.predicates.grounding import Grounding
-from teacher.predicates.vocabulary import choose_vocabulary, name_vocabulary
-from teacher.prompts import format_facts
-from teacher.validation.validator import WORD
+from dynapix.conf.files import write_json, write_text
+from dynapix.data.records import COLORS, MATERIALS, Rationale, SelectionItem
+from dynapix.teacher.predicates.grounding import Grounding
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary, name_vocabulary
+from dynapix.teacher.prompts import format_facts
+from dynapix.teacher.validation.validator import WORD
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from conf.schema import TeacherConfig
-    from data.store import Store
+    from dynapix.conf.schema import TeacherConfig
+    from dynapix.data.store import Store
 
 Figures = dict[str, Any]
 
@@ -240,8 +240,8 @@ def write_report(
     responses to `count` items. Return the path of report.html."""
     import jinja2
 
-    from conf.files import write_bytes
-    from data.publish.contact_sheets import SheetRows, draw_sheet
+    from dynapix.conf.files import write_bytes
+    from dynapix.data.publish.contact_sheets import SheetRows, draw_sheet
 
     teacher = name_teacher(cfg)
     text = f"teacher: {teacher}\npredicates: {name_vocabulary(cfg)}\n{format_figures(figures)}"
@@ -254,7 +254,7 @@ def write_report(
         facts = predicates and choose_vocabulary(predicates, cfg)
         shown = sorted(responses[item.item_id], key=lambda r: not r.accepted)
         examples.append((item, shown, json.dumps(facts and format_facts(facts), indent=1)))
-    template = (files("teacher") / "templates" / "report.html").read_text()
+    template = (files("dynapix.teacher") / "templates" / "report.html").read_text()
     page = jinja2.Template(template, autoescape=True).render(
         teacher=teacher,
         name_constraint=name_constraint,

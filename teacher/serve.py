@@ -11,10 +11,10 @@ import subprocess
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.files import write_text
-from conf.schema import ServeCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_text
+from dynapix.conf.schema import ServeCommand
 
 log = logging.getLogger(__name__)
 

@@ -6,20 +6,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from conf.schema import TeacherConfig
-from data.records import Rationale, SelectionItem
-from teacher.cited_rationales import CitationError, cited_schema, compose_rationale, list_facts
-from teacher.predicates.grounding import Grounding
-from teacher.predicates.vocabulary import choose_vocabulary, describe_item
-from teacher.prompts import build_messages
-from teacher.sections import GRAMMAR
-from teacher.servers.capabilities import Constraint, RequestFields
-from teacher.servers.pool import NoResponseError, ServerPool, run_limited
-from teacher.servers.responses import Response
-from teacher.validation.grader import RationaleGrader
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.records import Rationale, SelectionItem
+from dynapix.teacher.cited_rationales import (
+    CitationError,
+    cited_schema,
+    compose_rationale,
+    list_facts,
+)
+from dynapix.teacher.predicates.grounding import Grounding
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary, describe_item
+from dynapix.teacher.prompts import build_messages
+from dynapix.teacher.sections import GRAMMAR
+from dynapix.teacher.servers.capabilities import Constraint, RequestFields
+from dynapix.teacher.servers.pool import NoResponseError, ServerPool, run_limited
+from dynapix.teacher.servers.responses import Response
+from dynapix.teacher.validation.grader import RationaleGrader
 
 if TYPE_CHECKING:
-    from data.store import Store
+    from dynapix.data.store import Store
 
 Job = tuple[SelectionItem, int]
 """An item and the index of its next attempt."""

@@ -10,10 +10,10 @@ from math import dist, erf, hypot, sqrt
 
 import numpy as np
 
-from conf.schema import RelationBounds
-from teacher.predicates.facts import OUT_OF_VIEW, Relation, RelationalPredicates, View
-from teacher.predicates.margins import measure_margin
-from teacher.predicates.relations import CHANGES
+from dynapix.conf.schema import RelationBounds
+from dynapix.teacher.predicates.facts import OUT_OF_VIEW, Relation, RelationalPredicates, View
+from dynapix.teacher.predicates.margins import measure_margin
+from dynapix.teacher.predicates.relations import CHANGES
 
 SEEN_ERROR, PREDICTED_ERROR = 0.02, 0.3
 """Standard deviations, along each axis, of a reader's errors in the places of objects. `SEEN_ERROR`

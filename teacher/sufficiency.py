@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from teacher.predicates.facts import Relation, RelationalPredicates, View
-from teacher.predicates.relations import VALUES, normalize_relation
-from teacher.reading.claims import BETWEEN, OBJECT_CHECKS, TARGET, Claim
-from teacher.sections import split_sections
+from dynapix.teacher.predicates.facts import Relation, RelationalPredicates, View
+from dynapix.teacher.predicates.relations import VALUES, normalize_relation
+from dynapix.teacher.reading.claims import BETWEEN, OBJECT_CHECKS, TARGET, Claim
+from dynapix.teacher.sections import split_sections
 
 SECTION = "Prediction"
 """The section whose claims are the predicted state."""

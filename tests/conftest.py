@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
-from data.build import ensure_benchmark
-from data.items.recipes import CELLS
-from data.store import Store, open_store
+from dynapix.conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
+from dynapix.data.build import ensure_benchmark
+from dynapix.data.items.recipes import CELLS
+from dynapix.data.store import Store, open_store
 
 
 def micro_config(**changes: object) -> BenchmarkConfig:

@@ -7,9 +7,9 @@ from dataclasses import asdict, replace
 import pytest
 
 from benchmarks.speed.growth import scale_preset
-from conf.compose import compose
-from conf.runs import flatten
-from conf.schema import BenchmarkConfig, BuildCommand
+from dynapix.conf.compose import compose
+from dynapix.conf.runs import flatten
+from dynapix.conf.schema import BenchmarkConfig, BuildCommand
 
 
 @pytest.fixture(scope="module")

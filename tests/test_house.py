@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
+import shutil
 import subprocess
 import sys
-import tomllib
+import zipfile
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
+import dynapix
+
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("conf", "data", "teacher", "models", "train", "evaluation", "dynapix")
-"""The packages in the order of the data flow: each imports only from itself and those before it."""
+"""The packages in the order of the data flow: each imports only from itself and those before it.
+
+`dynapix/` has a link to each of the others, and code imports them through it: a folder `data` of
+the user's cannot hide `dynapix.data`."""
 TOP = {"data/export.py", "evaluation/report.py"}
 """Commands that show or write what several packages make. Nothing imports them, so they import from
 all."""
@@ -32,9 +39,16 @@ LARGEST_FOLDER = 14
 """Maximum number of modules in a folder."""
 
 
+def imported_names(path: Path) -> list[str]:
+    """Return the modules that a file imports."""
+    nodes = [*ast.walk(ast.parse(path.read_text()))]
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    return names + [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+
+
 def test_all_commands_are_found() -> None:
     assert {"data.build", "train.sft", "train.contrastive", "evaluation.report"} <= set(COMMANDS)
-    assert len(COMMANDS) == 20
+    assert len(COMMANDS) == 19
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -43,16 +57,15 @@ def test_packages_import_only_from_those_before_them(package: str) -> None:
     tops = {name.removesuffix(".py").replace("/", ".") for name in TOP}
     for path in (ROOT / package).rglob("*.py"):
         name = path.relative_to(ROOT).as_posix()
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = []
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                names = [node.module or ""]
-            assert not tops & {*names}, f"{name} imports a command"
-            roots = {name.split(".")[0] for name in names} & {*PACKAGES, "benchmarks", "tests"}
-            known = {*PACKAGES} if name in TOP else allowed
-            assert roots <= known, f"{name} imports {roots - known}"
+        names = imported_names(path)
+        foreign = {*PACKAGES[:-1], "benchmarks", "research", "tests"}
+        assert not foreign & {each.split(".")[0] for each in names}, f"{name}: {names}"
+        below = [each.removeprefix("dynapix.") for each in names if each.startswith("dynapix")]
+        assert not tops & {*below}, f"{name} imports a command"
+        parts = {each.split(".")[0] for each in below}
+        roots = {part if part in PACKAGES else "dynapix" for part in parts}
+        known = {*PACKAGES} if name in TOP else allowed
+        assert roots <= known, f"{name} imports {roots - known}"
 
 
 ROOMS = (
@@ -70,8 +83,8 @@ def test_rooms_of_data_import_only_from_those_before_them(path: Path) -> None:
     if own == "__init__":
         return
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "data":
-            below = node.module.split(".")[1:]
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("dynapix.data"):
+            below = node.module.split(".")[2:]
             names = below[:1] or [alias.name for alias in node.names]
             for name in names:
                 assert name == own or place[name] < place[own], f"{path} imports data.{name}"
@@ -117,23 +130,56 @@ def test_no_file_names_a_package_registry() -> None:
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
     for name in listed.stdout.splitlines():
         path = ROOT / name
-        if path.suffix in (".png", ".safetensors", ".parquet") or not path.exists():
+        if path.suffix in (".png", ".safetensors", ".parquet") or not path.is_file():
             continue
         text = path.read_text(errors="ignore")
         assert not any(host in text for host in hosts), name
 
 
-def test_the_wheel_has_every_file_of_the_packages() -> None:
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    shipped = {
-        path
-        for package, patterns in settings["package-data"].items()
-        for pattern in patterns
-        for path in (ROOT / package.replace(".", "/")).glob(pattern)
-    }
-    listed = subprocess.run(
-        ["git", "ls-files", *PACKAGES], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    files = {ROOT / name for name in listed.stdout.splitlines() if not name.endswith(".py")}
-    assert len(files) > 50
-    assert not files - shipped
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The content of a wheel of this project."""
+    folder = tmp_path_factory.mktemp("wheel")
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    for name in listed.stdout.splitlines():
+        if (ROOT / name).exists() and not name.startswith("tests/"):
+            (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, folder / "source" / name, follow_symlinks=False)
+    build = [sys.executable, "-m", "uv", "build", "--quiet", "--wheel", "--out-dir", str(folder)]
+    subprocess.run([*build, str(folder / "source")], check=True)
+    (wheel,) = folder.glob("*.whl")
+    zipfile.ZipFile(wheel).extractall(folder / "site")
+    return folder / "site"
+
+
+@pytest.mark.slow
+def test_the_wheel_has_every_file_of_the_packages(site: Path) -> None:
+    command = ["git", "ls-files", *PACKAGES]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    files = [name for name in listed.stdout.splitlines() if (ROOT / name).is_file()]
+    assert len(files) > 400
+    own = [name if name.startswith("dynapix/") else f"dynapix/{name}" for name in files]
+    assert not [name for name in own if not (site / name).is_file()]
+    assert not (site / "benchmarks").exists()
+
+
+@pytest.mark.slow
+def test_folders_of_a_user_hide_nothing_of_the_package(site: Path, tmp_path: Path) -> None:
+    for name in PACKAGES[:-1]:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise SystemExit('of the user')")
+    names = "; ".join(f"dynapix.{name}" for name in dynapix.__all__)
+    code = f"import dynapix; {names}; print(dynapix.__file__)"
+    env = {**os.environ, "PYTHONPATH": str(site)}
+    for arguments in (["-c", code], ["-m", "dynapix"], ["-m", "dynapix.train.sft", "--help"]):
+        command = [sys.executable, *arguments]
+        done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert arguments[0] != "-c" or done.stdout.startswith(str(site))
+    for command in ("data.build", "teacher.narrate", "train.sft", "evaluation.select"):
+        elsewhere = tmp_path / "elsewhere"
+        elsewhere.mkdir(exist_ok=True)
+        subprocess.run(
+            [sys.executable, "-m", command, "--help"],
+            cwd=elsewhere, env=env, check=True, capture_output=True,
+        )  # fmt: skip

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 import dynapix
-from conf.compose import compose, config_name
-from conf.multirun.sweep import Sweep
-from conf.runs import TRAINER_FOLDERS, run_name
+from dynapix.conf.compose import compose, config_name
+from dynapix.conf.multirun.sweep import Sweep
+from dynapix.conf.runs import TRAINER_FOLDERS, run_name
 from tests.conf.test_presets import SCHEMAS
 from tests.evaluation.chat_server import ChatServer
 

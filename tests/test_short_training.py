@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.experiments.sabotage import INTACT, SABOTAGES, train_and_measure
+from research.experiments.sabotage import INTACT, SABOTAGES, train_and_measure
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from torch import nn
 from transformers import PreTrainedModel, ProcessorMixin
 
-from conf.schema import (
+from dynapix.conf.schema import (
     ArchitectureConfig,
     BenchmarkConfig,
     ContrastiveCommand,
@@ -21,11 +21,11 @@ from conf.schema import (
     StudentConfig,
     TeacherConfig,
 )
-from data.frames.frame_cache import FrameReader
-from data.records import RetrievalQuery
-from data.store import Store
-from models.tiny_qwen3_vl import build_model, build_processor
-from train.student import dataset
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import RetrievalQuery
+from dynapix.data.store import Store
+from dynapix.models.tiny_qwen3_vl import build_model, build_processor
+from dynapix.train.student import dataset
 
 SMALL = ArchitectureConfig(
     hidden=64,

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from conf.errors import UserError
+from dynapix.conf.errors import UserError
 
 
 @contextmanager

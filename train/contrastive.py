@@ -7,12 +7,12 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-from conf.entry import command
-from conf.errors import UserError
-from conf.gpus import restrict_to_one_gpu
-from conf.runs import Run, rank, read_finished_metrics
-from conf.schema import ContrastiveCommand
-from conf.trackers import check_trackers
+from dynapix.conf.entry import command
+from dynapix.conf.errors import UserError
+from dynapix.conf.gpus import restrict_to_one_gpu
+from dynapix.conf.runs import Run, rank, read_finished_metrics
+from dynapix.conf.schema import ContrastiveCommand
+from dynapix.conf.trackers import check_trackers
 
 log = logging.getLogger(__name__)
 
@@ -26,19 +26,19 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
 
     from transformers import set_seed
 
-    from data.build import ensure_benchmark
-    from models.checks import check_available
-    from models.compat import keep_freed_memory
-    from models.distributed import is_sharded, main_first, split_batch
-    from models.layers.fast_layers import use_fast_layers
-    from models.resolved_settings import data_digest, resolve_run
-    from models.retriever.embedder import load_retriever, tokenizer_texts
-    from train.common.checkpoints import newest_checkpoint
-    from train.common.journal import run_metrics
-    from train.common.model_card import write_run_card
-    from train.common.training_loop import explain_load_errors, run_training
-    from train.retriever.batches import read_pools, split_queries
-    from train.retriever.trainer_setup import build_trainer
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.models.checks import check_available
+    from dynapix.models.compat import keep_freed_memory
+    from dynapix.models.distributed import is_sharded, main_first, split_batch
+    from dynapix.models.layers.fast_layers import use_fast_layers
+    from dynapix.models.resolved_settings import data_digest, resolve_run
+    from dynapix.models.retriever.embedder import load_retriever, tokenizer_texts
+    from dynapix.train.common.checkpoints import newest_checkpoint
+    from dynapix.train.common.journal import run_metrics
+    from dynapix.train.common.model_card import write_run_card
+    from dynapix.train.common.training_loop import explain_load_errors, run_training
+    from dynapix.train.retriever.batches import read_pools, split_queries
+    from dynapix.train.retriever.trainer_setup import build_trainer
 
     keep_freed_memory()
     if is_sharded():

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from conf.entry import Run, command
-from conf.gpus import restrict_to_one_gpu
-from conf.runs import read_finished_metrics
-from conf.schema import DistillCommand
-from conf.trackers import check_trackers
+from dynapix.conf.entry import Run, command
+from dynapix.conf.gpus import restrict_to_one_gpu
+from dynapix.conf.runs import read_finished_metrics
+from dynapix.conf.schema import DistillCommand
+from dynapix.conf.trackers import check_trackers
 
 
 @command("train.distill", DistillCommand, ranks=True)
@@ -18,23 +18,23 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     restrict_to_one_gpu()
     check_trackers(cfg.train.report_to)
 
-    from data.build import ensure_benchmark
-    from models import compat, distributed
-    from models.fingerprints import weights_digest
-    from models.resolved_settings import data_digest
-    from models.trained_runs import product_folder
-    from teacher.narrate import ensure_rationales
-    from train.common.checkpoints import newest_checkpoint
-    from train.on_policy.continuation import (
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.models import compat, distributed
+    from dynapix.models.fingerprints import weights_digest
+    from dynapix.models.resolved_settings import data_digest
+    from dynapix.models.trained_runs import product_folder
+    from dynapix.teacher.narrate import ensure_rationales
+    from dynapix.train.common.checkpoints import newest_checkpoint
+    from dynapix.train.on_policy.continuation import (
         inherit_settings,
         load_source,
         read_source_settings,
         resolve_continuation,
         train_and_save,
     )
-    from train.on_policy.distillation import build_trainer
-    from train.on_policy.paired_prompts import load_datasets
-    from train.on_policy.teachers import (
+    from dynapix.train.on_policy.distillation import build_trainer
+    from dynapix.train.on_policy.paired_prompts import load_datasets
+    from dynapix.train.on_policy.teachers import (
         LocalTeacher,
         ServerTeacher,
         load_teacher,

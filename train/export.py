@@ -21,15 +21,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.files import read_json, write_json
-from conf.runs import lock_file, resolve_run_name, runs_folder
-from conf.schema import ContrastiveCommand, ExportModelCommand, SftCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import read_json, write_json
+from dynapix.conf.runs import lock_file, resolve_run_name, runs_folder
+from dynapix.conf.schema import ContrastiveCommand, ExportModelCommand, SftCommand
 
 if TYPE_CHECKING:
-    from train.retriever.merge import RetrieverMerge
-    from train.student.merge import StudentMerge
+    from dynapix.train.retriever.merge import RetrieverMerge
+    from dynapix.train.student.merge import StudentMerge
 
 log = logging.getLogger(__name__)
 
@@ -40,11 +40,11 @@ COMMANDS = {"student": SftCommand, "retriever": ContrastiveCommand}
 
 @command("train.export", ExportModelCommand)
 def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
-    from data.store import hash_file
-    from models.checks import ADAPTER_WEIGHTS
-    from models.resolved_settings import RESOLVED
-    from models.trained_runs import EXPORT, read_export_record, settings_file
-    from train.common.model_card import CARD, build_model_card
+    from dynapix.data.store import hash_file
+    from dynapix.models.checks import ADAPTER_WEIGHTS
+    from dynapix.models.resolved_settings import RESOLVED
+    from dynapix.models.trained_runs import EXPORT, read_export_record, settings_file
+    from dynapix.train.common.model_card import CARD, build_model_card
 
     name, run_folder, settings = find_run(cfg.run, cfg.product, cfg.checkpoints)
     saved, folder = run_folder / cfg.product, run.folder / cfg.product
@@ -66,11 +66,11 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
             if (resolved := run_folder / RESOLVED).exists():
                 shutil.copy(resolved, partial)
         elif cfg.product == "student":
-            from train.student.merge import StudentMerge
+            from dynapix.train.student.merge import StudentMerge
 
             measured = write_merged(StudentMerge(settings, saved), partial, cfg)
         else:
-            from train.retriever.merge import RetrieverMerge
+            from dynapix.train.retriever.merge import RetrieverMerge
 
             measured = write_merged(RetrieverMerge(settings, saved), partial, cfg)
         for file_name in RECORDS:
@@ -98,10 +98,10 @@ def find_run(
     """
     from safetensors import safe_open
 
-    from models.checks import ADAPTER_WEIGHTS
-    from models.loading import explain_damage
-    from models.resolved_settings import check_base
-    from models.trained_runs import read_trained_settings
+    from dynapix.models.checks import ADAPTER_WEIGHTS
+    from dynapix.models.loading import explain_damage
+    from dynapix.models.resolved_settings import check_base
+    from dynapix.models.trained_runs import read_trained_settings
 
     runs = runs_folder(checkpoints, product, run)
     name = resolve_run_name(run, runs)
@@ -137,7 +137,7 @@ def write_merged(
     Raises:
         UserError: The outputs differ too much, or the benchmark or its rationales are missing.
     """
-    from train.common.output_comparison import compare_outputs
+    from dynapix.train.common.output_comparison import compare_outputs
 
     if not cfg.verify:
         merge.write(folder, cfg.format)

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from conf.entry import Run, command
-from conf.gpus import restrict_to_one_gpu
-from conf.runs import read_finished_metrics
-from conf.schema import ReinforceCommand
-from conf.trackers import check_trackers
+from dynapix.conf.entry import Run, command
+from dynapix.conf.gpus import restrict_to_one_gpu
+from dynapix.conf.runs import read_finished_metrics
+from dynapix.conf.schema import ReinforceCommand
+from dynapix.conf.trackers import check_trackers
 
 
 @command("train.reinforce", ReinforceCommand, ranks=True)
@@ -22,20 +22,20 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     restrict_to_one_gpu()
     check_trackers(cfg.train.report_to)
 
-    from data.build import ensure_benchmark
-    from models import compat, distributed
-    from models.fingerprints import weights_digest
-    from models.resolved_settings import data_digest
-    from models.trained_runs import product_folder
-    from train.common.checkpoints import newest_checkpoint
-    from train.on_policy.continuation import (
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.models import compat, distributed
+    from dynapix.models.fingerprints import weights_digest
+    from dynapix.models.resolved_settings import data_digest
+    from dynapix.models.trained_runs import product_folder
+    from dynapix.train.common.checkpoints import newest_checkpoint
+    from dynapix.train.on_policy.continuation import (
         inherit_settings,
         load_source,
         read_source_settings,
         resolve_continuation,
         train_and_save,
     )
-    from train.on_policy.reinforcement import build_trainer, load_items
+    from dynapix.train.on_policy.reinforcement import build_trainer, load_items
 
     compat.keep_freed_memory()
     source, trained = read_source_settings(cfg.model)

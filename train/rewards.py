@@ -12,14 +12,19 @@ from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from data.records import SelectionItem
-from models.student.answer_parser import parse_choice
-from teacher.numbers.detection import find_numbers
-from teacher.predicates.facts import Relation, RelationalPredicates
-from teacher.predicates.relations import VALUES, normalize_relation
-from teacher.reading.claims import Claim
-from teacher.sections import SECTIONS, split_sections
-from teacher.validation.reasons import CONTRADICTED, SUPPORTED, ResponseReasons, read_response
+from dynapix.data.records import SelectionItem
+from dynapix.models.student.answer_parser import parse_choice
+from dynapix.teacher.numbers.detection import find_numbers
+from dynapix.teacher.predicates.facts import Relation, RelationalPredicates
+from dynapix.teacher.predicates.relations import VALUES, normalize_relation
+from dynapix.teacher.reading.claims import Claim
+from dynapix.teacher.sections import SECTIONS, split_sections
+from dynapix.teacher.validation.reasons import (
+    CONTRADICTED,
+    SUPPORTED,
+    ResponseReasons,
+    read_response,
+)
 
 MIN_CLAIMS = 6
 """Minimum denominator of `reward_truth`: a response with fewer different claims earns less."""

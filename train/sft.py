@@ -7,11 +7,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from conf.entry import Run, command
-from conf.gpus import restrict_to_one_gpu
-from conf.runs import rank, read_finished_metrics
-from conf.schema import SftCommand
-from conf.trackers import check_trackers
+from dynapix.conf.entry import Run, command
+from dynapix.conf.gpus import restrict_to_one_gpu
+from dynapix.conf.runs import rank, read_finished_metrics
+from dynapix.conf.schema import SftCommand
+from dynapix.conf.trackers import check_trackers
 
 log = logging.getLogger(__name__)
 
@@ -25,18 +25,18 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
 
     from transformers import set_seed
 
-    from data.build import ensure_benchmark
-    from models import compat, distributed, loading
-    from models.checks import check_adapters, check_available
-    from models.layers.fast_layers import use_fast_layers
-    from models.resolved_settings import data_digest, resolve_run
-    from teacher.narrate import ensure_rationales
-    from train.common import training_loop
-    from train.common.checkpoints import newest_checkpoint
-    from train.common.journal import run_metrics
-    from train.common.model_card import write_run_card
-    from train.student.dataset import load_datasets, tokenizer_corpus
-    from train.student.trainer_setup import build_trainer
+    from dynapix.data.build import ensure_benchmark
+    from dynapix.models import compat, distributed, loading
+    from dynapix.models.checks import check_adapters, check_available
+    from dynapix.models.layers.fast_layers import use_fast_layers
+    from dynapix.models.resolved_settings import data_digest, resolve_run
+    from dynapix.teacher.narrate import ensure_rationales
+    from dynapix.train.common import training_loop
+    from dynapix.train.common.checkpoints import newest_checkpoint
+    from dynapix.train.common.journal import run_metrics
+    from dynapix.train.common.model_card import write_run_card
+    from dynapix.train.student.dataset import load_datasets, tokenizer_corpus
+    from dynapix.train.student.trainer_setup import build_trainer
 
     compat.keep_freed_memory()
     # Check the batch and the base now, because building the benchmark may take long.

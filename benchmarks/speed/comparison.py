@@ -34,12 +34,12 @@ from transformers import (
 
 from benchmarks.arguments import positive_int
 from benchmarks.speed import hours
-from conf.errors import SettingsError, UserError
-from conf.runs import Run
-from conf.schema import TrainConfig
-from models.precision import resolve_precision
-from models.tiny_qwen3_vl import SPECIAL_TOKENS, build_processor
-from train.common.arguments import common_arguments
+from dynapix.conf.errors import SettingsError, UserError
+from dynapix.conf.runs import Run
+from dynapix.conf.schema import TrainConfig
+from dynapix.models.precision import resolve_precision
+from dynapix.models.tiny_qwen3_vl import SPECIAL_TOKENS, build_processor
+from dynapix.train.common.arguments import common_arguments
 
 OURS = "ours"
 """Name of the variant that uses this project's trainer with the preset's settings."""

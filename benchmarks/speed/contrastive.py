@@ -39,21 +39,21 @@ from transformers import Trainer, set_seed
 from benchmarks.arguments import positive_int
 from benchmarks.speed import comparison
 from benchmarks.speed.comparison import MALLOC, OURS, SEED, Measurements, timing_arguments
-from conf.compose import compose
-from conf.failures import report_failures
-from conf.runs import Run
-from conf.schema import ContrastiveCommand
-from data.build import ensure_benchmark
-from data.frames.frame_cache import FrameReader
-from data.records import RetrievalQuery
-from models import compat
-from models.layers.attention import choose_attention
-from models.layers.fast_layers import use_fast_layers
-from models.retriever import embedder
-from models.retriever.inputs import Retriever, frame_input, query_input
-from train.retriever.batches import QueryBatchSampler
-from train.retriever.trainer import NUMBER, numbered_rows
-from train.retriever.trainer_setup import build_trainer
+from dynapix.conf.compose import compose
+from dynapix.conf.failures import report_failures
+from dynapix.conf.runs import Run
+from dynapix.conf.schema import ContrastiveCommand
+from dynapix.data.build import ensure_benchmark
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import RetrievalQuery
+from dynapix.models import compat
+from dynapix.models.layers.attention import choose_attention
+from dynapix.models.layers.fast_layers import use_fast_layers
+from dynapix.models.retriever import embedder
+from dynapix.models.retriever.inputs import Retriever, frame_input, query_input
+from dynapix.train.retriever.batches import QueryBatchSampler
+from dynapix.train.retriever.trainer import NUMBER, numbered_rows
+from dynapix.train.retriever.trainer_setup import build_trainer
 
 
 @dataclass(frozen=True)

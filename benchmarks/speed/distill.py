@@ -33,19 +33,19 @@ from benchmarks.speed.comparison import SEED, Measurements
 from benchmarks.speed.sft import VARIANTS as SFT_VARIANTS
 from benchmarks.speed.sft import list_overrides, write_base
 from benchmarks.speed.sft import measure as measure_sft
-from conf.compose import compose
-from conf.failures import report_failures
-from conf.runs import Run
-from conf.schema import DistillCommand, SftCommand
-from data.build import ensure_benchmark
-from models import compat, loading
-from models.distributed import rank_device
-from models.layers.fast_layers import use_fast_layers
-from teacher.narrate import ensure_rationales
-from train.on_policy import distillation, sampling
-from train.on_policy.continuation import inherit_settings
-from train.on_policy.paired_prompts import load_datasets
-from train.on_policy.teachers import LocalTeacher
+from dynapix.conf.compose import compose
+from dynapix.conf.failures import report_failures
+from dynapix.conf.runs import Run
+from dynapix.conf.schema import DistillCommand, SftCommand
+from dynapix.data.build import ensure_benchmark
+from dynapix.models import compat, loading
+from dynapix.models.distributed import rank_device
+from dynapix.models.layers.fast_layers import use_fast_layers
+from dynapix.teacher.narrate import ensure_rationales
+from dynapix.train.on_policy import distillation, sampling
+from dynapix.train.on_policy.continuation import inherit_settings
+from dynapix.train.on_policy.paired_prompts import load_datasets
+from dynapix.train.on_policy.teachers import LocalTeacher
 
 SFT, DISTILL, SAMPLING = "train.sft", "train.distill", "sampling"
 

@@ -34,16 +34,22 @@ from tqdm import tqdm
 
 from benchmarks.arguments import positive_int
 from benchmarks.speed import comparison, contrastive, retrieval, sft
-from conf.compose import compose
-from conf.failures import report_failures
-from conf.schema import BenchmarkConfig, BuildCommand, NarrateCommand, Quota, RetrieveCommand
-from data import build
-from data.frames.frame_cache import FrameReader
-from data.items.cells import family_quotas
-from data.parallel import Workers
-from data.store import open_store
-from models.precision import resolve_precision
-from teacher.narrate import JOURNAL_FILE, narrate_store
+from dynapix.conf.compose import compose
+from dynapix.conf.failures import report_failures
+from dynapix.conf.schema import (
+    BenchmarkConfig,
+    BuildCommand,
+    NarrateCommand,
+    Quota,
+    RetrieveCommand,
+)
+from dynapix.data import build
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.items.cells import family_quotas
+from dynapix.data.parallel import Workers
+from dynapix.data.store import open_store
+from dynapix.models.precision import resolve_precision
+from dynapix.teacher.narrate import JOURNAL_FILE, narrate_store
 
 BUILD_PARTS = {
     "make_scenes": "scenes",
@@ -155,7 +161,7 @@ def step_seconds(batch: int, measured: comparison.Measurements) -> Seconds:
 
 def embed(frames: int, args: argparse.Namespace) -> Seconds:
     """Embed frames of the tiny benchmark with the tiny retriever."""
-    from models.retriever import embedder, inputs
+    from dynapix.models.retriever import embedder, inputs
 
     cfg, seconds = compose("evaluation.retrieve", RetrieveCommand, ["retriever=tiny"]), {}
     store = build.ensure_benchmark(cfg.benchmark, Path(args.store), args.workers)

@@ -23,11 +23,11 @@ from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
-from conf.compose import compose
-from conf.errors import UserError
-from conf.failures import report_failures
-from conf.schema import ContrastiveCommand, SftCommand
-from data.items.cells import family_quotas
+from dynapix.conf.compose import compose
+from dynapix.conf.errors import UserError
+from dynapix.conf.failures import report_failures
+from dynapix.conf.schema import ContrastiveCommand, SftCommand
+from dynapix.data.items.cells import family_quotas
 
 RATES = Path(__file__).with_name("rates.jsonl")
 LIBRARIES = ("torch", "transformers", "sentence-transformers")

@@ -18,14 +18,14 @@ from typing import TypeVar
 
 import pandas as pd
 
-from conf.failures import report_failures
-from conf.schema import TeacherConfig
-from data.store import open_store
-from teacher.narrator import write_rationale
-from teacher.predicates.vocabulary import choose_vocabulary, describe_item
-from teacher.statement_choice import choose_statements
-from teacher.sufficiency import measure_sufficiency
-from teacher.validation.validator import validate_rationale
+from dynapix.conf.failures import report_failures
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.store import open_store
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary, describe_item
+from dynapix.teacher.statement_choice import choose_statements
+from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.validation.validator import validate_rationale
 
 ITEMS = 10_000
 T = TypeVar("T")

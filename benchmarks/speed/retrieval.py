@@ -31,10 +31,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.arguments import positive_int
-from conf.failures import report_failures
-from data.records import FRAMES as SCENE
-from evaluation.embedders.cache import EmbeddingCache
-from evaluation.retrieval.exact_search import Ranks, exact_ranks
+from dynapix.conf.failures import report_failures
+from dynapix.data.records import FRAMES as SCENE
+from dynapix.evaluation.embedders.cache import EmbeddingCache
+from dynapix.evaluation.retrieval.exact_search import Ranks, exact_ranks
 
 WIDTHS = (4096, 2048, 1024, 512, 256, 128, 64)
 

@@ -39,21 +39,21 @@ from transformers import ProcessorMixin, Trainer, set_seed
 
 from benchmarks.speed import comparison
 from benchmarks.speed.comparison import MALLOC, OURS, SEED, Measurements, timing_arguments
-from conf.compose import compose
-from conf.failures import report_failures
-from conf.runs import Run
-from conf.schema import SftCommand
-from data.build import ensure_benchmark
-from models import compat, loading
-from models.layers.attention import flash_attention
-from models.layers.fast_layers import use_fast_layers
-from models.student.collator import Collator, encode, pad
-from models.student.prompts import Sample
-from teacher.narrate import ensure_rationales
-from train.student.dataset import load_datasets, tokenizer_corpus
-from train.student.length_sampler import LengthSampler
-from train.student.trainer import token_mean
-from train.student.trainer_setup import build_trainer
+from dynapix.conf.compose import compose
+from dynapix.conf.failures import report_failures
+from dynapix.conf.runs import Run
+from dynapix.conf.schema import SftCommand
+from dynapix.data.build import ensure_benchmark
+from dynapix.models import compat, loading
+from dynapix.models.layers.attention import flash_attention
+from dynapix.models.layers.fast_layers import use_fast_layers
+from dynapix.models.student.collator import Collator, encode, pad
+from dynapix.models.student.prompts import Sample
+from dynapix.teacher.narrate import ensure_rationales
+from dynapix.train.student.dataset import load_datasets, tokenizer_corpus
+from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.trainer import token_mean
+from dynapix.train.student.trainer_setup import build_trainer
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,13 @@ import pandas as pd
 from PIL import Image
 
 from benchmarks.arguments import positive_int
-from conf.compose import compose, list_presets
-from conf.failures import report_failures
-from conf.schema import BuildCommand, WorldConfig
-from data.records import Scene
-from data.render.bullet import BulletRenderer
-from data.sim.sampling import sample_scene
-from data.sources.scenes import record_scene
+from dynapix.conf.compose import compose, list_presets
+from dynapix.conf.failures import report_failures
+from dynapix.conf.schema import BuildCommand, WorldConfig
+from dynapix.data.records import Scene
+from dynapix.data.render.bullet import BulletRenderer
+from dynapix.data.sim.sampling import sample_scene
+from dynapix.data.sources.scenes import record_scene
 
 SIZE = 240, 160
 """Width and height of the rendered frames, px."""

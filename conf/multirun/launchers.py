@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from conf.errors import UserError, import_extra
-from conf.gpus import visible_gpus
+from dynapix.conf.errors import UserError, import_extra
+from dynapix.conf.gpus import visible_gpus
 
 log = logging.getLogger(__name__)
 

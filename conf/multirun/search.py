@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.types import Override, RangeSweep
 
-from conf.compose import compose
-from conf.errors import SettingsError, UserError, import_extra
-from conf.files import read_json, write_json
-from conf.gpus import visible_gpus
-from conf.multirun.table import is_lower_better
-from conf.runs import compare_settings, other_settings_error
-from conf.schema import SftCommand
+from dynapix.conf.compose import compose
+from dynapix.conf.errors import SettingsError, UserError, import_extra
+from dynapix.conf.files import read_json, write_json
+from dynapix.conf.gpus import visible_gpus
+from dynapix.conf.multirun.table import is_lower_better
+from dynapix.conf.runs import compare_settings, other_settings_error
+from dynapix.conf.schema import SftCommand
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from conf.files import read_json, write_text
+from dynapix.conf.files import read_json, write_text
 
 JOB_FILE = "job.json"
 AT_START_SUFFIX = "_at_start"

@@ -5,8 +5,13 @@ sets the values that differ from the defaults. `check()` returns one message for
 each invalid value or combination of values; a message names keys as the user types them.
 """
 
-from conf.schema.benchmark import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
-from conf.schema.commands import (
+from dynapix.conf.schema.benchmark import (
+    BenchmarkConfig,
+    Quota,
+    RetrievalTrackConfig,
+    SelectionConfig,
+)
+from dynapix.conf.schema.commands import (
     BuildCommand,
     ClaimsCommand,
     CommandConfig,
@@ -20,9 +25,8 @@ from conf.schema.commands import (
     ServeCommand,
     SftCommand,
     StatisticsCommand,
-    TinyBaseCommand,
 )
-from conf.schema.evaluation import (
+from dynapix.conf.schema.evaluation import (
     EmbedderConfig,
     ExportStudyCommand,
     ReportCommand,
@@ -32,14 +36,14 @@ from conf.schema.evaluation import (
     StudyCommand,
     TwoStageCommand,
 )
-from conf.schema.models import (
+from dynapix.conf.schema.models import (
     ArchitectureConfig,
     LateConfig,
     LoraConfig,
     RetrieverConfig,
     StudentConfig,
 )
-from conf.schema.servers import (
+from dynapix.conf.schema.servers import (
     RelationBounds,
     SamplingServerConfig,
     ServerConfig,
@@ -47,15 +51,13 @@ from conf.schema.servers import (
     TeacherConfig,
     TeacherServerConfig,
 )
-from conf.schema.training import (
+from dynapix.conf.schema.training import (
     ContrastiveTrainConfig,
     DistillTrainConfig,
     ReinforceTrainConfig,
     RewardWeights,
     SftTrainConfig,
-    StageConfig,
     StudentTrainConfig,
-    TinyBaseTrainConfig,
     TrainConfig,
 )
-from conf.schema.world import CameraConfig, PartConfig, PhysicsConfig, WorldConfig
+from dynapix.conf.schema.world import CameraConfig, PartConfig, PhysicsConfig, WorldConfig

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
 
-from conf.schema.settings import MISSING, Settings, path, setting
-from conf.schema.world import WorldConfig
+from dynapix.conf.schema.settings import MISSING, Settings, path, setting
+from dynapix.conf.schema.world import WorldConfig
 
 RENDERERS = ("bullet", "blender")
 SIMULATORS = ("bullet", "clevrer", "movi_a", "physion", "tracks")

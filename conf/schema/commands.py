@@ -6,23 +6,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from conf.runs import TRAINER_FOLDERS, is_inside, runs_folder
-from conf.schema.benchmark import BenchmarkConfig
-from conf.schema.models import RetrieverConfig, StudentConfig
-from conf.schema.servers import SamplingServerConfig, TeacherConfig, TeacherServerConfig
-from conf.schema.settings import MISSING, Settings, check_run, path, setting
-from conf.schema.training import (
+from dynapix.conf.runs import TRAINER_FOLDERS, is_inside, runs_folder
+from dynapix.conf.schema.benchmark import BenchmarkConfig
+from dynapix.conf.schema.models import RetrieverConfig, StudentConfig
+from dynapix.conf.schema.servers import SamplingServerConfig, TeacherConfig, TeacherServerConfig
+from dynapix.conf.schema.settings import MISSING, Settings, check_run, path, setting
+from dynapix.conf.schema.training import (
     ContrastiveTrainConfig,
     DistillTrainConfig,
     ReinforceTrainConfig,
     SftTrainConfig,
-    TinyBaseTrainConfig,
 )
-
-BASE_LAYERS, BASE_HEADS = 7, 6
-"""Minimum numbers of language layers and of attention heads of a base that `train.base` trains: its
-targets refer to the first seven layers, and in one of them to six heads: one for the clip, one for
-each candidate, and one for the picture that the text describes."""
 
 
 @dataclass
@@ -260,28 +254,6 @@ class DistillCommand(ContinuationCommand):
 @dataclass
 class ReinforceCommand(ContinuationCommand):
     train: ReinforceTrainConfig = field(default_factory=ReinforceTrainConfig)
-
-
-@dataclass
-class TinyBaseCommand(CommandConfig):
-    benchmark: BenchmarkConfig = MISSING
-    student: StudentConfig = MISSING
-    train: TinyBaseTrainConfig = field(default_factory=TinyBaseTrainConfig)
-    seed: int = setting(0, least=0)
-    """Seed of the order of the items, of the questions and of the heads."""
-
-    def find_problems(self, group: str) -> Iterator[str]:
-        sizes = self.student.architecture
-        if sizes is None:
-            yield (
-                f"student.model={self.student.model}: a base is trained from random weights; "
-                "choose student=tiny_scratch or set student.architecture"
-            )
-        elif sizes.layers < BASE_LAYERS or sizes.heads < BASE_HEADS:
-            yield (
-                f"student.architecture.layers={sizes.layers} and heads={sizes.heads}: the training "
-                f"of a base needs {BASE_LAYERS} layers with {BASE_HEADS} heads or more"
-            )
 
 
 @dataclass

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 from urllib.parse import urlsplit
 
-from conf.schema.benchmark import PAIRED, POOLS, BenchmarkConfig
-from conf.schema.commands import CommandConfig
-from conf.schema.models import RetrieverConfig, StudentConfig
-from conf.schema.servers import ServerConfig
-from conf.schema.settings import (
+from dynapix.conf.schema.benchmark import PAIRED, POOLS, BenchmarkConfig
+from dynapix.conf.schema.commands import CommandConfig
+from dynapix.conf.schema.models import RetrieverConfig, StudentConfig
+from dynapix.conf.schema.servers import ServerConfig
+from dynapix.conf.schema.settings import (
     MISSING,
     Settings,
     check_choices,
@@ -20,7 +20,7 @@ from conf.schema.settings import (
     path,
     setting,
 )
-from conf.schema.training import RATIONALE_REGIMES, ContrastiveTrainConfig, SftTrainConfig
+from dynapix.conf.schema.training import RATIONALE_REGIMES, ContrastiveTrainConfig, SftTrainConfig
 
 RESPONSE_MODES = ("reasoning", "answer", "record", "constrained")
 ROUTES = ("cot_text", "predict_caption", "predict_image")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from conf.schema.settings import MISSING, Settings, path, setting
+from dynapix.conf.schema.settings import MISSING, Settings, path, setting
 
 ENCODERS = ("sentence_transformers", "vlm2vec", "dual", "languagebind")
 

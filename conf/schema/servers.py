@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from conf.schema.settings import MISSING, Settings, is_url, path, setting
+from dynapix.conf.schema.settings import MISSING, Settings, is_url, path, setting
 
 NARRATOR_WORDS = (80, 250)
 """Minimum and maximum number of words of the built-in narrator's rationales."""

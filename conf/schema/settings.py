@@ -9,9 +9,9 @@ from math import isfinite
 from typing import Any, get_args, get_origin, get_type_hints
 from urllib.parse import urlsplit
 
-from conf.errors import UserError
-from conf.files import expand_path, refuse_broken_link
-from conf.runs import is_run_name, resolve_run_name
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import expand_path, refuse_broken_link
+from dynapix.conf.runs import is_run_name, resolve_run_name
 
 MISSING: Any = "???"
 """Default of a required setting. It equals `omegaconf.MISSING`, but importing the schema does not

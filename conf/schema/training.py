@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import ClassVar
 
-from conf.schema.benchmark import POOLS
-from conf.schema.settings import Settings, check_choices, setting
+from dynapix.conf.schema.benchmark import POOLS
+from dynapix.conf.schema.settings import Settings, check_choices, setting
 
 RATIONALE_REGIMES = ("cot", "cot_no_candidate_analysis", "cot_no_match_layout")
 REGIMES = (*RATIONALE_REGIMES, "answer_only")
@@ -272,50 +272,3 @@ class ContrastiveTrainConfig(TrainConfig):
             )
         if not 1 <= self.mini_batch <= self.batch:
             yield f"{group}mini_batch={self.mini_batch} must be from 1 to {group}batch={self.batch}"
-
-
-@dataclass
-class StageConfig(Settings):
-    """A stage of the training of the tiny base (see `train.tiny_base.training`)."""
-
-    steps: int = setting(1000, least=1)
-    """Number of optimizer steps."""
-    batch: int = setting(8, least=1)
-    """Number of samples per step."""
-    lr: float = setting(1e-3, above=0)
-    """Peak learning rate; a cosine lowers it to a twentieth."""
-
-
-def stage(steps: int, batch: int, lr: float) -> StageConfig:
-    """Return the field of a stage with its defaults."""
-    return field(default_factory=lambda: StageConfig(steps, batch, lr))
-
-
-@dataclass
-class TinyBaseTrainConfig(Settings):
-    vision: StageConfig = stage(3000, 16, 2e-3)
-    """The vision tower learns to see objects in single pictures."""
-    motion: StageConfig = stage(2000, 8, 1e-3)
-    """The whole model learns where objects are and where they go."""
-    words: StageConfig = stage(3500, 8, 8e-4)
-    """The model learns to answer questions in words."""
-    weight_decay: float = setting(0.05, least=0)
-    """Weight decay of Muon and AdamW."""
-    adam_beta2: float = setting(0.98, least=0, below=1)
-    """Decay rate of AdamW's second moment."""
-    max_grad_norm: float = setting(1.0, above=0)
-    """Maximum norm of the gradient of the model's weights, to which it is clipped."""
-    precision: str = setting("auto", ("auto", "bf16", "fp32"))
-    """Precision of the forward and backward pass, as in `train.sft`."""
-    hold_out: bool = True
-    """Hold out a tenth of the training scenes, on whose items or queries the evaluations of the run
-    are measured. false trains on all of them, as the paper does; the evaluations are then measured
-    on a sample of what the run trains on."""
-    evaluations: int = setting(10, least=1)
-    """Number of evaluations of each stage. A checkpoint follows each evaluation."""
-    checkpoint_steps: int = setting(200, least=1)
-    """Number of steps between two checkpoints."""
-    validation_items: int = setting(160, least=1)
-    """Number of items, from held-out scenes, of an evaluation."""
-    log_steps: int = setting(20, least=1)
-    """Number of steps between two losses in the journal."""

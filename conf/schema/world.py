@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import dist, hypot
 
-from conf.schema.settings import Settings, check_choices, setting
+from dynapix.conf.schema.settings import Settings, check_choices, setting
 
 SHAPES = ("cube", "sphere", "cylinder")
 APPEARANCES_PER_SHAPE = 16

@@ -12,16 +12,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data.oracle.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
-from data.oracle.extrapolation import extrapolate, project
-from data.records import (
+from dynapix.data.oracle.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
+from dynapix.data.oracle.extrapolation import extrapolate, project
+from dynapix.data.records import (
     Candidate,
     FrameRef,
     RetrievalQuery,
     SelectionItem,
     original_scene_id,
 )
-from data.store import Store
+from dynapix.data.store import Store
 
 
 def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: Store) -> float:

@@ -16,12 +16,12 @@ from PIL import Image
 from torch import nn
 from tqdm import tqdm
 
-from conf.errors import UserError
-from data.frames.frame_cache import render_frames
-from data.parallel import batched
-from data.records import FrameRef, SelectionItem
-from data.seeded_order import named_rng
-from data.store import Store
+from dynapix.conf.errors import UserError
+from dynapix.data.frames.frame_cache import render_frames
+from dynapix.data.parallel import batched
+from dynapix.data.records import FrameRef, SelectionItem
+from dynapix.data.seeded_order import named_rng
+from dynapix.data.store import Store
 
 ENCODER = Path("checkpoints/bases/tiny")
 """Folder of the model whose vision encoder the blind models use."""

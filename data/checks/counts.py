@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
-from conf.schema import BenchmarkConfig
-from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR, PAIRED
-from data.items.cells import builder_name, cell_quotas
-from data.records import CONTACT, SPLITS, FrameRef, RetrievalQuery, SelectionItem
-from data.store import Store
+from dynapix.conf.schema import BenchmarkConfig
+from dynapix.conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR, PAIRED
+from dynapix.data.items.cells import builder_name, cell_quotas
+from dynapix.data.records import CONTACT, SPLITS, FrameRef, RetrievalQuery, SelectionItem
+from dynapix.data.store import Store
 
 
 def count_records(

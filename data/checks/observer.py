@@ -25,20 +25,20 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from conf.errors import UserError
-from conf.files import is_writable, write_bytes
-from conf.runs import lock_file
-from conf.schema import WorldConfig
-from conf.schema.settings import from_dict
-from data.items.futures.simulation import scene_states, simulate_futures
-from data.oracle.contacts import touching_pairs
-from data.oracle.displacement import DIAGONAL, MODEL_SIZE, visible_positions
-from data.parallel import Workers, batched
-from data.records import Scene, SelectionItem, sample_prefix_frames
-from data.seeded_order import named_rng
-from data.sim.camera import Camera
-from data.sim.physics import Branch
-from data.store import Store
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import is_writable, write_bytes
+from dynapix.conf.runs import lock_file
+from dynapix.conf.schema import WorldConfig
+from dynapix.conf.schema.settings import from_dict
+from dynapix.data.items.futures.simulation import scene_states, simulate_futures
+from dynapix.data.oracle.contacts import touching_pairs
+from dynapix.data.oracle.displacement import DIAGONAL, MODEL_SIZE, visible_positions
+from dynapix.data.parallel import Workers, batched
+from dynapix.data.records import Scene, SelectionItem, sample_prefix_frames
+from dynapix.data.seeded_order import named_rng
+from dynapix.data.sim.camera import Camera
+from dynapix.data.sim.physics import Branch
+from dynapix.data.store import Store
 
 ERRORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Standard deviations of an observer's errors in each direction of the image, px at 336 x 336."""

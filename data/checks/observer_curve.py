@@ -13,12 +13,12 @@ from typing import IO, Any, Self
 import numpy as np
 import pandas as pd
 
-from data.checks.figures import COLORS, GRID, INK, create_figure, legend_above
-from data.checks.intervals import Interval, SceneBootstrap
-from data.checks.observer import DRAWS, ERRORS, SIMULATES
-from data.checks.statistics import list_categories
-from data.items.recipes import TIME_CELLS
-from data.records import SelectionItem
+from dynapix.data.checks.figures import COLORS, GRID, INK, create_figure, legend_above
+from dynapix.data.checks.intervals import Interval, SceneBootstrap
+from dynapix.data.checks.observer import DRAWS, ERRORS, SIMULATES
+from dynapix.data.checks.statistics import list_categories
+from dynapix.data.items.recipes import TIME_CELLS
+from dynapix.data.records import SelectionItem
 
 CEILING_ERROR = 1.0
 """Error in px of the observer whose chance of being right is the ceiling of an item."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from conf.errors import UserError
-from data.records import FrameRef, RetrievalQuery, original_scene_id
-from data.store import Store
+from dynapix.conf.errors import UserError
+from dynapix.data.records import FrameRef, RetrievalQuery, original_scene_id
+from dynapix.data.store import Store
 
 QUOTAS = {"future": "builders", "counterfactual": "counterfactual"}
 """The setting below benchmark.retrieval with the quotas of each pool."""

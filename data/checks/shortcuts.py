@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from data.items.futures.contact import has_ghost
-from data.items.scores import compare_candidates, order_target_first, rank_shares
-from data.records import SelectionItem
-from data.seeded_order import named_rng
+from dynapix.data.items.futures.contact import has_ghost
+from dynapix.data.items.scores import compare_candidates, order_target_first, rank_shares
+from dynapix.data.records import SelectionItem
+from dynapix.data.seeded_order import named_rng
 
 PENALTY = 1e-2
 """Weight of the squared coefficients in the loss of the logistic model."""

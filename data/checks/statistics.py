@@ -10,17 +10,17 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
-from data.checks.baselines import score_scene_alone, score_velocity
-from data.checks.shortcuts import (
+from dynapix.data.checks.baselines import score_scene_alone, score_velocity
+from dynapix.data.checks.shortcuts import (
     cross_validate_logistic_model,
     score_logistic_model,
     score_not_the_ghost,
     score_simple_strategies,
 )
-from data.items.scores import COLLISION_SCORES, SCORES, CandidateFrames, compare_item
-from data.oracle.contacts import collisions_in
-from data.records import CONTACT, LETTERS, SPLITS, SelectionItem
-from data.store import Store
+from dynapix.data.items.scores import COLLISION_SCORES, SCORES, CandidateFrames, compare_item
+from dynapix.data.oracle.contacts import collisions_in
+from dynapix.data.records import CONTACT, LETTERS, SPLITS, SelectionItem
+from dynapix.data.store import Store
 
 LOGISTIC, VELOCITY = "logistic model of all scores", "velocity"
 
@@ -93,7 +93,7 @@ def measure_shortcuts(
     right[LOGISTIC] = score_logistic(items, scores, answers)
     right[VELOCITY] = [score_velocity(item, store) for item in items]
     if blind:
-        from data.checks.blind_models import score_blind_models
+        from dynapix.data.checks.blind_models import score_blind_models
 
         right = right.assign(**score_blind_models(items, store, store.manifest["seed"]))
     names = list(right)

@@ -21,11 +21,11 @@ import numpy as np
 import pyarrow as pa
 from PIL import Image
 
-from conf.errors import UserError
-from conf.files import write_bytes
-from data.records import Scene
-from data.render import get_renderer
-from data.store import FRAMES_FOLDER, Store
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_bytes
+from dynapix.data.records import Scene
+from dynapix.data.render import get_renderer
+from dynapix.data.store import FRAMES_FOLDER, Store
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +92,7 @@ def render_frames(
     return (height, width, 3) uint8 arrays by frame index."""
     if scene.footage is not None:
         # Reading the frames of simulated scenes does not need pydantic.
-        from data.sources.releases import READERS
+        from dynapix.data.sources.releases import READERS
 
         reader = READERS[config["simulator"]]
         images = reader.load_images(scene, Path(config["folder"]), frames)

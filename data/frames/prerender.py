@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from conf.files import read_json, write_json
-from conf.runs import LOCK, lock_file
-from conf.schema.benchmark import PAIRED, POOLS
-from data.frames.frame_cache import frames_path, load_frames, render_frames, save_frames
-from data.parallel import Workers
-from data.records import original_scene_id, sample_prefix_frames
-from data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path
+from dynapix.conf.files import read_json, write_json
+from dynapix.conf.runs import LOCK, lock_file
+from dynapix.conf.schema.benchmark import PAIRED, POOLS
+from dynapix.data.frames.frame_cache import frames_path, load_frames, render_frames, save_frames
+from dynapix.data.parallel import Workers
+from dynapix.data.records import original_scene_id, sample_prefix_frames
+from dynapix.data.store import DATABASES, FRAMES_FOLDER, Store, load_scene, scene_path
 
 FRAMES_RECORD = "frames.json"
 """File with the options and results of the last prerendering, which is not repeated."""

@@ -21,27 +21,33 @@ from typing import Any
 
 import numpy as np
 
-from conf.files import write_bytes
-from conf.schema import BenchmarkConfig, Quota
-from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
-from data.items import recipes, transfer
-from data.items.futures import contact
-from data.items.futures.balanced import BalancedPicker
-from data.items.futures.balanced_subset import RESERVE, choose_items
-from data.items.futures.contact import ContactPicker
-from data.items.futures.interventions import (
+from dynapix.conf.files import write_bytes
+from dynapix.conf.schema import BenchmarkConfig, Quota
+from dynapix.conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
+from dynapix.data.items import recipes, transfer
+from dynapix.data.items.futures import contact
+from dynapix.data.items.futures.balanced import BalancedPicker
+from dynapix.data.items.futures.balanced_subset import RESERVE, choose_items
+from dynapix.data.items.futures.contact import ContactPicker
+from dynapix.data.items.futures.interventions import (
     InterventionPicker,
     make_intervention_pair,
     make_intervention_recipe,
 )
-from data.items.pickers import CellInputs, DistractorPicker, Recipe, fill_quota, shuffle_candidates
-from data.items.queries import make_counterfactual_queries, make_future_queries
-from data.items.scores import compare_item
-from data.parallel import Workers
-from data.records import CONTACT, FAMILIES, GHOST, RetrievalQuery, Scene, SelectionItem
-from data.seeded_order import named_rng
-from data.store import PARTS, SCENES_FOLDER, hash_files, load_scene, part_path, scene_path
-from data.versions import component_versions
+from dynapix.data.items.pickers import (
+    CellInputs,
+    DistractorPicker,
+    Recipe,
+    fill_quota,
+    shuffle_candidates,
+)
+from dynapix.data.items.queries import make_counterfactual_queries, make_future_queries
+from dynapix.data.items.scores import compare_item
+from dynapix.data.parallel import Workers
+from dynapix.data.records import CONTACT, FAMILIES, GHOST, RetrievalQuery, Scene, SelectionItem
+from dynapix.data.seeded_order import named_rng
+from dynapix.data.store import PARTS, SCENES_FOLDER, hash_files, load_scene, part_path, scene_path
+from dynapix.data.versions import component_versions
 
 COUNTERFACTUAL = "counterfactual"
 CACHED_SCENES = 20_000

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from conf.schema.benchmark import INTERVENTIONS
-from data.items.recipes import pair_key
-from data.records import INTERVENTION, SelectionItem, sample_prefix_frames
+from dynapix.conf.schema.benchmark import INTERVENTIONS
+from dynapix.data.items.recipes import pair_key
+from dynapix.data.records import INTERVENTION, SelectionItem, sample_prefix_frames
 
 
 def pair_items(items: Sequence[SelectionItem]) -> list[tuple[SelectionItem, SelectionItem]]:

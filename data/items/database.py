@@ -16,12 +16,12 @@ from itertools import chain, islice
 
 import numpy as np
 
-from conf.schema import BenchmarkConfig
-from conf.schema.benchmark import POOLS
-from data.items.cells import builder_name, cell_quotas
-from data.oracle.displacement import visible_positions
-from data.records import FrameRef, RetrievalQuery, Scene
-from data.seeded_order import named_rng, round_robin
+from dynapix.conf.schema import BenchmarkConfig
+from dynapix.conf.schema.benchmark import POOLS
+from dynapix.data.items.cells import builder_name, cell_quotas
+from dynapix.data.oracle.displacement import visible_positions
+from dynapix.data.records import FrameRef, RetrievalQuery, Scene
+from dynapix.data.seeded_order import named_rng, round_robin
 
 DUPLICATE_DISTANCE = 1.0
 """Near-duplicates differ by less than this in all coordinates of objects, px at 336 x 336."""

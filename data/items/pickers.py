@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from conf.schema import Quota
-from data.oracle.displacement import (
+from dynapix.conf.schema import Quota
+from dynapix.data.oracle.displacement import (
     cross_scene_displacement,
     frame_displacements,
     visible_positions,
 )
-from data.records import SPLITS, Candidate, FrameRef, Scene, SelectionItem
-from data.seeded_order import named_rng
+from dynapix.data.records import SPLITS, Candidate, FrameRef, Scene, SelectionItem
+from dynapix.data.seeded_order import named_rng
 
 Pool = tuple[Iterable[Candidate], int]
 """Possible distractors in order of preference, and the maximum number of them to use."""

@@ -17,23 +17,23 @@ from functools import partial
 
 import numpy as np
 
-from conf.schema.benchmark import COUNTERFACTUAL_SECONDS, QUERIES_PER_SCENE
-from data.items.pickers import CellInputs
-from data.items.recipes import spell_seconds
-from data.oracle.contacts import collision_frames, is_next
-from data.oracle.displacement import (
+from dynapix.conf.schema.benchmark import COUNTERFACTUAL_SECONDS, QUERIES_PER_SCENE
+from dynapix.data.items.pickers import CellInputs
+from dynapix.data.items.recipes import spell_seconds
+from dynapix.data.oracle.contacts import collision_frames, is_next
+from dynapix.data.oracle.displacement import (
     cross_scene_displacement,
     frame_displacements,
     visible_positions,
 )
-from data.oracle.interventions import (
+from dynapix.data.oracle.interventions import (
     counterfactual_id,
     last_factual_frame,
     removal_displacements,
     removed_object,
 )
-from data.records import FPS, SPLITS, FrameRef, RetrievalQuery, Scene
-from data.seeded_order import named_rng, round_robin
+from dynapix.data.records import FPS, SPLITS, FrameRef, RetrievalQuery, Scene
+from dynapix.data.seeded_order import named_rng, round_robin
 
 OBSERVED = 2
 """Number of seconds that builder 2 observes, and minimum number for builder 1."""

@@ -29,18 +29,18 @@ from typing import Any
 
 import numpy as np
 
-from conf.schema.benchmark import (
+from dynapix.conf.schema.benchmark import (
     MATCHED_ANCHOR,
     WINDOW_DIFFICULTIES,
     WINDOW_FAMILIES,
     WINDOW_HORIZONS,
     needs_contacts,
 )
-from data.items.pickers import DistractorPicker, Pool, Recipe, Timing, visible_objects
-from data.oracle.contacts import collision_frames, is_next, next_collision
-from data.oracle.displacement import object_match_scores, visible_positions
-from data.oracle.events import window_group
-from data.records import SELECTION_SECOND, Candidate, Scene, SelectionItem
+from dynapix.data.items.pickers import DistractorPicker, Pool, Recipe, Timing, visible_objects
+from dynapix.data.oracle.contacts import collision_frames, is_next, next_collision
+from dynapix.data.oracle.displacement import object_match_scores, visible_positions
+from dynapix.data.oracle.events import window_group
+from dynapix.data.records import SELECTION_SECOND, Candidate, Scene, SelectionItem
 
 EVENT_OBSERVED, WINDOW_OBSERVED = 21, 16
 """Numbers of frames of a prefix. The first and last frame of event items differ by 20."""

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from data.frames.frame_cache import render_frames
-from data.oracle.contacts import next_collision
-from data.oracle.displacement import (
+from dynapix.data.frames.frame_cache import render_frames
+from dynapix.data.oracle.contacts import next_collision
+from dynapix.data.oracle.displacement import (
     MODEL_SIZE,
     cross_scene_displacement,
     object_displacements,
     visible_positions,
 )
-from data.oracle.extrapolation import extrapolate
-from data.records import CONTACT, FrameRef, Scene, SelectionItem
-from data.sim.camera import Camera
+from dynapix.data.oracle.extrapolation import extrapolate
+from dynapix.data.records import CONTACT, FrameRef, Scene, SelectionItem
+from dynapix.data.sim.camera import Camera
 
 SCORES = (
     "nearness", "pixel nearness", "oddness", "pixel oddness", "moment", "travel", "visible", "gap",

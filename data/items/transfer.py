@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from data.items.pickers import DistractorPicker, Pool, Recipe, Timing
-from data.items.recipes import (
+from dynapix.data.items.pickers import DistractorPicker, Pool, Recipe, Timing
+from dynapix.data.items.recipes import (
     EVENT_QUESTION,
     TIME_CELLS,
     TIME_QUESTION,
@@ -23,9 +23,9 @@ from data.items.recipes import (
     scene_candidates,
     spell_seconds,
 )
-from data.oracle.contacts import collision_frames, first_collisions, is_next
-from data.oracle.events import find_motion_onsets
-from data.records import Scene
+from dynapix.data.oracle.contacts import collision_frames, first_collisions, is_next
+from dynapix.data.oracle.events import find_motion_onsets
+from dynapix.data.records import Scene
 
 SPAN, GAP = 20, 10
 """Number of frames from the first to the last frame of the prefix of an event item, and from there

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from data.records import Collision, Scene
-from data.sim.physics import break_frames
+from dynapix.data.records import Collision, Scene
+from dynapix.data.sim.physics import break_frames
 
 Pair = tuple[int, int]
 

@@ -6,9 +6,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from conf.schema.benchmark import MODEL_SIZE
-from data.oracle.visibility import is_hidden
-from data.records import Scene, SceneObject
+from dynapix.conf.schema.benchmark import MODEL_SIZE
+from dynapix.data.oracle.visibility import is_hidden
+from dynapix.data.records import Scene, SceneObject
 
 DIAGONAL = MODEL_SIZE * 2**0.5
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from data.oracle.contacts import collisions_in
-from data.records import Scene
+from dynapix.data.oracle.contacts import collisions_in
+from dynapix.data.records import Scene
 
 OCCLUDED = 0.5
 """Visible fraction below which an object is occluded."""

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from data.records import Scene
-from data.sim.camera import Camera
+from dynapix.data.records import Scene
+from dynapix.data.sim.camera import Camera
 
 
 def extrapolate(scene: Scene, frame: int, seconds: np.ndarray | float) -> np.ndarray:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from data.oracle.displacement import DIAGONAL, visible_positions
-from data.records import COUNTERFACTUAL, FPS, Scene
-from data.seeded_order import named_rng
+from dynapix.data.oracle.displacement import DIAGONAL, visible_positions
+from dynapix.data.records import COUNTERFACTUAL, FPS, Scene
+from dynapix.data.seeded_order import named_rng
 
 LATEST_STOP = 2 * FPS
 """Maximum index of the last frame of a prefix."""

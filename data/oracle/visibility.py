@@ -7,10 +7,10 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from data.records import Scene, SceneObject
-from data.sim.camera import Camera, pixel_rays
-from data.sim.parts import Box
-from data.sim.shapes import (
+from dynapix.data.records import Scene, SceneObject
+from dynapix.data.sim.camera import Camera, pixel_rays
+from dynapix.data.sim.parts import Box
+from dynapix.data.sim.shapes import (
     BOUNDING_RADIUS,
     CORNERS,
     CUBE_HALF,

@@ -17,9 +17,9 @@ from urllib.request import urlopen
 
 from tqdm import tqdm
 
-from conf.errors import UserError
-from conf.runs import lock_file
-from data.store import FRAMES_FOLDER, MANIFEST, RATIONALES, Store, open_store
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import lock_file
+from dynapix.data.store import FRAMES_FOLDER, MANIFEST, RATIONALES, Store, open_store
 
 log = logging.getLogger(__name__)
 

@@ -14,18 +14,24 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
-from conf.schema.benchmark import PAIRED
-from data.frames.frame_cache import FrameReader, encode_png
-from data.publish.leaderboard import write_question
-from data.records import FrameRef, Rationale, RetrievalQuery, SelectionItem, sample_prefix_frames
-from data.store import Store
+from dynapix.conf.schema.benchmark import PAIRED
+from dynapix.data.frames.frame_cache import FrameReader, encode_png
+from dynapix.data.publish.leaderboard import write_question
+from dynapix.data.records import (
+    FrameRef,
+    Rationale,
+    RetrievalQuery,
+    SelectionItem,
+    sample_prefix_frames,
+)
+from dynapix.data.store import Store
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from datasets import Features
 
 COLUMNS = OmegaConf.to_container(
-    OmegaConf.create((files("data.publish") / "columns.yaml").read_text())
+    OmegaConf.create((files("dynapix.data.publish") / "columns.yaml").read_text())
 )
 DESCRIPTIONS: dict[str, str] = COLUMNS.pop("descriptions")
 COLUMNS |= dict.fromkeys(PAIRED, COLUMNS["selection"])

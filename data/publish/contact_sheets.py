@@ -9,10 +9,10 @@ from textwrap import fill
 
 from PIL import Image
 
-from data.frames.frame_cache import FrameReader
-from data.oracle.displacement import cross_scene_displacement
-from data.oracle.interventions import removal_displacements
-from data.records import (
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.oracle.displacement import cross_scene_displacement
+from dynapix.data.oracle.interventions import removal_displacements
+from dynapix.data.records import (
     LETTERS,
     FrameRef,
     RetrievalQuery,
@@ -20,7 +20,7 @@ from data.records import (
     original_scene_id,
     sample_prefix_frames,
 )
-from data.store import Store
+from dynapix.data.store import Store
 
 INK, GREEN = "#222222", "#1a7f37"
 CELL_WIDTH, CAPTION_HEIGHT, HEADING_HEIGHT = 2.3, 0.5, 0.6

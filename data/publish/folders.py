@@ -13,10 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from conf.errors import UserError
-from conf.files import read_json_if_valid, write_bytes
-from conf.runs import lock_file
-from data.store import hash_file
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import read_json_if_valid, write_bytes
+from dynapix.conf.runs import lock_file
+from dynapix.data.store import hash_file
 
 log = logging.getLogger(__name__)
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
-from data.items.controls import pair_items
-from data.publish.contact_sheets import SheetRows, draw_sheet
-from data.records import SPLITS
-from data.seeded_order import named_rng
-from data.store import Store
+from dynapix.conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
+from dynapix.data.items.controls import pair_items
+from dynapix.data.publish.contact_sheets import SheetRows, draw_sheet
+from dynapix.data.records import SPLITS
+from dynapix.data.seeded_order import named_rng
+from dynapix.data.store import Store
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def render_page(store: Store, sheets: Sequence[Sheet]) -> str:
         anchor = Path(sheet.file).stem
         name = anchor.partition("-")[2] or anchor
         sections[sheet.section].append((anchor, name, sheet.title, sheet.file))
-    text = (files("data.publish") / "templates/gallery.html").read_text()
+    text = (files("dynapix.data.publish") / "templates/gallery.html").read_text()
     return Template(text, autoescape=True).render(
         store=store,
         sections=sections,

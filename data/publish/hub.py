@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from conf.errors import UserError
+from dynapix.conf.errors import UserError
 
 log = logging.getLogger(__name__)
 

@@ -27,9 +27,9 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from conf.files import write_bytes
-from conf.schema.benchmark import PAIRED, POOLS
-from data.publish.columns import (
+from dynapix.conf.files import write_bytes
+from dynapix.conf.schema.benchmark import PAIRED, POOLS
+from dynapix.data.publish.columns import (
     DESCRIPTIONS,
     LEADERBOARD,
     ExportedRecord,
@@ -37,11 +37,11 @@ from data.publish.columns import (
     arrow_schema,
     list_columns,
 )
-from data.publish.folders import Shard, describe_file, write_folder
-from data.publish.leaderboard import EVAL_FILE, write_eval_file
-from data.records import SPLITS, RetrievalQuery, SelectionItem
-from data.store import DATABASES, Store
-from data.versions import component_versions
+from dynapix.data.publish.folders import Shard, describe_file, write_folder
+from dynapix.data.publish.leaderboard import EVAL_FILE, write_eval_file
+from dynapix.data.records import SPLITS, RetrievalQuery, SelectionItem
+from dynapix.data.store import DATABASES, Store
+from dynapix.data.versions import component_versions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -209,7 +209,7 @@ def render_card(stores: Mapping[str, Store], shards: Sequence[Shard], images: bo
         rows.setdefault(shard["configuration"], Counter())[shard["split"]] += shard["rows"]
     kinds = {t.configuration: t.kind for t in list_tables(stores, images)}
     columns, shown = list_columns(images), dict.fromkeys(kinds[name] for name in rows)
-    text = (files("data.publish") / "templates/dataset_card.md").read_text()
+    text = (files("dynapix.data.publish") / "templates/dataset_card.md").read_text()
     benchmarks = [_describe_benchmark(name, store) for name, store in stores.items()]
     licences = {each["origin"]["license"] for each in benchmarks}
     return Template(text).render(

@@ -14,8 +14,8 @@ from typing import Any
 import yaml
 from PIL import Image, ImageDraw, ImageFont
 
-from data.frames.frame_cache import FrameReader, encode_png
-from data.records import LETTERS, SelectionItem, sample_prefix_frames
+from dynapix.data.frames.frame_cache import FrameReader, encode_png
+from dynapix.data.records import LETTERS, SelectionItem, sample_prefix_frames
 
 EVAL_FILE = "eval.yaml"
 COLUMNS, CELL_WIDTH, CAPTION, GAP = 4, 336, 24, 4

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from data.render.blender import BlenderRenderer
-from data.render.bullet import BulletRenderer
+from dynapix.data.render.blender import BlenderRenderer
+from dynapix.data.render.bullet import BulletRenderer
 
 Renderer = BulletRenderer | BlenderRenderer
 RENDERERS: dict[str, type[Renderer]] = {"bullet": BulletRenderer, "blender": BlenderRenderer}
@@ -33,7 +33,7 @@ def get_renderer(config: Mapping[str, Any]) -> Renderer:
 
 @cache
 def _make_renderer(name: str, width: int, height: int, world: str) -> Renderer:
-    from conf.schema.settings import from_dict
-    from conf.schema.world import WorldConfig
+    from dynapix.conf.schema.settings import from_dict
+    from dynapix.conf.schema.world import WorldConfig
 
     return RENDERERS[name](width, height, from_dict(WorldConfig, json.loads(world)))

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from data.sim.shapes import CUBE_HALF, RADIUS
+from dynapix.data.sim.shapes import CUBE_HALF, RADIUS
 
 RGB = {
     "gray": (112, 112, 112),

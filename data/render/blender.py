@@ -17,12 +17,12 @@ from typing import Any
 
 from PIL import Image
 
-from conf.errors import UserError
-from conf.schema import WorldConfig
-from data.records import Scene
-from data.render.appearance import RGB
-from data.sim.camera import Camera
-from data.sim.shapes import CUBE_HALF, RADIUS
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import WorldConfig
+from dynapix.data.records import Scene
+from dynapix.data.render.appearance import RGB
+from dynapix.data.sim.camera import Camera
+from dynapix.data.sim.shapes import CUBE_HALF, RADIUS
 
 BPY = "4.2.23"
 """Release of Blender's Python module; other releases give other pixels."""

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from conf.schema import WorldConfig
-from data.records import MATERIALS, Scene, SceneObject
-from data.render.appearance import RGB, Mesh, box_mesh, mesh, texture
-from data.render.floor import Floor
-from data.sim.camera import Camera
-from data.sim.parts import world_boxes
-from data.sim.physics import start_bullet
+from dynapix.conf.schema import WorldConfig
+from dynapix.data.records import MATERIALS, Scene, SceneObject
+from dynapix.data.render.appearance import RGB, Mesh, box_mesh, mesh, texture
+from dynapix.data.render.floor import Floor
+from dynapix.data.sim.camera import Camera
+from dynapix.data.sim.parts import world_boxes
+from dynapix.data.sim.physics import start_bullet
 
 OVERSAMPLING = 2
 NEAR, FAR = 0.1, 50.0

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from conf.schema import WorldConfig
-from data.sim.camera import Camera, pixel_rays
-from data.sim.parts import world_boxes
-from data.sim.shapes import RADIUS
+from dynapix.conf.schema import WorldConfig
+from dynapix.data.sim.camera import Camera, pixel_rays
+from dynapix.data.sim.parts import world_boxes
+from dynapix.data.sim.shapes import RADIUS
 
 SHADOW_DEPTH = 0.55
 """Fraction of the light that a shadow removes at its centre."""

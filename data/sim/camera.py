@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from conf.schema import CameraConfig
+from dynapix.conf.schema import CameraConfig
 
 WIDTH, HEIGHT = 480, 320
 """Size in px of the image plane to which the image positions of a simulated scene refer."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from conf.schema import PartConfig, WorldConfig
-from data.sim.shapes import CORNERS, intersect_box, rotation_matrix
+from dynapix.conf.schema import PartConfig, WorldConfig
+from dynapix.data.sim.shapes import CORNERS, intersect_box, rotation_matrix
 
 HIGH = 100.0
 """A height above all parts, simulator units."""

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from conf.schema import WorldConfig
-from data.records import Landing, SceneObject
-from data.sim.parts import world_boxes
-from data.sim.shapes import CUBE_HALF, RADIUS, half_height
+from dynapix.conf.schema import WorldConfig
+from dynapix.data.records import Landing, SceneObject
+from dynapix.data.sim.parts import world_boxes
+from dynapix.data.sim.shapes import CUBE_HALF, RADIUS, half_height
 
 if TYPE_CHECKING:
     from pybullet_utils.bullet_client import BulletClient

@@ -11,14 +11,14 @@ from itertools import product
 
 import numpy as np
 
-from conf.errors import UserError
-from conf.schema import WorldConfig
-from data.records import COLORS, MATERIALS, SceneObject
-from data.sim import starts
-from data.sim.camera import Camera
-from data.sim.parts import world_boxes
-from data.sim.physics import Body
-from data.sim.starts import RejectedError, Sample
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import WorldConfig
+from dynapix.data.records import COLORS, MATERIALS, SceneObject
+from dynapix.data.sim import starts
+from dynapix.data.sim.camera import Camera
+from dynapix.data.sim.parts import world_boxes
+from dynapix.data.sim.physics import Body
+from dynapix.data.sim.starts import RejectedError, Sample
 
 STARTS = {"slide": starts.slide, "throw": starts.throw, "strike": starts.strike}
 """Functions that sample the initial states of objects, by `start.kind` of the world."""

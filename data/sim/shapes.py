@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from conf.schema.world import RADIUS
+from dynapix.conf.schema.world import RADIUS
 
 CUBE_HALF = 0.18
 """Half of a cube's edge, simulator units."""

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from conf.schema import WorldConfig
-from data.sim.camera import Camera
-from data.sim.parts import surface_height, world_boxes
-from data.sim.physics import Body, Motion, Touching, has_repeated, shared_simulator
-from data.sim.shapes import BOUNDING_RADIUS, RADIUS, half_height
+from dynapix.conf.schema import WorldConfig
+from dynapix.data.sim.camera import Camera
+from dynapix.data.sim.parts import surface_height, world_boxes
+from dynapix.data.sim.physics import Body, Motion, Touching, has_repeated, shared_simulator
+from dynapix.data.sim.shapes import BOUNDING_RADIUS, RADIUS, half_height
 
 COLLISIONS = {2: 0.63, 3: 0.33, 4: 0.04}
 """Probabilities of the intended number of collisions, from a sample of CLEVRER's release."""

@@ -26,11 +26,11 @@ import numpy as np
 from PIL import Image
 from pydantic import Field, conlist, constr
 
-from data.oracle.visibility import compute_visibility
-from data.records import COLORS, FPS, FRAMES, MATERIALS, SHAPES, Scene, SceneObject
-from data.sim.camera import Camera
-from data.sim.shapes import CUBE_HALF
-from data.sources.validation import (
+from dynapix.data.oracle.visibility import compute_visibility
+from dynapix.data.records import COLORS, FPS, FRAMES, MATERIALS, SHAPES, Scene, SceneObject
+from dynapix.data.sim.camera import Camera
+from dynapix.data.sim.shapes import CUBE_HALF
+from dynapix.data.sources.validation import (
     Layout,
     RecordError,
     Vector,
@@ -41,7 +41,7 @@ from data.sources.validation import (
     reconcile_velocities,
     scene_id,
 )
-from data.sources.videos import describe_video, load_frames
+from dynapix.data.sources.videos import describe_video, load_frames
 
 FOLDER_CONTENTS = (
     "annotation_train/.../annotation_00000.json beside video_train/.../video_00000.mp4"

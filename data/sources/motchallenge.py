@@ -20,7 +20,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from data.sources.validation import Layout, RecordError, check_layout
+from dynapix.data.sources.validation import Layout, RecordError, check_layout
 
 Whole = Annotated[float, Field(multiple_of=1)]
 

@@ -27,9 +27,9 @@ import numpy as np
 from PIL import Image
 from pydantic import BeforeValidator, Field, PlainValidator, conlist
 
-from data.records import Scene, SceneObject
-from data.sources.tfrecord import feature_values, read_example, record_ranges
-from data.sources.validation import (
+from dynapix.data.records import Scene, SceneObject
+from dynapix.data.sources.tfrecord import feature_values, read_example, record_ranges
+from dynapix.data.sources.validation import (
     FLOOR_TOLERANCE,
     MIN_VERTICAL,
     Layout,

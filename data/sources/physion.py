@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from data.records import Collision, Landing, Scene, SceneObject
-from data.sources.validation import (
+from dynapix.data.records import Collision, Landing, Scene, SceneObject
+from dynapix.data.sources.validation import (
     FLOOR_TOLERANCE,
     MIN_VERTICAL,
     RecordError,

@@ -25,14 +25,14 @@ from itertools import groupby
 from pathlib import Path
 from types import ModuleType
 
-from conf.errors import SettingsError, UserError
-from conf.files import write_bytes
-from conf.schema import BenchmarkConfig
-from data.parallel import Workers
-from data.records import SPLITS
-from data.sources import clevrer, movi_a, physion, tracks
-from data.sources.validation import RecordError, RescaledVelocities
-from data.store import part_path, save_scene, scene_path
+from dynapix.conf.errors import SettingsError, UserError
+from dynapix.conf.files import write_bytes
+from dynapix.conf.schema import BenchmarkConfig
+from dynapix.data.parallel import Workers
+from dynapix.data.records import SPLITS
+from dynapix.data.sources import clevrer, movi_a, physion, tracks
+from dynapix.data.sources.validation import RecordError, RescaledVelocities
+from dynapix.data.store import part_path, save_scene, scene_path
 
 log = logging.getLogger(__name__)
 

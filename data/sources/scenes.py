@@ -14,21 +14,21 @@ from typing import TypeVar
 
 import numpy as np
 
-from conf.errors import UserError
-from conf.schema import BenchmarkConfig, WorldConfig
-from data.oracle.contacts import group_contacts
-from data.oracle.interventions import counterfactual_id, removed_object
-from data.oracle.visibility import compute_visibility
-from data.parallel import Workers
-from data.records import SPEED_BOUNDS, SPLITS, Scene, SceneObject
-from data.seeded_order import named_rng
-from data.sim.camera import HEIGHT, WIDTH, Camera
-from data.sim.parts import world_boxes
-from data.sim.physics import Body, shared_simulator
-from data.sim.sampling import sample_scene
-from data.sim.starts import Sample
-from data.sources.releases import list_release, read_release
-from data.store import save_scene, scene_path
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import BenchmarkConfig, WorldConfig
+from dynapix.data.oracle.contacts import group_contacts
+from dynapix.data.oracle.interventions import counterfactual_id, removed_object
+from dynapix.data.oracle.visibility import compute_visibility
+from dynapix.data.parallel import Workers
+from dynapix.data.records import SPEED_BOUNDS, SPLITS, Scene, SceneObject
+from dynapix.data.seeded_order import named_rng
+from dynapix.data.sim.camera import HEIGHT, WIDTH, Camera
+from dynapix.data.sim.parts import world_boxes
+from dynapix.data.sim.physics import Body, shared_simulator
+from dynapix.data.sim.sampling import sample_scene
+from dynapix.data.sim.starts import Sample
+from dynapix.data.sources.releases import list_release, read_release
+from dynapix.data.store import save_scene, scene_path
 
 SPLIT_BLOCK = 5
 """Number of consecutive scenes in a block; each block is divided between the splits."""

@@ -17,7 +17,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from data.sources.validation import RecordError
+from dynapix.data.sources.validation import RecordError
 
 HEADER, FOOTER = 12, 4
 """Number of bytes before and after the data of a record."""
@@ -61,7 +61,7 @@ def example_class() -> type:
 
     # A pool of our own cannot conflict with the tf.train.Example that TensorFlow registers.
     pool = descriptor_pool.DescriptorPool()
-    schema = (files("data.sources") / "example.textproto").read_text()
+    schema = (files("dynapix.data.sources") / "example.textproto").read_text()
     pool.Add(text_format.Parse(schema, descriptor_pb2.FileDescriptorProto()))
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("dynapix.Example"))
 

@@ -34,10 +34,16 @@ import numpy as np
 from PIL import Image
 from pydantic import Field
 
-from data.records import FRAMES, Scene, SceneObject
-from data.sources.motchallenge import Track, read_tracks
-from data.sources.validation import Layout, RecordError, check_unique_scenes, read_layout, scene_id
-from data.sources.videos import Video, describe_video, load_frames
+from dynapix.data.records import FRAMES, Scene, SceneObject
+from dynapix.data.sources.motchallenge import Track, read_tracks
+from dynapix.data.sources.validation import (
+    Layout,
+    RecordError,
+    check_unique_scenes,
+    read_layout,
+    scene_id,
+)
+from dynapix.data.sources.videos import Video, describe_video, load_frames
 
 FOLDER_CONTENTS = "a video street.mp4 beside its tracks street.txt, and tracks.yaml"
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".ogv")

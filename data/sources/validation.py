@@ -18,9 +18,9 @@ from PIL import Image
 from pydantic import BaseModel, ValidationError, conlist
 from pydantic_core import from_json
 
-from conf.errors import UserError
-from data.oracle.contacts import group_contacts
-from data.records import ALTERNATIVE, COUNTERFACTUAL, Collision, Landing, Scene
+from dynapix.conf.errors import UserError
+from dynapix.data.oracle.contacts import group_contacts
+from dynapix.data.records import ALTERNATIVE, COUNTERFACTUAL, Collision, Landing, Scene
 
 FLOOR_TOLERANCE = 0.05
 """Maximum distance from the floor's plane of a contact with the floor, simulator units."""

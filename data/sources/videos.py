@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from PIL import Image
 
-from data.sources.validation import RecordError
+from dynapix.data.sources.validation import RecordError
 
 if TYPE_CHECKING:
     from av.container import InputContainer

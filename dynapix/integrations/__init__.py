@@ -4,7 +4,7 @@ Reading and showing a benchmark needs no more than `import dynapix` does, so tha
 an environment of its own.
 """
 
-from models.student.responses import ANSWER_TOKENS
+from dynapix.models.student.responses import ANSWER_TOKENS
 
 TOKENS = {"reasoning": 512, "answer": ANSWER_TOKENS}
 """Maximum numbers of tokens of a response by mode, the defaults of `evaluation.select`."""

@@ -28,10 +28,10 @@ from inspect_ai.scorer import (
 )
 from inspect_ai.solver import TaskState, generate
 
-from conf.errors import UserError
 from dynapix.benchmark import Item, load
+from dynapix.conf.errors import UserError
 from dynapix.integrations import TOKENS
-from models.student.answer_parser import parse_choice
+from dynapix.models.student.answer_parser import parse_choice
 
 
 @task

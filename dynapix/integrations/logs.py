@@ -12,7 +12,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from conf.errors import UserError
+from dynapix.conf.errors import UserError
 
 ZSTANDARD, LOCAL_HEADER = 93, 30
 """Zip files: the number of a compression that Python reads from 3.14 on; bytes before a name."""

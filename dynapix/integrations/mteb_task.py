@@ -32,16 +32,16 @@ from mteb.models.model_meta import ScoringFunction
 from mteb.types import PromptType
 from PIL import Image
 
-from conf.errors import UserError
-from conf.files import expand_path
-from conf.schema import ContrastiveCommand
-from data.frames.frame_cache import encode_png
 from dynapix.benchmark import Benchmark
-from models.fingerprints import model_id, weights_digest
-from models.precision import resolve_precision
-from models.retriever.embedder import load_trained
-from models.retriever.inputs import embed
-from models.trained_runs import product_folder, read_trained_settings, run_title
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import expand_path
+from dynapix.conf.schema import ContrastiveCommand
+from dynapix.data.frames.frame_cache import encode_png
+from dynapix.models.fingerprints import model_id, weights_digest
+from dynapix.models.precision import resolve_precision
+from dynapix.models.retriever.embedder import load_trained
+from dynapix.models.retriever.inputs import embed
+from dynapix.models.trained_runs import product_folder, read_trained_settings, run_title
 
 
 class RetrievalTask(AbsTaskRetrieval):

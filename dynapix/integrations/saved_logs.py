@@ -7,12 +7,12 @@ from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
-from conf.errors import UserError
-from conf.files import expand_path
-from conf.schema.benchmark import POOLS
-from data.records import SPLITS
-from data.store import MANIFEST, hash_file
 from dynapix.benchmark import Benchmark, load
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import expand_path
+from dynapix.conf.schema.benchmark import POOLS
+from dynapix.data.records import SPLITS
+from dynapix.data.store import MANIFEST, hash_file
 from dynapix.integrations.logs import read_inspect, read_lmms_eval, read_mteb
 from dynapix.retrieval import RetrievalScores
 from dynapix.selection import Result

@@ -15,10 +15,10 @@ import io
 from pathlib import Path
 from typing import Any
 
-from conf.errors import UserError
-from conf.files import write_bytes
-from data.publish.folders import Shard, describe_file, write_folder
 from dynapix.benchmark import Benchmark
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_bytes
+from dynapix.data.publish.folders import Shard, describe_file, write_folder
 from dynapix.integrations import TOKENS
 
 TABLE, IMAGES, PLACEHOLDER = "selection.tsv", "images", "<image>"

@@ -22,12 +22,12 @@ from typing import Any, TypeVar
 import numpy as np
 from tqdm import tqdm
 
-from conf.errors import UserError
-from conf.files import is_writable
-from conf.runs import rank
-from data.parallel import batched
-from models.distributed import map_over_ranks, share_from_main
-from models.fingerprints import settings_key
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import is_writable
+from dynapix.conf.runs import rank
+from dynapix.data.parallel import batched
+from dynapix.models.distributed import map_over_ranks, share_from_main
+from dynapix.models.fingerprints import settings_key
 
 log = logging.getLogger(__name__)
 

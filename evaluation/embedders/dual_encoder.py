@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from transformers import AutoConfig, AutoModel, AutoProcessor, PreTrainedModel
 
-from conf.errors import UserError
-from conf.schema import RetrieverConfig
-from data.frames.frame_cache import FrameReader
-from data.records import FrameRef, sample_prefix_frames
-from evaluation.embedders.embedder import Query
-from models.loading import DTYPES, explain_unloadable, for_inference, place_weights
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import FrameRef, sample_prefix_frames
+from dynapix.evaluation.embedders.embedder import Query
+from dynapix.models.loading import DTYPES, explain_unloadable, for_inference, place_weights
 
 EmbedClips = Callable[[list[np.ndarray]], np.ndarray]
 

@@ -15,21 +15,21 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from conf.runs import Run, rank
-from conf.schema import ContrastiveCommand, EmbedderConfig, RetrieverConfig
-from conf.schema.evaluation import EmbeddingCommand
-from data.build import ensure_benchmark
-from data.frames.frame_cache import FrameReader
-from data.records import FrameRef, RetrievalQuery, SelectionItem
-from data.store import Store
-from evaluation.embedders.cache import EmbeddingCache
-from evaluation.metrics.results import UNTRAINED
-from models.checks import check_widths
-from models.distributed import main_first
-from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
-from models.precision import resolve_precision
-from models.resolved_settings import check_base
-from models.trained_runs import product_folder, resolve_model, run_title
+from dynapix.conf.runs import Run, rank
+from dynapix.conf.schema import ContrastiveCommand, EmbedderConfig, RetrieverConfig
+from dynapix.conf.schema.evaluation import EmbeddingCommand
+from dynapix.data.build import ensure_benchmark
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import FrameRef, RetrievalQuery, SelectionItem
+from dynapix.data.store import Store
+from dynapix.evaluation.embedders.cache import EmbeddingCache
+from dynapix.evaluation.metrics.results import UNTRAINED
+from dynapix.models.checks import check_widths
+from dynapix.models.distributed import main_first
+from dynapix.models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
+from dynapix.models.precision import resolve_precision
+from dynapix.models.resolved_settings import check_base
+from dynapix.models.trained_runs import product_folder, resolve_model, run_title
 
 EMBEDDINGS = "embeddings"
 """Folder of the embeddings in a store."""
@@ -82,7 +82,7 @@ class Embedder:
 
     @cached_property
     def encoder(self) -> Encoder:
-        from evaluation.embedders.joint_encoder import load_encoder
+        from dynapix.evaluation.embedders.joint_encoder import load_encoder
 
         return load_encoder(self.preset, self.precision, self.saved)
 
@@ -132,7 +132,7 @@ class Embedder:
         def embed(batch: list[Input]) -> np.ndarray:
             encoder = self.encoder
 
-            from models.memory import explain_out_of_memory
+            from dynapix.models.memory import explain_out_of_memory
 
             with explain_out_of_memory(
                 f"with {len(batch)} inputs in a batch",
@@ -220,7 +220,7 @@ def open_embedders(
         # The base is built from a seed. A training run contains it.
         base = (folder or run) / "untrained"
         if folder is None or not base.is_dir():
-            from models.retriever.embedder import load_retriever, tokenizer_texts
+            from dynapix.models.retriever.embedder import load_retriever, tokenizer_texts
 
             base = run / "untrained"
             texts = tokenizer_texts(store.retrieval("train"), preset)

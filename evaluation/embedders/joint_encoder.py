@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from conf.schema import RetrieverConfig
-from data.frames.frame_cache import FrameReader
-from data.parallel import batched
-from data.records import FrameRef
-from evaluation.embedders.cache import pad_rows
-from evaluation.embedders.embedder import Encoder, Query
-from models.compat import keep_freed_memory
-from models.retriever.embedder import load_retriever, load_trained
-from models.retriever.inputs import encode, model_inputs
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.parallel import batched
+from dynapix.data.records import FrameRef
+from dynapix.evaluation.embedders.cache import pad_rows
+from dynapix.evaluation.embedders.embedder import Encoder, Query
+from dynapix.models.compat import keep_freed_memory
+from dynapix.models.retriever.embedder import load_retriever, load_trained
+from dynapix.models.retriever.inputs import encode, model_inputs
 
 if TYPE_CHECKING:
-    from models.retriever.inputs import Retriever
+    from dynapix.models.retriever.inputs import Retriever
 
 MAX_TOKEN_PAIRS = 64 * 512**2
 """Maximum entries of the attention mask of a batch of texts: 64 texts of 512 tokens, the default
@@ -60,15 +60,15 @@ def load_encoder(preset: RetrieverConfig, precision: str, saved: Path | None) ->
     if saved is not None:
         return JointEncoder(load_trained(preset, precision, saved), preset)
     if preset.encoder == "vlm2vec":
-        from evaluation.embedders.vlm2vec import load_vlm2vec
+        from dynapix.evaluation.embedders.vlm2vec import load_vlm2vec
 
         return JointEncoder(load_vlm2vec(preset, precision), preset)
     if preset.encoder == "dual":
-        from evaluation.embedders.dual_encoder import load_dual
+        from dynapix.evaluation.embedders.dual_encoder import load_dual
 
         return load_dual(preset, precision)
     if preset.encoder == "languagebind":
-        from evaluation.embedders.languagebind import load_languagebind
+        from dynapix.evaluation.embedders.languagebind import load_languagebind
 
         return load_languagebind(preset, precision)
     # The texts and the folder are for building a base. `open_embedders` has already built it.

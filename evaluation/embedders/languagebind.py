@@ -15,9 +15,9 @@ from torch import nn
 from transformers import CLIPConfig, CLIPImageProcessor, CLIPModel, CLIPTokenizer
 from transformers.models.clip.modeling_clip import CLIPAttention, CLIPEncoderLayer
 
-from conf.errors import UserError
-from conf.schema import RetrieverConfig
-from evaluation.embedders.dual_encoder import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.evaluation.embedders.dual_encoder import (
     DualEncoder,
     check_size,
     check_tokenizer,
@@ -25,7 +25,7 @@ from evaluation.embedders.dual_encoder import (
     load_complete,
     unit_rows,
 )
-from models.loading import explain_unloadable
+from dynapix.models.loading import explain_unloadable
 
 
 class TemporalLayer(CLIPEncoderLayer):

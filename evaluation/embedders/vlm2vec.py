@@ -8,12 +8,12 @@ import torch
 from sentence_transformers import SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 
-from conf.errors import UserError
-from conf.schema import RetrieverConfig
-from models.checks import check_processor
-from models.distributed import rank_device
-from models.loading import DTYPES, explain_unloadable, pin_sizes, place_weights
-from models.retriever.embedder import PROCESSING
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.models.checks import check_processor
+from dynapix.models.distributed import rank_device
+from dynapix.models.loading import DTYPES, explain_unloadable, pin_sizes, place_weights
+from dynapix.models.retriever.embedder import PROCESSING
 
 TEMPLATE = (
     "{%- set parts = namespace(media='', texts=[]) -%}"

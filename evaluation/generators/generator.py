@@ -5,16 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Protocol
 
-from conf.errors import UserError
-from conf.runs import world_size
-from conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageCommand
-from data.frames.frame_cache import FrameReader
-from data.records import SelectionItem
-from evaluation.generators.response_log import RECORD_MODES, SampleOf, SaveResponses, Subject
-from evaluation.generators.response_schema import build_record_schema, write_record_instruction
-from models.precision import resolve_precision
-from models.student.prompts import Sample, choose_instruction, selection_sample
-from models.student.responses import response_token_limit
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import world_size
+from dynapix.conf.schema import SelectCommand, SftCommand, StudentConfig, TwoStageCommand
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import SelectionItem
+from dynapix.evaluation.generators.response_log import (
+    RECORD_MODES,
+    SampleOf,
+    SaveResponses,
+    Subject,
+)
+from dynapix.evaluation.generators.response_schema import (
+    build_record_schema,
+    write_record_instruction,
+)
+from dynapix.models.precision import resolve_precision
+from dynapix.models.student.prompts import Sample, choose_instruction, selection_sample
+from dynapix.models.student.responses import response_token_limit
 
 PROMPT_VERSION = 2
 """Version of the prompt layout. Increment it when the layout changes, so that earlier responses are
@@ -68,10 +76,10 @@ def open_generator(
                 "with python, not with torchrun or another launcher",
                 code="unsupported-ranks",
             )
-        from evaluation.generators.openai_server import ServedModel
+        from dynapix.evaluation.generators.openai_server import ServedModel
 
         return ServedModel(cfg, folder, trained.student)
-    from evaluation.generators.local import LocalModel
+    from dynapix.evaluation.generators.local import LocalModel
 
     return LocalModel(cfg, folder, trained.student, resolve_precision(trained.train.precision))
 

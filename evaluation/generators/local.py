@@ -13,20 +13,25 @@ from torch import nn
 from transformers import ProcessorMixin
 from xgrammar.contrib.hf import LogitsProcessor
 
-from conf.schema import SelectCommand, StudentConfig, TwoStageCommand
-from data.parallel import batched
-from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
-from evaluation.generators.response_schema import build_record_schema
-from models import loading
-from models.compat import keep_freed_memory
-from models.distributed import map_over_ranks
-from models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
-from models.memory import explain_out_of_memory
-from models.resolved_settings import check_base
-from models.student.collator import Collator
-from models.student.generation import end_tokens, generate, sampling_processors
-from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
-from models.trained_runs import product_folder, run_title
+from dynapix.conf.schema import SelectCommand, StudentConfig, TwoStageCommand
+from dynapix.data.parallel import batched
+from dynapix.evaluation.generators.response_log import (
+    SampleOf,
+    SaveResponses,
+    Subject,
+    response_seed,
+)
+from dynapix.evaluation.generators.response_schema import build_record_schema
+from dynapix.models import loading
+from dynapix.models.compat import keep_freed_memory
+from dynapix.models.distributed import map_over_ranks
+from dynapix.models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
+from dynapix.models.memory import explain_out_of_memory
+from dynapix.models.resolved_settings import check_base
+from dynapix.models.student.collator import Collator
+from dynapix.models.student.generation import end_tokens, generate, sampling_processors
+from dynapix.models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
+from dynapix.models.trained_runs import product_folder, run_title
 
 
 class LocalModel:

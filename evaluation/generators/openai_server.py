@@ -14,25 +14,30 @@ from typing import Any
 import numpy as np
 import openai
 
-from conf.errors import UserError
-from conf.proxies import proxy_hint
-from conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageCommand
-from evaluation.generators.response_log import SampleOf, SaveResponses, Subject, response_seed
-from evaluation.generators.response_schema import build_record_schema
-from models.fingerprints import find_commit, processor_digest, weights_digest
-from models.student.chat_requests import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.proxies import proxy_hint
+from dynapix.conf.schema import SelectCommand, ServerConfig, StudentConfig, TwoStageCommand
+from dynapix.evaluation.generators.response_log import (
+    SampleOf,
+    SaveResponses,
+    Subject,
+    response_seed,
+)
+from dynapix.evaluation.generators.response_schema import build_record_schema
+from dynapix.models.fingerprints import find_commit, processor_digest, weights_digest
+from dynapix.models.student.chat_requests import (
     build_messages,
     find_difference,
     qwen_fields,
     sampling_fields,
 )
-from models.student.prompts import Sample, show_frames_as_images
-from models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
-from models.trained_runs import product_folder, run_title
-from teacher.servers.capabilities import Messages, RequestFields
-from teacher.servers.pool import NoResponseError, ServerPool, run_limited
-from teacher.servers.responses import TRUNCATED, Response
-from teacher.servers.server import (
+from dynapix.models.student.prompts import Sample, show_frames_as_images
+from dynapix.models.student.responses import THOUGHT_TAG, GeneratedText, response_token_limit
+from dynapix.models.trained_runs import product_folder, run_title
+from dynapix.teacher.servers.capabilities import Messages, RequestFields
+from dynapix.teacher.servers.pool import NoResponseError, ServerPool, run_limited
+from dynapix.teacher.servers.responses import TRUNCATED, Response
+from dynapix.teacher.servers.server import (
     API_KEY_VARIABLE,
     MALFORMED_REPLY_ERRORS,
     authentication_error,
@@ -183,7 +188,7 @@ class ServedModel:
         def with_images(sample: Sample) -> tuple[Messages, RequestFields]:
             return build_messages(show_frames_as_images(sample)), {}
 
-        from models.student.chat_format import takes_clips
+        from dynapix.models.student.chat_format import takes_clips
 
         if processor is not None and not takes_clips(processor):
             return with_images
@@ -204,8 +209,8 @@ class ServedModel:
         try:
             from transformers import AutoProcessor
 
-            from models.compat import write_clips_as_released
-            from models.loading import pin_sizes
+            from dynapix.models.compat import write_clips_as_released
+            from dynapix.models.loading import pin_sizes
 
             origin = {"trust_remote_code": student.trust_remote_code}
             if not Path(source).is_dir():
@@ -223,7 +228,7 @@ class ServedModel:
 
     def _compare(self, sample_of: SampleOf, subject: Subject, served: Sequence[int]) -> None:
         """Warn if the server reads a prompt as other tokens than a local model."""
-        from models.student.collator import encode
+        from dynapix.models.student.collator import encode
 
         own = encode(sample_of(subject), self._processor, None, self._student.thinking).input_ids
         if difference := find_difference(own, served, self._processor.tokenizer):

@@ -12,15 +12,15 @@ from typing import Any
 
 from tqdm import tqdm
 
-from conf.files import read_json_lines
-from conf.runs import rank
-from data.records import FrameRef, RetrievalQuery, SelectionItem
-from evaluation.generators.response_schema import Record, read_record
-from models.distributed import share_from_main
-from models.fingerprints import settings_key
-from models.student.answer_parser import parse_choice
-from models.student.prompts import Sample
-from models.student.responses import GeneratedText
+from dynapix.conf.files import read_json_lines
+from dynapix.conf.runs import rank
+from dynapix.data.records import FrameRef, RetrievalQuery, SelectionItem
+from dynapix.evaluation.generators.response_schema import Record, read_record
+from dynapix.models.distributed import share_from_main
+from dynapix.models.fingerprints import settings_key
+from dynapix.models.student.answer_parser import parse_choice
+from dynapix.models.student.prompts import Sample
+from dynapix.models.student.responses import GeneratedText
 
 Subject = SelectionItem | RetrievalQuery | FrameRef
 """The item, query or frame that a prompt is about."""

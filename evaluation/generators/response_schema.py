@@ -12,8 +12,8 @@ from typing import Any
 
 from jsonschema import Draft202012Validator
 
-from data.records import LETTERS
-from models.student.answer_parser import parse_choice
+from dynapix.data.records import LETTERS
+from dynapix.models.student.answer_parser import parse_choice
 
 AMBIGUITY = ("none", "some", "high")
 """Values of `ambiguity`: how hard the candidates are to distinguish."""

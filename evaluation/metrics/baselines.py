@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data.checks.baselines import score_baselines
-from data.records import SelectionItem
-from data.store import Store
-from evaluation.metrics.results import BASELINE, SelectionResult
-from evaluation.metrics.selection import Choices, build_selection_report
+from dynapix.data.checks.baselines import score_baselines
+from dynapix.data.records import SelectionItem
+from dynapix.data.store import Store
+from dynapix.evaluation.metrics.results import BASELINE, SelectionResult
+from dynapix.evaluation.metrics.selection import Choices, build_selection_report
 
 TITLES = {
     "nearest": "nearest to the last observed frame",

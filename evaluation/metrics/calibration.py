@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data.records import LETTERS
+from dynapix.data.records import LETTERS
 
 BINS = 10
 """Number of confidence bins, which have equal width."""

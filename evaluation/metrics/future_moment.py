@@ -14,10 +14,10 @@ from itertools import product
 
 import numpy as np
 
-from data.checks.intervals import Interval, SceneBootstrap
-from data.oracle.displacement import cross_scene_displacement
-from data.records import LETTERS, Candidate, Scene, SelectionItem
-from evaluation.metrics.selection import horizon_of, horizon_order
+from dynapix.data.checks.intervals import Interval, SceneBootstrap
+from dynapix.data.oracle.displacement import cross_scene_displacement
+from dynapix.data.records import LETTERS, Candidate, Scene, SelectionItem
+from dynapix.evaluation.metrics.selection import horizon_of, horizon_order
 
 BAND_EDGES = (24, 48, 96)
 BANDS = ("below 24 px", "24 to 48 px", "48 to 96 px", "96 px or more")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from data.checks.intervals import Interval, SceneBootstrap
-from data.items.controls import pair_items
-from data.records import SelectionItem
+from dynapix.data.checks.intervals import Interval, SceneBootstrap
+from dynapix.data.items.controls import pair_items
+from dynapix.data.records import SelectionItem
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from conf.errors import UserError
-from evaluation.metrics.arrays import to_array
+from dynapix.conf.errors import UserError
+from dynapix.evaluation.metrics.arrays import to_array
 
 
 def target_scores(scores: np.ndarray, columns: np.ndarray) -> np.ndarray:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from conf.schema import TeacherConfig
-from data.checks.intervals import Interval, SceneBootstrap
-from data.records import SelectionItem
-from teacher.predicates.facts import RelationalPredicates
-from teacher.predicates.vocabulary import describe_item
-from teacher.reading.claims import Claim
-from teacher.validation.reasons import (
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.checks.intervals import Interval, SceneBootstrap
+from dynapix.data.records import SelectionItem
+from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.predicates.vocabulary import describe_item
+from dynapix.teacher.reading.claims import Claim
+from dynapix.teacher.validation.reasons import (
     CONTRADICTED,
     PARTS,
     SUPPORTED,
@@ -23,8 +23,8 @@ from teacher.validation.reasons import (
 )
 
 if TYPE_CHECKING:
-    from data.store import Store
-    from evaluation.generators.response_log import Answer
+    from dynapix.data.store import Store
+    from dynapix.evaluation.generators.response_log import Answer
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from data.checks.intervals import Interval, SceneBootstrap
-from data.records import FAMILIES, RetrievalQuery
-from evaluation.metrics.calibration import Calibration, PositionBias
-from evaluation.metrics.pairs import PairScores
-from evaluation.metrics.ranking import query_metrics
-from evaluation.metrics.reasons import ReasonSummary
-from evaluation.metrics.significance import PairedComparison
+from dynapix.data.checks.intervals import Interval, SceneBootstrap
+from dynapix.data.records import FAMILIES, RetrievalQuery
+from dynapix.evaluation.metrics.calibration import Calibration, PositionBias
+from dynapix.evaluation.metrics.pairs import PairScores
+from dynapix.evaluation.metrics.ranking import query_metrics
+from dynapix.evaluation.metrics.reasons import ReasonSummary
+from dynapix.evaluation.metrics.significance import PairedComparison
 
 if TYPE_CHECKING:
-    from evaluation.retrieval.exact_search import Ranks
+    from dynapix.evaluation.retrieval.exact_search import Ranks
 
 RECALLS = (1, 10, 50)
 """Cut-offs of the reported recalls."""

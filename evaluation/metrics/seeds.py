@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data.checks.intervals import Interval
-from data.records import FAMILIES
+from dynapix.data.checks.intervals import Interval
+from dynapix.data.records import FAMILIES
 
 MACRO = "macro"
 """Name of the unweighted mean of the families' accuracies."""

@@ -10,25 +10,29 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
-from data.checks.intervals import Interval, SceneBootstrap
-from data.items.controls import pair_items
-from data.items.recipes import TIME_CELLS
-from data.records import LETTERS, SelectionItem
-from evaluation.metrics.calibration import Calibration, measure_calibration, measure_position_bias
-from evaluation.metrics.pairs import PairScores, score_pairs
-from evaluation.metrics.reasons import ReasonSummary
-from evaluation.metrics.results import (
+from dynapix.conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
+from dynapix.data.checks.intervals import Interval, SceneBootstrap
+from dynapix.data.items.controls import pair_items
+from dynapix.data.items.recipes import TIME_CELLS
+from dynapix.data.records import LETTERS, SelectionItem
+from dynapix.evaluation.metrics.calibration import (
+    Calibration,
+    measure_calibration,
+    measure_position_bias,
+)
+from dynapix.evaluation.metrics.pairs import PairScores, score_pairs
+from dynapix.evaluation.metrics.reasons import ReasonSummary
+from dynapix.evaluation.metrics.results import (
     BASELINE,
     SIMILARITY,
     SelectionReport,
     SelectionResult,
     accuracy_by_family,
 )
-from evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
+from dynapix.evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
 
 if TYPE_CHECKING:
-    from evaluation.generators.response_log import Answer
+    from dynapix.evaluation.generators.response_log import Answer
 
 
 @dataclass(frozen=True)

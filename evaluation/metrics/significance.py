@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from conf.errors import UserError
-from data.checks.intervals import SceneBootstrap
-from data.items.controls import pair_items
-from data.records import FAMILIES, SelectionItem
+from dynapix.conf.errors import UserError
+from dynapix.data.checks.intervals import SceneBootstrap
+from dynapix.data.items.controls import pair_items
+from dynapix.data.records import FAMILIES, SelectionItem
 
 MAX_NAMED_ITEMS = 3
 """Most items of each run that the error about different items names."""

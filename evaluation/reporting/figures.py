@@ -8,11 +8,11 @@ from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
-from data.checks.figures import COLORS, GRID, INK, create_figure, legend_above
-from data.checks.intervals import Interval
-from evaluation.metrics.future_moment import FutureMoment
-from evaluation.metrics.results import RECALLS, UNTRAINED, RetrievalResult
-from evaluation.reporting.reference import COT_STUDENT, cot_student
+from dynapix.data.checks.figures import COLORS, GRID, INK, create_figure, legend_above
+from dynapix.data.checks.intervals import Interval
+from dynapix.evaluation.metrics.future_moment import FutureMoment
+from dynapix.evaluation.metrics.results import RECALLS, UNTRAINED, RetrievalResult
+from dynapix.evaluation.reporting.reference import COT_STUDENT, cot_student
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,32 +12,32 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from conf.errors import UserError
-from conf.schema.benchmark import PAIRED
-from data.checks.intervals import Interval, SceneBootstrap
-from data.checks.observer import SIMULATES, load_observers
-from data.checks.observer_curve import CEILING_ERROR, ObserverCurve, observer_curves
-from data.frames.frame_cache import FrameReader
-from data.oracle.contacts import collisions_in
-from data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_prefix_frames
-from data.seeded_order import interleave
-from data.store import Store, open_store
-from evaluation.metrics.baselines import baseline_results
-from evaluation.metrics.future_moment import FutureMoment, measure_future_moment
-from evaluation.metrics.reasons import item_predicates, read_reasons
-from evaluation.metrics.results import SelectionResult
-from evaluation.metrics.selection import accuracy_by_horizon
-from evaluation.metrics.significance import PairedComparison
-from evaluation.reporting.measurements import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema.benchmark import PAIRED
+from dynapix.data.checks.intervals import Interval, SceneBootstrap
+from dynapix.data.checks.observer import SIMULATES, load_observers
+from dynapix.data.checks.observer_curve import CEILING_ERROR, ObserverCurve, observer_curves
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.oracle.contacts import collisions_in
+from dynapix.data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_prefix_frames
+from dynapix.data.seeded_order import interleave
+from dynapix.data.store import Store, open_store
+from dynapix.evaluation.metrics.baselines import baseline_results
+from dynapix.evaluation.metrics.future_moment import FutureMoment, measure_future_moment
+from dynapix.evaluation.metrics.reasons import item_predicates, read_reasons
+from dynapix.evaluation.metrics.results import SelectionResult
+from dynapix.evaluation.metrics.selection import accuracy_by_horizon
+from dynapix.evaluation.metrics.significance import PairedComparison
+from dynapix.evaluation.reporting.measurements import (
     Measurement,
     SeededResult,
     combine_seeds,
     compare_models,
 )
-from evaluation.reporting.run_responses import ItemResponse, Responses
-from teacher.cited_rationales import list_facts
-from teacher.reading.claims import Claim
-from teacher.sections import SECTIONS
+from dynapix.evaluation.reporting.run_responses import ItemResponse, Responses
+from dynapix.teacher.cited_rationales import list_facts
+from dynapix.teacher.reading.claims import Claim
+from dynapix.teacher.sections import SECTIONS
 
 SHOWN_ERRORS = (1.0, 4.0, 16.0)
 """Errors (px) of the observers whose accuracy by horizon is plotted."""

@@ -14,14 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from conf.schema.benchmark import store_name
-from data.checks.intervals import Interval
-from data.records import SelectionItem
-from evaluation.metrics.results import SCENE_ALONE, UNTRAINED, RetrievalResult, SelectionResult
-from evaluation.metrics.seeds import MACRO, SeedBootstrap
-from evaluation.metrics.significance import PairedComparison, compare_runs
-from evaluation.reporting.run_responses import Responses
-from evaluation.reporting.runs import FinishedRun
+from dynapix.conf.schema.benchmark import store_name
+from dynapix.data.checks.intervals import Interval
+from dynapix.data.records import SelectionItem
+from dynapix.evaluation.metrics.results import (
+    SCENE_ALONE,
+    UNTRAINED,
+    RetrievalResult,
+    SelectionResult,
+)
+from dynapix.evaluation.metrics.seeds import MACRO, SeedBootstrap
+from dynapix.evaluation.metrics.significance import PairedComparison, compare_runs
+from dynapix.evaluation.reporting.run_responses import Responses
+from dynapix.evaluation.reporting.runs import FinishedRun
 
 TRANSFER_SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
 """Names of the paper's transfer suites, by the setting `benchmark.simulator`."""

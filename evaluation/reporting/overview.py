@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from textwrap import indent
 
-from data.checks.intervals import Interval
-from evaluation.metrics.baselines import TITLES
-from evaluation.metrics.results import TWIN_ABOVE, RetrievalResult
-from evaluation.reporting.item_browser import ItemBrowser
-from evaluation.reporting.measurements import Measurement, widest_results
+from dynapix.data.checks.intervals import Interval
+from dynapix.evaluation.metrics.baselines import TITLES
+from dynapix.evaluation.metrics.results import TWIN_ABOVE, RetrievalResult
+from dynapix.evaluation.reporting.item_browser import ItemBrowser
+from dynapix.evaluation.reporting.measurements import Measurement, widest_results
 
 EXAMPLES = 5
 """Number of responses that are shown."""

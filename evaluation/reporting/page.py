@@ -9,9 +9,9 @@ from importlib.resources import files
 import jinja2
 from markupsafe import Markup
 
-from evaluation.reporting.item_browser import ItemBrowser
-from evaluation.reporting.sections import Section
-from evaluation.reporting.table import Best
+from dynapix.evaluation.reporting.item_browser import ItemBrowser
+from dynapix.evaluation.reporting.sections import Section
+from dynapix.evaluation.reporting.table import Best
 
 
 def render_page(
@@ -27,11 +27,11 @@ def render_page(
         left_out: A sentence for each run that it does not cover, with the reason.
     """
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("evaluation.reporting"), autoescape=True,
+        loader=jinja2.PackageLoader("dynapix.evaluation.reporting"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.tests["best"] = lambda cell: isinstance(cell, Best)
-    templates = files("evaluation.reporting") / "templates"
+    templates = files("dynapix.evaluation.reporting") / "templates"
     figures = [figure for section in sections for figure in section.figures]
     return environment.get_template("page.html").render(
         sections=sections,

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from data.records import FAMILIES
-from evaluation.reporting.table import DETAIL, FORMATS, Row, Table
+from dynapix.data.records import FAMILIES
+from dynapix.evaluation.reporting.table import DETAIL, FORMATS, Row, Table
 
 SUITE = "dynapix"
 """The suite (set of items) that the paper's selection tables measure."""
@@ -24,7 +24,7 @@ def reference(group: str) -> Any:
 
     A row is a dictionary of its `name` and of values by column heading.
     """
-    text = (files("evaluation.reporting") / "reference.yaml").read_text(encoding="utf-8")
+    text = (files("dynapix.evaluation.reporting") / "reference.yaml").read_text(encoding="utf-8")
     return yaml.safe_load(text)[group]
 
 

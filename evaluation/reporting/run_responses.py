@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from conf.errors import UserError
-from conf.files import read_json_lines
-from data.records import LETTERS
-from evaluation.metrics.results import SelectionReport, variant_name
-from models.student.answer_parser import Reason, parse_choice
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import read_json_lines
+from dynapix.data.records import LETTERS
+from dynapix.evaluation.metrics.results import SelectionReport, variant_name
+from dynapix.models.student.answer_parser import Reason, parse_choice
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,15 @@ from typing import Any
 
 import yaml
 
-from conf.errors import UserError
-from evaluation.metrics.results import RetrievalReport, SelectionReport, StudyReport, from_json
-from evaluation.reporting.run_responses import Responses, read_responses, reading
-from models.trained_runs import settings_file
+from dynapix.conf.errors import UserError
+from dynapix.evaluation.metrics.results import (
+    RetrievalReport,
+    SelectionReport,
+    StudyReport,
+    from_json,
+)
+from dynapix.evaluation.reporting.run_responses import Responses, read_responses, reading
+from dynapix.models.trained_runs import settings_file
 
 SELECTION_KINDS, RETRIEVAL_KINDS = ("select", "similarity"), ("retrieve", "two_stage")
 STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "distill", "reinforce", "contrastive")

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
-from data.checks.observer_curve import plot_observers
-from evaluation.reporting import figures, summary_tables, tables
-from evaluation.reporting.item_browser import ItemBrowser
-from evaluation.reporting.measurements import (
+from dynapix.data.checks.observer_curve import plot_observers
+from dynapix.evaluation.reporting import figures, summary_tables, tables
+from dynapix.evaluation.reporting.item_browser import ItemBrowser
+from dynapix.evaluation.reporting.measurements import (
     ABLATED_REGIMES,
     REGIMES,
     Measurement,
@@ -19,10 +19,15 @@ from evaluation.reporting.measurements import (
     transfer_benchmarks,
     widest_results,
 )
-from evaluation.reporting.runs import SELECTION_KINDS, STUDY_KINDS, TRAINING_KINDS, FinishedRun
-from evaluation.reporting.table import Row, Table, file_stem
-from train.common.curves import plot_curves
-from train.common.journal import read_journal
+from dynapix.evaluation.reporting.runs import (
+    SELECTION_KINDS,
+    STUDY_KINDS,
+    TRAINING_KINDS,
+    FinishedRun,
+)
+from dynapix.evaluation.reporting.table import Row, Table, file_stem
+from dynapix.train.common.curves import plot_curves
+from dynapix.train.common.journal import read_journal
 
 Results = Sequence[Measurement]
 

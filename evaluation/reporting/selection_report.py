@@ -8,11 +8,11 @@ import logging
 from dataclasses import asdict
 from pathlib import Path
 
-from conf.files import write_text
-from evaluation.metrics.results import SelectionReport
-from evaluation.reporting import tables
-from evaluation.reporting.figures import plot_accuracies
-from evaluation.reporting.reference import SUITE
+from dynapix.conf.files import write_text
+from dynapix.evaluation.metrics.results import SelectionReport
+from dynapix.evaluation.reporting import tables
+from dynapix.evaluation.reporting.figures import plot_accuracies
+from dynapix.evaluation.reporting.reference import SUITE
 
 log = logging.getLogger(__name__)
 

@@ -8,20 +8,20 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from data.checks.intervals import Interval
-from data.checks.observer import SIMULATES
-from data.checks.observer_curve import ObserverCurve
-from evaluation.metrics.results import SIMILARITY, RetrievalResult, SelectionResult
-from evaluation.metrics.seeds import MACRO
-from evaluation.reporting.measurements import (
+from dynapix.data.checks.intervals import Interval
+from dynapix.data.checks.observer import SIMULATES
+from dynapix.data.checks.observer_curve import ObserverCurve
+from dynapix.evaluation.metrics.results import SIMILARITY, RetrievalResult, SelectionResult
+from dynapix.evaluation.metrics.seeds import MACRO
+from dynapix.evaluation.reporting.measurements import (
     TRANSFER_SUITES,
     Measurement,
     SeededResult,
     shared_names,
 )
-from evaluation.reporting.reference import table_with_paper
-from evaluation.reporting.table import Row, Table, file_stem
-from evaluation.reporting.tables import (
+from dynapix.evaluation.reporting.reference import table_with_paper
+from dynapix.evaluation.reporting.table import Row, Table, file_stem
+from dynapix.evaluation.reporting.tables import (
     FAMILY_COLUMNS,
     INTERVAL_NOTE,
     RECALL_COLUMNS,

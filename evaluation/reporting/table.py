@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from data.checks.intervals import Interval
+from dynapix.data.checks.intervals import Interval
 
 NOTE_WIDTH = 100
 DETAIL = "  "
@@ -142,7 +142,7 @@ class Table:
 
         environment = jinja2.Environment(
             block_start_string="<%", block_end_string="%>", variable_start_string="<<",
-            variable_end_string=">>", loader=jinja2.PackageLoader("evaluation.reporting"),
+            variable_end_string=">>", loader=jinja2.PackageLoader("dynapix.evaluation.reporting"),
             undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True,
         )  # fmt: skip
         environment.filters["cell"] = cell

@@ -6,13 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from data.checks.intervals import Interval
-from data.records import FAMILIES, LETTERS
-from evaluation.metrics.calibration import Calibration, PositionBias
-from evaluation.metrics.future_moment import BANDS, FutureMoment
-from evaluation.metrics.pairs import PairScores
-from evaluation.metrics.reasons import ReasonSummary
-from evaluation.metrics.results import (
+from dynapix.data.checks.intervals import Interval
+from dynapix.data.records import FAMILIES, LETTERS
+from dynapix.evaluation.metrics.calibration import Calibration, PositionBias
+from dynapix.evaluation.metrics.future_moment import BANDS, FutureMoment
+from dynapix.evaluation.metrics.pairs import PairScores
+from dynapix.evaluation.metrics.reasons import ReasonSummary
+from dynapix.evaluation.metrics.results import (
     MEASURES,
     RECALLS,
     SIMILARITY,
@@ -24,9 +24,9 @@ from evaluation.metrics.results import (
     SelectionResult,
     StudyReport,
 )
-from evaluation.metrics.significance import PairedComparison, adjust_holm
-from evaluation.reporting.reference import SUITE, reference, table_with_paper
-from evaluation.reporting.table import DETAIL, Row, Table
+from dynapix.evaluation.metrics.significance import PairedComparison, adjust_holm
+from dynapix.evaluation.reporting.reference import SUITE, reference, table_with_paper
+from dynapix.evaluation.reporting.table import DETAIL, Row, Table
 
 FAMILY_COLUMNS = [family.capitalize() for family in FAMILIES]
 SELECTION_COLUMNS = [*FAMILY_COLUMNS, "Macro", "Micro", "Parsed", "Items"]

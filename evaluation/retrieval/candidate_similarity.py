@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from conf.schema import RetrieverConfig
-from data.records import SelectionItem
-from evaluation.embedders.cache import EmbeddingCache
-from evaluation.retrieval.exact_search import GridEmbeddings, pair_scores
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.data.records import SelectionItem
+from dynapix.evaluation.embedders.cache import EmbeddingCache
+from dynapix.evaluation.retrieval.exact_search import GridEmbeddings, pair_scores
 
 
 def score_candidates(
@@ -27,7 +27,7 @@ def score_candidates(
     for k in range(len(items[0].candidates)):
         frame_rows = frames.rows([item.candidates[k].name for item in items])
         if preset.late is not None:
-            from evaluation.retrieval.late_interaction import pair_scores as late_scores
+            from dynapix.evaluation.retrieval.late_interaction import pair_scores as late_scores
 
             columns.append(late_scores(query_rows, frame_rows, preset.late.width))
         else:

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from conf.files import write_json_lines
-from data.parallel import batched
-from data.records import RetrievalQuery
-from evaluation.metrics.ranking import count_above_and_equal, share_above
+from dynapix.conf.files import write_json_lines
+from dynapix.data.parallel import batched
+from dynapix.data.records import RetrievalQuery
+from dynapix.evaluation.metrics.ranking import count_above_and_equal, share_above
 
 GRID = 2.0**26
 """Entries of unit vectors are rounded to multiples of 1 / GRID."""

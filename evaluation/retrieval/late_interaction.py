@@ -13,9 +13,9 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
-from data.parallel import batched
-from evaluation.metrics.ranking import count_above_and_equal, share_above
-from evaluation.retrieval.exact_search import Ranks
+from dynapix.data.parallel import batched
+from dynapix.evaluation.metrics.ranking import count_above_and_equal, share_above
+from dynapix.evaluation.retrieval.exact_search import Ranks
 
 GRID = 2.0**20
 """Entries of unit vectors are rounded to multiples of 1 / GRID. In these steps, the dot product of

@@ -16,16 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from conf.files import write_text
-from conf.schema import RetrieverConfig
-from data.checks.baselines import count_frames_of_scene
-from data.checks.queries import check_test, read_queries
-from data.records import FrameRef, RetrievalQuery
-from data.store import Store
-from evaluation.metrics.results import SCENE_ALONE, RetrievalResult, retrieval_results
-from evaluation.reporting import figures, tables
-from evaluation.reporting.table import Table
-from evaluation.retrieval.exact_search import Ranks, exact_ranks
+from dynapix.conf.files import write_text
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.data.checks.baselines import count_frames_of_scene
+from dynapix.data.checks.queries import check_test, read_queries
+from dynapix.data.records import FrameRef, RetrievalQuery
+from dynapix.data.store import Store
+from dynapix.evaluation.metrics.results import SCENE_ALONE, RetrievalResult, retrieval_results
+from dynapix.evaluation.reporting import figures, tables
+from dynapix.evaluation.reporting.table import Table
+from dynapix.evaluation.retrieval.exact_search import Ranks, exact_ranks
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ def rank_targets(
 ) -> Ranks:
     """Rank with `late_ranks` if the preset is a multi-vector retriever, else with `exact_ranks`."""
     if preset.late is not None:
-        from evaluation.retrieval.late_interaction import late_ranks
+        from dynapix.evaluation.retrieval.late_interaction import late_ranks
 
         return late_ranks(queries, targets, database, preset.late.width, twins)
     return exact_ranks(queries, targets, database, preset.widths, twins)

@@ -15,26 +15,26 @@ from pathlib import Path
 
 import numpy as np
 
-from conf.errors import UserError
-from conf.files import is_writable
-from conf.runs import lock_folder, rank
-from conf.schema import StudentConfig, TwoStageCommand
-from data.records import FrameRef, RetrievalQuery
-from data.store import Store
-from evaluation.embedders.embedder import Embedder
-from evaluation.generators.generator import Generator, response_settings
-from evaluation.generators.response_log import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import is_writable
+from dynapix.conf.runs import lock_folder, rank
+from dynapix.conf.schema import StudentConfig, TwoStageCommand
+from dynapix.data.records import FrameRef, RetrievalQuery
+from dynapix.data.store import Store
+from dynapix.evaluation.embedders.embedder import Embedder
+from dynapix.evaluation.generators.generator import Generator, response_settings
+from dynapix.evaluation.generators.response_log import (
     ModelResponse,
     ResponseLog,
     Subject,
     collect_responses,
 )
-from evaluation.retrieval.exact_search import Ranks
-from evaluation.retrieval.standard_test import rank_targets
-from models.fingerprints import settings_key
-from models.student.prompts import Sample
-from models.student.response_text import strip_thought
-from teacher.sections import SECTIONS, split_sections
+from dynapix.evaluation.retrieval.exact_search import Ranks
+from dynapix.evaluation.retrieval.standard_test import rank_targets
+from dynapix.models.fingerprints import settings_key
+from dynapix.models.student.prompts import Sample
+from dynapix.models.student.response_text import strip_thought
+from dynapix.teacher.sections import SECTIONS, split_sections
 
 TEXTS = "texts"
 """Folder of the texts in a store."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.schema import StudyCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import StudyCommand
 
 log = logging.getLogger(__name__)
 
@@ -18,13 +18,13 @@ log = logging.getLogger(__name__)
 @command("evaluation.study", StudyCommand)
 def main(cfg: StudyCommand, run: Run) -> None:
     try:
-        from evaluation.study import auth, routes, storage
+        from dynapix.evaluation.study import auth, routes, storage
     except ImportError as error:
         raise UserError(
             f"the study's pages need {error.name}: pip install -e '.[study]'",
             code="missing-package",
         ) from error
-    from evaluation.study import setup
+    from dynapix.evaluation.study import setup
 
     path, links = run.folder / storage.DATABASE, run.folder / auth.LINKS_FILE
     with routes.listen(cfg.host, cfg.port) as listener:

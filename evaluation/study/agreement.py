@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from data.checks.intervals import SceneBootstrap
-from data.records import LETTERS
-from evaluation.metrics.results import (
+from dynapix.data.checks.intervals import SceneBootstrap
+from dynapix.data.records import LETTERS
+from dynapix.evaluation.metrics.results import (
     Accuracy,
     Agreement,
     MajorityVote,

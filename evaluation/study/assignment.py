@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data.records import LETTERS, SelectionItem
-from data.seeded_order import named_rng
+from dynapix.data.records import LETTERS, SelectionItem
+from dynapix.data.seeded_order import named_rng
 
 
 @dataclass(frozen=True)

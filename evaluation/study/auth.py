@@ -10,7 +10,7 @@ from pathlib import Path
 
 from starlette.datastructures import Headers
 
-from evaluation.study.storage import transaction
+from dynapix.evaluation.study.storage import transaction
 
 LINKS_FILE = "links.txt"
 POLICY = (

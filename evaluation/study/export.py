@@ -7,11 +7,11 @@ import logging
 from dataclasses import asdict
 from pathlib import Path
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.files import write_text
-from conf.runs import resolve_run_name
-from conf.schema import ExportStudyCommand
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_text
+from dynapix.conf.runs import resolve_run_name
+from dynapix.conf.schema import ExportStudyCommand
 
 log = logging.getLogger(__name__)
 
@@ -20,9 +20,9 @@ VOTES_FILE = "votes.jsonl"
 
 @command("evaluation.study.export", ExportStudyCommand)
 def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
-    from evaluation.reporting.tables import human_table
-    from evaluation.study import storage
-    from evaluation.study.agreement import summarize_votes
+    from dynapix.evaluation.reporting.tables import human_table
+    from dynapix.evaluation.study import storage
+    from dynapix.evaluation.study.agreement import summarize_votes
 
     studies = Path(cfg.checkpoints) / "study"
     path = studies / resolve_run_name(cfg.run, str(studies)) / storage.DATABASE

@@ -9,9 +9,9 @@ from fractions import Fraction
 import numpy as np
 from PIL import Image
 
-from conf.errors import UserError
-from data.frames.frame_cache import FrameReader
-from data.records import SelectionItem
+from dynapix.conf.errors import UserError
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import SelectionItem
 
 VIDEO, IMAGE = "video/mp4", "image/png"
 PREFIX = -1

@@ -19,10 +19,10 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from conf.errors import UserError
-from conf.schema import StudyCommand
-from data.records import LETTERS
-from evaluation.study import auth, workflow
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import StudyCommand
+from dynapix.data.records import LETTERS
+from dynapix.evaluation.study import auth, workflow
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ class Pages:
         self._session_seconds = math.ceil(cfg.session_days * 24 * 3600)
         self._on_links_changed = on_links_changed
         self._templates = jinja2.Environment(
-            loader=jinja2.PackageLoader("evaluation.study"), autoescape=True,
+            loader=jinja2.PackageLoader("dynapix.evaluation.study"), autoescape=True,
             undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         )  # fmt: skip
 
@@ -69,7 +69,7 @@ class Pages:
             Route("/withdraw", self.confirm_withdrawal),
             Route("/withdraw", self.withdraw, methods=["POST"]),
             Route("/media/{key}/{place}", self.media),
-            Mount("/static", StaticFiles(packages=[("evaluation.study", "static")])),
+            Mount("/static", StaticFiles(packages=[("dynapix.evaluation.study", "static")])),
         ]
 
     async def home(self, request: Request) -> Response:

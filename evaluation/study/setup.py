@@ -10,17 +10,17 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from conf.errors import UserError
-from conf.schema import StudyCommand
-from conf.schema.benchmark import MATCHED_ANCHOR
-from data.build import ensure_benchmark
-from data.frames.frame_cache import FrameReader
-from data.records import FAMILIES, SelectionItem
-from data.seeded_order import interleave, named_rng
-from data.store import Store
-from evaluation.study import auth, storage
-from evaluation.study.assignment import assign_items
-from evaluation.study.media import encode_media
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import StudyCommand
+from dynapix.conf.schema.benchmark import MATCHED_ANCHOR
+from dynapix.data.build import ensure_benchmark
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import FAMILIES, SelectionItem
+from dynapix.data.seeded_order import interleave, named_rng
+from dynapix.data.store import Store
+from dynapix.evaluation.study import auth, storage
+from dynapix.evaluation.study.assignment import assign_items
+from dynapix.evaluation.study.media import encode_media
 
 
 def create_study(cfg: StudyCommand, path: Path) -> sqlite3.Connection:

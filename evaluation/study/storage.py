@@ -12,10 +12,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from conf.errors import UserError
-from data.records import SelectionItem
-from evaluation.study.assignment import Assignment
-from evaluation.study.media import Medium
+from dynapix.conf.errors import UserError
+from dynapix.data.records import SelectionItem
+from dynapix.evaluation.study.assignment import Assignment
+from dynapix.evaluation.study.media import Medium
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,10 +11,10 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from data.records import LETTERS
-from evaluation.study.auth import new_token
-from evaluation.study.media import PREFIX
-from evaluation.study.storage import transaction
+from dynapix.data.records import LETTERS
+from dynapix.evaluation.study.auth import new_token
+from dynapix.evaluation.study.media import PREFIX
+from dynapix.evaluation.study.storage import transaction
 
 ABANDONED_SECONDS = 3600.0
 """An item that was opened counts as a vote in `NEXT_ITEM` for this time, even without an answer."""

@@ -29,7 +29,7 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import (
     eager_attention_forward,
 )
 
-from models.layers.shared_prompts import SharedPromptTower
+from dynapix.models.layers.shared_prompts import SharedPromptTower
 
 
 def use_fast_layers(model: nn.Module) -> None:

@@ -20,21 +20,21 @@ from sentence_transformers.sentence_transformer.modules import Normalize, Poolin
 from sentence_transformers.util import is_sentence_transformer_model
 from transformers import AutoConfig, AutoModel, AutoProcessor
 
-from conf.errors import UserError
-from conf.runs import rank
-from conf.schema import RetrieverConfig
-from data.records import RetrievalQuery
-from models.checks import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import rank
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.data.records import RetrievalQuery
+from dynapix.models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
     PEFT_PREFIX,
     check_late_base,
     check_processor,
 )
-from models.compat import keep_differentiable, write_clips_as_released
-from models.distributed import main_first, rank_device
-from models.layers.attention import choose_attention
-from models.loading import (
+from dynapix.models.compat import keep_differentiable, write_clips_as_released
+from dynapix.models.distributed import main_first, rank_device
+from dynapix.models.layers.attention import choose_attention
+from dynapix.models.loading import (
     explain_damage,
     explain_unloadable,
     lora_config,
@@ -44,13 +44,17 @@ from models.loading import (
     precision_of,
     weight_options,
 )
-from models.retriever.inputs import Retriever, query_form
-from models.retriever.last_token import compute_last_token
-from models.retriever.multi_vector import keep_head_fp32, load_multi_vector, multi_vector_modules
-from models.student.prompts import list_timestamps
-from models.tiny_qwen3_vl import build_model, build_processor
-from models.towers import find_unquantized
-from models.trained_runs import EXPORT
+from dynapix.models.retriever.inputs import Retriever, query_form
+from dynapix.models.retriever.last_token import compute_last_token
+from dynapix.models.retriever.multi_vector import (
+    keep_head_fp32,
+    load_multi_vector,
+    multi_vector_modules,
+)
+from dynapix.models.student.prompts import list_timestamps
+from dynapix.models.tiny_qwen3_vl import build_model, build_processor
+from dynapix.models.towers import find_unquantized
+from dynapix.models.trained_runs import EXPORT
 
 PROCESSING = {
     # By default, sentence-transformers truncates long inputs, even within a video. Here, inputs are

@@ -24,12 +24,12 @@ from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from torch.nn.functional import normalize
 from transformers import Qwen3VLProcessor
 
-from conf.errors import UserError
-from conf.runs import world_size
-from conf.schema import RetrieverConfig
-from data.frames.frame_cache import FrameReader
-from data.records import FrameRef, RetrievalQuery, SelectionItem, sample_prefix_frames
-from models.student.prompts import load_clip, write_time
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import world_size
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import FrameRef, RetrievalQuery, SelectionItem, sample_prefix_frames
+from dynapix.models.student.prompts import load_clip, write_time
 
 Retriever = SentenceTransformer | MultiVectorEncoder
 """A single-vector or a multi-vector retriever."""

@@ -20,8 +20,8 @@ from transformers import Qwen3VLTextModel
 from transformers.modeling_outputs import BaseModelOutputWithPast
 from transformers.models.qwen3_vl.modeling_qwen3_vl import Qwen3VLTextDecoderLayer
 
-from models.layers.fast_layers import FastAttention
-from models.retriever.inputs import Retriever
+from dynapix.models.layers.fast_layers import FastAttention
+from dynapix.models.retriever.inputs import Retriever
 
 
 def compute_last_token(model: Retriever) -> None:

@@ -14,8 +14,8 @@ from sentence_transformers import MultiVectorEncoder
 from sentence_transformers.base.modules import Dense, Module, Normalize, Transformer
 from torch import nn
 
-from conf.schema import LateConfig
-from models.retriever.scored_tokens import ScoredTokens
+from dynapix.conf.schema import LateConfig
+from dynapix.models.retriever.scored_tokens import ScoredTokens
 
 MESSAGE_END = "<|im_end|>"
 

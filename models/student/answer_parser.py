@@ -15,9 +15,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from data.records import LETTERS
-from models.student.answer_records import AnswerRecord, read_records
-from models.student.response_text import clean_response
+from dynapix.data.records import LETTERS
+from dynapix.models.student.answer_records import AnswerRecord, read_records
+from dynapix.models.student.response_text import clean_response
 
 
 class Reason(StrEnum):

@@ -12,8 +12,8 @@ from typing import Any
 
 from transformers import ProcessorMixin, Qwen2_5_VLProcessor, Qwen3VLProcessor
 
-from models.student.prompts import Sample
-from models.student.responses import THOUGHT_TAG
+from dynapix.models.student.prompts import Sample
+from dynapix.models.student.responses import THOUGHT_TAG
 
 TIMED_PROCESSORS = (Qwen3VLProcessor, Qwen2_5_VLProcessor)
 """Processors that tell the times of a clip's frames: Qwen3-VL's as text before each pair of frames,

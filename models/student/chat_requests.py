@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from data.frames.frame_cache import encode_png
-from models.student.prompts import Clip, Sample
+from dynapix.data.frames.frame_cache import encode_png
+from dynapix.models.student.prompts import Clip, Sample
 
 if TYPE_CHECKING:
-    from conf.schema import StudentConfig
-    from teacher.servers.capabilities import Messages, RequestFields
+    from dynapix.conf.schema import StudentConfig
+    from dynapix.teacher.servers.capabilities import Messages, RequestFields
 
 
 def build_messages(sample: Sample) -> Messages:

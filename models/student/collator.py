@@ -18,10 +18,10 @@ from torch.nn.utils.rnn import pad_sequence
 from transformers import ProcessorMixin
 from transformers.video_utils import VideoMetadata
 
-from conf.errors import UserError
-from data.records import LETTERS
-from models.student.chat_format import find_end_token, takes_clips, write_prompt
-from models.student.prompts import Clip, Sample, answer_line, show_frames_as_images
+from dynapix.conf.errors import UserError
+from dynapix.data.records import LETTERS
+from dynapix.models.student.chat_format import find_end_token, takes_clips, write_prompt
+from dynapix.models.student.prompts import Clip, Sample, answer_line, show_frames_as_images
 
 IGNORED = -100
 """Label of a token that is not in the loss: the default `ignore_index` of torch's cross-entropy."""

@@ -22,11 +22,11 @@ from transformers import (
     TopPLogitsWarper,
 )
 
-from conf.schema import StudentConfig
-from models.loading import DTYPES
-from models.student.chat_format import find_end_token
-from models.student.kv_cache import create_cache
-from models.student.responses import THOUGHT_TAG, GeneratedText
+from dynapix.conf.schema import StudentConfig
+from dynapix.models.loading import DTYPES
+from dynapix.models.student.chat_format import find_end_token
+from dynapix.models.student.kv_cache import create_cache
+from dynapix.models.student.responses import THOUGHT_TAG, GeneratedText
 
 TAG_SEARCH_TOKENS = 8
 """Number of tokens at the end of a prompt in which the tag is searched."""

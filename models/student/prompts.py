@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from data.frames.frame_cache import FrameReader
-from data.items.controls import prefix_under_control
-from data.records import (
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.items.controls import prefix_under_control
+from dynapix.data.records import (
     FPS,
     FRAMES,
     LETTERS,
@@ -28,7 +28,7 @@ from data.records import (
     SelectionItem,
     sample_prefix_frames,
 )
-from teacher.sections import remove_section
+from dynapix.teacher.sections import remove_section
 
 MODES = ("reasoning", "answer")
 TEXT_INSTRUCTIONS = {

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from itertools import accumulate
 
-from teacher.numbers.normalization import LEXICON, Spans, fold_character, normalize
+from dynapix.teacher.numbers.normalization import LEXICON, Spans, fold_character, normalize
 
 NAME = re.compile(r"\{([a-z_]+)\}")
 GAP = r"(?:\s{1,9}|-)"

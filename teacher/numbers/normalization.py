@@ -18,7 +18,9 @@ import yaml
 
 Spans = list[tuple[int, int]]
 
-LEXICON: dict[str, Any] = yaml.safe_load((files("teacher.numbers") / "lexicon.yaml").read_bytes())
+LEXICON: dict[str, Any] = yaml.safe_load(
+    (files("dynapix.teacher.numbers") / "lexicon.yaml").read_bytes()
+)
 LOOKALIKES: dict[str, str] = LEXICON["lookalikes"]
 ASCII_LETTERS = str.maketrans("".join(LOOKALIKES), "".join(LOOKALIKES.values()))
 STYLED = re.compile(r"(?:.* )?(?:LATIN|CIRCLED|SQUARED|INDICATOR) .*\b([A-Z])(?: WITH .*)?")

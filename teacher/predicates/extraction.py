@@ -8,11 +8,11 @@ from math import dist, hypot
 
 import numpy as np
 
-from conf.schema import RelationBounds
-from data.oracle.contacts import collisions_in, next_collision
-from data.oracle.displacement import MODEL_SIZE
-from data.records import CONTACT, LETTERS, Candidate, Scene, SelectionItem
-from teacher.predicates.facts import (
+from dynapix.conf.schema import RelationBounds
+from dynapix.data.oracle.contacts import collisions_in, next_collision
+from dynapix.data.oracle.displacement import MODEL_SIZE
+from dynapix.data.records import CONTACT, LETTERS, Candidate, Scene, SelectionItem
+from dynapix.teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
     Difference,
@@ -23,7 +23,7 @@ from teacher.predicates.facts import (
     RelationalPredicates,
     View,
 )
-from teacher.predicates.motion import (
+from dynapix.teacher.predicates.motion import (
     describe_meeting,
     find_collision_courses,
     find_cut,
@@ -31,14 +31,14 @@ from teacher.predicates.motion import (
     object_heading,
     object_speed,
 )
-from teacher.predicates.places import (
+from dynapix.teacher.predicates.places import (
     close_pairs,
     compass_direction,
     object_region,
     object_sight,
     square_displacement,
 )
-from teacher.predicates.relations import (
+from dynapix.teacher.predicates.relations import (
     CLEARLY,
     DISPLACED,
     Places,

@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from conf.schema import RelationBounds
-    from teacher.predicates.relations import Places
+    from dynapix.conf.schema import RelationBounds
+    from dynapix.teacher.predicates.relations import Places
 
 SPEEDS = ("slowly", "steadily", "quickly")
 """Words for speeds below each of the bounds of a scene; above these, it is VERY_FAST."""

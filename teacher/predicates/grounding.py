@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from conf.errors import UserError
-from data.oracle.contacts import group_contacts
-from data.oracle.extrapolation import extrapolate, project
-from data.records import ALTERNATIVE, Collision, Scene, SelectionItem, original_scene_id
-from data.seeded_order import named_rng
-from teacher.predicates.extraction import name_moment
-from teacher.predicates.facts import RelationalPredicates
-from teacher.predicates.motion import STATIONARY
-from teacher.predicates.places import contact_distance
-from teacher.predicates.vocabulary import describe_item
+from dynapix.conf.errors import UserError
+from dynapix.data.oracle.contacts import group_contacts
+from dynapix.data.oracle.extrapolation import extrapolate, project
+from dynapix.data.records import ALTERNATIVE, Collision, Scene, SelectionItem, original_scene_id
+from dynapix.data.seeded_order import named_rng
+from dynapix.teacher.predicates.extraction import name_moment
+from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.predicates.motion import STATIONARY
+from dynapix.teacher.predicates.places import contact_distance
+from dynapix.teacher.predicates.vocabulary import describe_item
 
 if TYPE_CHECKING:
-    from conf.schema import TeacherConfig
-    from data.store import Store
+    from dynapix.conf.schema import TeacherConfig
+    from dynapix.data.store import Store
 
 EXTRAPOLATED = f"{ALTERNATIVE}extrapolated"
 """Suffix of the id of a scene that a guess continues. It marks an alternative future."""

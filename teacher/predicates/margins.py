@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from math import dist, inf
 
-from conf.schema import RelationBounds
-from teacher.predicates.facts import REGIONS, Relation
-from teacher.predicates.relations import (
+from dynapix.conf.schema import RelationBounds
+from dynapix.teacher.predicates.facts import REGIONS, Relation
+from dynapix.teacher.predicates.relations import (
     EXTREMES,
     VALUES,
     Places,

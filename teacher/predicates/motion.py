@@ -7,10 +7,14 @@ from math import hypot
 
 import numpy as np
 
-from data.oracle.contacts import collisions_in, next_collision, touching_pairs
-from data.records import SPEED_BOUNDS, Scene
-from teacher.predicates.facts import SPEEDS, VERY_FAST, Meeting
-from teacher.predicates.places import compass_direction, contact_distance, square_displacement
+from dynapix.data.oracle.contacts import collisions_in, next_collision, touching_pairs
+from dynapix.data.records import SPEED_BOUNDS, Scene
+from dynapix.teacher.predicates.facts import SPEEDS, VERY_FAST, Meeting
+from dynapix.teacher.predicates.places import (
+    compass_direction,
+    contact_distance,
+    square_displacement,
+)
 
 CUT_MARGIN = 12
 """Minimum number of frames from the cut to the next collision (paper, Rationale construction)."""

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from itertools import combinations
 from math import atan2, dist, hypot, pi
 
-from data.oracle.displacement import MODEL_SIZE
-from data.oracle.visibility import MIN_VISIBLE
-from data.records import Scene
-from teacher.predicates.facts import COMPASS, OUT_OF_VIEW, REGIONS, Closeness
+from dynapix.data.oracle.displacement import MODEL_SIZE
+from dynapix.data.oracle.visibility import MIN_VISIBLE
+from dynapix.data.records import Scene
+from dynapix.teacher.predicates.facts import COMPASS, OUT_OF_VIEW, REGIONS, Closeness
 
 VERY_CLOSE = 1.5
 """Ground-plane distance below which two objects are very close, in units of their contact

@@ -27,11 +27,11 @@ from itertools import combinations, permutations
 from math import hypot, inf
 from typing import NamedTuple
 
-from conf.schema import RelationBounds
-from conf.schema.world import RADIUS
-from data.records import Scene
-from teacher.predicates.facts import Relation
-from teacher.predicates.places import object_sight
+from dynapix.conf.schema import RelationBounds
+from dynapix.conf.schema.world import RADIUS
+from dynapix.data.records import Scene
+from dynapix.teacher.predicates.facts import Relation
+from dynapix.teacher.predicates.places import object_sight
 
 OPPOSITES = {
     "left of": "right of", "above": "below", "in front of": "behind",

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from data.oracle.contacts import next_collision
-from data.records import CONTACT, Scene, SelectionItem
-from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.facts import Predicates, RelationalPredicates
+from dynapix.data.oracle.contacts import next_collision
+from dynapix.data.records import CONTACT, Scene, SelectionItem
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.predicates.facts import Predicates, RelationalPredicates
 
 if TYPE_CHECKING:
-    from conf.schema import TeacherConfig
-    from data.store import Store
+    from dynapix.conf.schema import TeacherConfig
+    from dynapix.data.store import Store
 
 VERSIONS = {"paper": "2", "relational": "8"}
 """Version of each vocabulary. It changes whenever the same item gives other predicates or other

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from data.records import LETTERS
-from teacher.predicates.relations import KINDS
-from teacher.reading.claims import EITHER, TARGET, Claim, IndexedPredicates
-from teacher.reading.reader import SEPARATORS, VERBS, Reader, UnreadableError
-from teacher.reading.scenes import SceneReader
-from teacher.reading.tagging import RelationPhrase, Tag
+from dynapix.data.records import LETTERS
+from dynapix.teacher.predicates.relations import KINDS
+from dynapix.teacher.reading.claims import EITHER, TARGET, Claim, IndexedPredicates
+from dynapix.teacher.reading.reader import SEPARATORS, VERBS, Reader, UnreadableError
+from dynapix.teacher.reading.scenes import SceneReader
+from dynapix.teacher.reading.tagging import RelationPhrase, Tag
 
 CHOOSING = {
     "agree",

@@ -8,8 +8,8 @@ from collections.abc import Callable, Collection, Iterable
 from itertools import product
 from typing import NamedTuple
 
-from conf.schema import RelationBounds
-from teacher.predicates.facts import (
+from dynapix.conf.schema import RelationBounds
+from dynapix.teacher.predicates.facts import (
     COMPASS,
     OUT_OF_VIEW,
     Difference,
@@ -19,13 +19,13 @@ from teacher.predicates.facts import (
     RelationalPredicates,
     View,
 )
-from teacher.predicates.relations import (
+from dynapix.teacher.predicates.relations import (
     EXTENTS,
     VALUES,
     describe_distance,
     normalize_relation,
 )
-from teacher.reading.phrases import COARSE
+from dynapix.teacher.reading.phrases import COARSE
 
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
 """The moment of a claim: the cut (the last frame that the predicates treat as observed), the time

@@ -8,7 +8,7 @@ from importlib.resources import files
 
 import yaml
 
-from teacher.predicates.facts import COMPASS
+from dynapix.teacher.predicates.facts import COMPASS
 
 COARSE = "~"
 """Prefix of a value that the text states only roughly. "Leftward" has the value "~west": true for
@@ -21,7 +21,7 @@ Phrase = tuple[tuple[str, ...], str, str]
 
 
 def _read_phrases() -> dict[str, list[Phrase]]:
-    source = (files("teacher.reading") / "phrases.yaml").read_text(encoding="utf-8")
+    source = (files("dynapix.teacher.reading") / "phrases.yaml").read_text(encoding="utf-8")
     phrases: dict[str, list[Phrase]] = defaultdict(list)
     for tag, listed in yaml.safe_load(source).items():
         values = listed if isinstance(listed, dict) else {"": listed}

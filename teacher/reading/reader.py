@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Container, Sequence
 
-from teacher.reading.claims import CUT, EITHER, JOINT, Claim, IndexedPredicates
-from teacher.reading.tagging import END, Noun, RelationPhrase, Tag
+from dynapix.teacher.reading.claims import CUT, EITHER, JOINT, Claim, IndexedPredicates
+from dynapix.teacher.reading.tagging import END, Noun, RelationPhrase, Tag
 
 SEPARATORS = {"comma", "semicolon", "and", "break", "moment"}
 """Tags that may lie between clauses."""

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
-from teacher.predicates.facts import COMPASS, OUT_OF_VIEW
-from teacher.predicates.relations import CHANGES, KINDS
-from teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
-from teacher.reading.phrases import COARSE
-from teacher.reading.reader import SEPARATORS, Reader, UnreadableError
-from teacher.reading.tagging import (
+from dynapix.teacher.predicates.facts import COMPASS, OUT_OF_VIEW
+from dynapix.teacher.predicates.relations import CHANGES, KINDS
+from dynapix.teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
+from dynapix.teacher.reading.phrases import COARSE
+from dynapix.teacher.reading.reader import SEPARATORS, Reader, UnreadableError
+from dynapix.teacher.reading.tagging import (
     COLOR_WORDS,
     COLUMNS,
     END,

@@ -11,10 +11,10 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from data.records import COLORS, LETTERS, MATERIALS, SHAPES
-from teacher.predicates.facts import REGIONS
-from teacher.predicates.relations import KINDS
-from teacher.reading.phrases import COARSE, PHRASES_BY_FIRST_WORD
+from dynapix.data.records import COLORS, LETTERS, MATERIALS, SHAPES
+from dynapix.teacher.predicates.facts import REGIONS
+from dynapix.teacher.predicates.relations import KINDS
+from dynapix.teacher.reading.phrases import COARSE, PHRASES_BY_FIRST_WORD
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")
 ARTICLES = {"the", "a", "an", "its", "their", "that", "this"}

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from teacher.servers.responses import Response
+from dynapix.teacher.servers.responses import Response
 
 Messages = list[dict[str, Any]]
 """A prompt in the chat format."""

@@ -17,9 +17,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
-from conf.errors import UserError
-from conf.schema import ServersConfig
-from teacher.servers.capabilities import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import ServersConfig
+from dynapix.teacher.servers.capabilities import (
     CANARY,
     Constraint,
     Messages,
@@ -29,8 +29,8 @@ from teacher.servers.capabilities import (
     optional_fields,
     without_optional,
 )
-from teacher.servers.responses import Response, ScoredPrompt
-from teacher.servers.server import (
+from dynapix.teacher.servers.responses import Response, ScoredPrompt
+from dynapix.teacher.servers.server import (
     MalformedReplyError,
     NoReplyInTimeError,
     RateLimitedError,

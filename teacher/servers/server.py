@@ -11,11 +11,11 @@ from typing import TypeVar
 
 import openai
 
-from conf.errors import UserError
-from conf.proxies import proxy_hint
-from conf.schema import ServersConfig
-from teacher.servers.capabilities import Capabilities, Constraint, Messages, RequestFields
-from teacher.servers.responses import Response, ScoredPrompt, parse_completion
+from dynapix.conf.errors import UserError
+from dynapix.conf.proxies import proxy_hint
+from dynapix.conf.schema import ServersConfig
+from dynapix.teacher.servers.capabilities import Capabilities, Constraint, Messages, RequestFields
+from dynapix.teacher.servers.responses import Response, ScoredPrompt, parse_completion
 
 Reply = TypeVar("Reply")
 Client = TypeVar("Client", openai.OpenAI, openai.AsyncOpenAI)

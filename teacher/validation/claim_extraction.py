@@ -7,12 +7,12 @@ The package `teacher.reading` describes the steps.
 
 from __future__ import annotations
 
-from teacher.predicates.facts import Predicates
-from teacher.reading.candidates import CandidateReader, read_answer
-from teacher.reading.claims import CUT, EITHER, TARGET, Claim, IndexedPredicates
-from teacher.reading.scenes import SceneReader
-from teacher.reading.tagging import Tag, find_tags
-from teacher.sections import split_sections
+from dynapix.teacher.predicates.facts import Predicates
+from dynapix.teacher.reading.candidates import CandidateReader, read_answer
+from dynapix.teacher.reading.claims import CUT, EITHER, TARGET, Claim, IndexedPredicates
+from dynapix.teacher.reading.scenes import SceneReader
+from dynapix.teacher.reading.tagging import Tag, find_tags
+from dynapix.teacher.sections import split_sections
 
 MOMENTS = {
     "Scene parse": CUT,

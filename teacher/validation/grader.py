@@ -7,19 +7,19 @@ import json
 from collections import Counter
 from dataclasses import astuple, replace
 
-from conf.schema import RelationBounds, TeacherConfig
-from data.records import Rationale, SelectionItem
-from teacher.cited_rationales import CITED_VERSION
-from teacher.narrator import NARRATOR_VERSION
-from teacher.predicates.facts import RelationalPredicates
-from teacher.predicates.vocabulary import choose_vocabulary, name_vocabulary
-from teacher.prompts import PROMPT_VERSION
-from teacher.reading.claims import VERDICTS
-from teacher.sections import GRAMMAR_VERSION
-from teacher.servers.responses import Response
-from teacher.statement_choice import choose_statements
-from teacher.sufficiency import measure_sufficiency
-from teacher.validation.validator import VALIDATOR_VERSION, Validation, validate_rationale
+from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.data.records import Rationale, SelectionItem
+from dynapix.teacher.cited_rationales import CITED_VERSION
+from dynapix.teacher.narrator import NARRATOR_VERSION
+from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary, name_vocabulary
+from dynapix.teacher.prompts import PROMPT_VERSION
+from dynapix.teacher.reading.claims import VERDICTS
+from dynapix.teacher.sections import GRAMMAR_VERSION
+from dynapix.teacher.servers.responses import Response
+from dynapix.teacher.statement_choice import choose_statements
+from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.validation.validator import VALIDATOR_VERSION, Validation, validate_rationale
 
 MAX_CHARACTERS = 20_000
 """Maximum length of a response. A longer one is rejected, and the record has its beginning only."""

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from random import Random
 
-from data.records import COLORS, LETTERS
-from teacher.predicates.facts import (
+from dynapix.data.records import COLORS, LETTERS
+from dynapix.teacher.predicates.facts import (
     COMPASS,
     REGIONS,
     SPEEDS,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from teacher.predicates.facts import RelationalPredicates
-from teacher.reading.claims import Claim
-from teacher.sections import split_sections
-from teacher.sufficiency import measure_sufficiency
-from teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.reading.claims import Claim
+from dynapix.teacher.sections import split_sections
+from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.validation.claim_extraction import extract_claims
 
 PARTS = ("prefix", "prediction", "candidates")
 """What claims are about: the observed prefix, what follows it, or the candidates."""

@@ -6,16 +6,16 @@ import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from data.records import LETTERS, SelectionItem
-from teacher.candidate_letters import find_letters
-from teacher.numbers.detection import find_numbers
-from teacher.predicates.facts import Predicates
-from teacher.reading.claims import Claim
-from teacher.sections import HEADING, SECTIONS, split_sections
-from teacher.validation.claim_extraction import extract_claims
+from dynapix.data.records import LETTERS, SelectionItem
+from dynapix.teacher.candidate_letters import find_letters
+from dynapix.teacher.numbers.detection import find_numbers
+from dynapix.teacher.predicates.facts import Predicates
+from dynapix.teacher.reading.claims import Claim
+from dynapix.teacher.sections import HEADING, SECTIONS, split_sections
+from dynapix.teacher.validation.claim_extraction import extract_claims
 
 if TYPE_CHECKING:
-    from conf.schema import TeacherConfig
+    from dynapix.conf.schema import TeacherConfig
 
 VALIDATOR_VERSION = "10"
 MAX_QUOTED = 80

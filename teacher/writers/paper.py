@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from teacher.predicates.facts import (
+from dynapix.teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
     Difference,
@@ -19,7 +19,7 @@ from teacher.predicates.facts import (
     Predicates,
 )
 
-PHRASES = yaml.safe_load((files("teacher") / "templates" / "phrases.yaml").read_text())
+PHRASES = yaml.safe_load((files("dynapix.teacher") / "templates" / "phrases.yaml").read_text())
 
 
 class Detail(NamedTuple):

@@ -9,7 +9,7 @@ from importlib.resources import files
 
 import yaml
 
-from teacher.predicates.facts import (
+from dynapix.teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
     ObjectFacts,
@@ -17,17 +17,17 @@ from teacher.predicates.facts import (
     RelationalPredicates,
     View,
 )
-from teacher.predicates.relations import (
+from dynapix.teacher.predicates.relations import (
     CHANGES,
     SYMMETRIC,
     find_topic,
     flip_relation,
     normalize_relation,
 )
-from teacher.statement_choice import Decision
-from teacher.writers.paper import Detail, Writer
+from dynapix.teacher.statement_choice import Decision
+from dynapix.teacher.writers.paper import Detail, Writer
 
-PHRASES = yaml.safe_load((files("teacher") / "templates" / "relations.yaml").read_text())
+PHRASES = yaml.safe_load((files("dynapix.teacher") / "templates" / "relations.yaml").read_text())
 
 POSSESSIVE = {"is": "has", "will be": "will have"}
 """For each verb, the one to use if the other object is named before the relation: "the cube *has*

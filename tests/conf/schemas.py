@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from typing import get_args, get_type_hints
 
-import conf.schema
-from conf.schema.commands import CommandConfig
+from dynapix.conf import schema as settings
+from dynapix.conf.schema.commands import CommandConfig
 
 COMMANDS = [
     schema
-    for schema in vars(conf.schema).values()
+    for schema in vars(settings).values()
     if isinstance(schema, type)
     and issubclass(schema, CommandConfig)
     and schema is not CommandConfig

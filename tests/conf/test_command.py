@@ -8,7 +8,7 @@ import sys
 import pytest
 import yaml
 
-from conf.failures import report_failures
+from dynapix.conf.failures import report_failures
 from tests.children import run_child
 from tests.conf.toy_process import run_toy
 
@@ -84,7 +84,7 @@ def test_library_error_on_a_full_disk_is_a_failed_write(monkeypatch, tmp_path, c
     with pytest.raises(RuntimeError), report_failures(str(tmp_path)):
         raise RuntimeError("shapes do not match")
     full = shutil.disk_usage(tmp_path)._replace(free=0)
-    monkeypatch.setattr("conf.failures.shutil.disk_usage", lambda _: full)
+    monkeypatch.setattr("dynapix.conf.failures.shutil.disk_usage", lambda _: full)
     with pytest.raises(SystemExit) as ended, report_failures(str(tmp_path)):
         raise RuntimeError("shapes do not match")
     assert ended.value.code == 1

@@ -3,14 +3,14 @@
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from conf.compose import (
+from dynapix.conf.compose import (
     compose,
     compose_config,
     open_hydra,
 )
-from conf.errors import SettingsError
-from conf.multirun.sweep import Sweep
-from conf.schema import BuildCommand, ContrastiveCommand, ExportCommand, Quota, SftCommand
+from dynapix.conf.errors import SettingsError
+from dynapix.conf.multirun.sweep import Sweep
+from dynapix.conf.schema import BuildCommand, ContrastiveCommand, ExportCommand, Quota, SftCommand
 from tests.user_errors import raises_user_error
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from conf.files import write_bytes, write_text
+from dynapix.conf.files import write_bytes, write_text
 
 
 @pytest.mark.parametrize(("write", "content"), [(write_bytes, b"new"), (write_text, "new")])

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from conf.compose import adapt_override, compose
-from conf.schema import BuildCommand, ExportStudyCommand, SelectCommand
+from dynapix.conf.compose import adapt_override, compose
+from dynapix.conf.schema import BuildCommand, ExportStudyCommand, SelectCommand
 from tests.conf.schemas import COMMANDS, path_settings
 from tests.user_errors import raises_user_error
 

@@ -9,13 +9,13 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from conf import schema
-from conf.compose import compose, config_name, list_presets
-from conf.errors import SettingsError
-from conf.help import COMMON, TRAINING, description
-from data.items.recipes import WINDOW_CELLS
+from dynapix.conf import schema
+from dynapix.conf.compose import compose, config_name, list_presets
+from dynapix.conf.errors import SettingsError
+from dynapix.conf.help import COMMON, TRAINING, description
+from dynapix.data.items.recipes import WINDOW_CELLS
 
-CONF = Path(str(files("conf")))
+CONF = Path(str(files("dynapix.conf")))
 SCHEMAS = {
     "data.build": schema.BuildCommand,
     "data.statistics": schema.StatisticsCommand,
@@ -24,7 +24,6 @@ SCHEMAS = {
     "teacher.narrate": schema.NarrateCommand,
     "teacher.claims_benchmark": schema.ClaimsCommand,
     "teacher.serve": schema.ServeCommand,
-    "train.base": schema.TinyBaseCommand,
     "train.sft": schema.SftCommand,
     "train.distill": schema.DistillCommand,
     "train.reinforce": schema.ReinforceCommand,
@@ -113,12 +112,6 @@ def test_teacher_takes_one_server_or_several():
 
 def test_overrides_and_overlays_replace_the_recipe():
     assert compose_line("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
-    base = compose_line("python -m train.base train.words.lr=3e-4")
-    assert base.student.name == "tiny_scratch"
-    assert base.student.architecture.vision_layers == 4
-    assert base.benchmark.name == "tiny_base"
-    assert base.benchmark.world.name == "above"
-    assert (base.train.words.lr, base.train.words.batch) == (3e-4, 8)
 
 
 def test_retriever_preset_sets_its_training_recipe():

@@ -5,7 +5,7 @@ from itertools import permutations
 
 import pytest
 
-from conf.runs import Run, is_inside, open_run, rank, run_name, world_size
+from dynapix.conf.runs import Run, is_inside, open_run, rank, run_name, world_size
 from tests.user_errors import raises_user_error
 
 SETTINGS = {"seed": 0, "run": None, "store": "store", "checkpoints": "c", "workers": 2, "x": 1.0}

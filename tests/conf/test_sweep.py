@@ -14,15 +14,21 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-from conf.compose import compose
-from conf.errors import import_extra
-from conf.files import write_json
-from conf.gpus import visible_gpus
-from conf.multirun.search import STUDY_FILE, default_metric, distribution
-from conf.multirun.sweep import Sweep
-from conf.multirun.table import JOB_FILE, is_lower_better, read_job, read_jobs, write_sweep_table
-from conf.schema import ContrastiveCommand, SftCommand
-from conf.schema.training import REGIMES
+from dynapix.conf.compose import compose
+from dynapix.conf.errors import import_extra
+from dynapix.conf.files import write_json
+from dynapix.conf.gpus import visible_gpus
+from dynapix.conf.multirun.search import STUDY_FILE, default_metric, distribution
+from dynapix.conf.multirun.sweep import Sweep
+from dynapix.conf.multirun.table import (
+    JOB_FILE,
+    is_lower_better,
+    read_job,
+    read_jobs,
+    write_sweep_table,
+)
+from dynapix.conf.schema import ContrastiveCommand, SftCommand
+from dynapix.conf.schema.training import REGIMES
 from tests.conf.toy_process import NO_GPU, run_toy, start_toy
 from tests.user_errors import raises_user_error
 

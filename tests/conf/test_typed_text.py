@@ -4,11 +4,11 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from conf.compose import adapt_override, compose
-from conf.multirun.sweep import Sweep
-from conf.runs import run_name
-from conf.schema import SelectCommand, SftCommand
-from conf.typed_text import PresetSource
+from dynapix.conf.compose import adapt_override, compose
+from dynapix.conf.multirun.sweep import Sweep
+from dynapix.conf.runs import run_name
+from dynapix.conf.schema import SelectCommand, SftCommand
+from dynapix.conf.typed_text import PresetSource
 from tests.conf.schemas import COMMANDS, leaf_settings
 
 NUMBERS = ("2026_11_29", "1e-4", "1.50", "1e3", "+1", "-0", "007", "true", "False", "inf", "nan")

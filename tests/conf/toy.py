@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from hydra.core.config_store import ConfigStore
 
-from conf.entry import Run, command
-from conf.errors import UserError
-from conf.schema import CommandConfig, TeacherConfig
+from dynapix.conf.entry import Run, command
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import CommandConfig, TeacherConfig
 
 log = logging.getLogger(__name__)
 

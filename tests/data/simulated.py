@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from conf.compose import compose
-from conf.schema import BuildCommand, WorldConfig
-from data.records import Scene
-from data.sim.sampling import sample_scene
-from data.sources.scenes import record_scene
+from dynapix.conf.compose import compose
+from dynapix.conf.schema import BuildCommand, WorldConfig
+from dynapix.data.records import Scene
+from dynapix.data.sim.sampling import sample_scene
+from dynapix.data.sources.scenes import record_scene
 
 CLEVRER = WorldConfig()
 WORLDS = [

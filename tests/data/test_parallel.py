@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from data.parallel import Workers
+from dynapix.data.parallel import Workers
 from tests.user_errors import raises_user_error
 
 

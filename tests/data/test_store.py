@@ -12,13 +12,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
-from conf.schema.world import ObjectsConfig, WorldConfig
-from data import store as stores
-from data.build import build, ensure_benchmark, ensure_items, lock_partial_build
-from data.parallel import Workers
-from data.sources.scenes import split_scenes
-from data.store import CHECKED, MANIFEST, hash_file, hash_files, open_store
+from dynapix.conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
+from dynapix.conf.schema.world import ObjectsConfig, WorldConfig
+from dynapix.data import store as stores
+from dynapix.data.build import build, ensure_benchmark, ensure_items, lock_partial_build
+from dynapix.data.parallel import Workers
+from dynapix.data.sources.scenes import split_scenes
+from dynapix.data.store import CHECKED, MANIFEST, hash_file, hash_files, open_store
 from tests.user_errors import raises_user_error
 from tests.waiting import wait_until
 

@@ -20,17 +20,17 @@ import torch
 from PIL import Image
 
 import dynapix
-from conf.compose import compose
-from conf.schema import BuildCommand
-from data.frames.frame_cache import FrameReader
-from data.records import SPLITS, Rationale
-from data.store import MANIFEST, RATIONALES, Store
 from dynapix.__main__ import COMMANDS, overview
 from dynapix.benchmark import _preset_world, _reopen, preset_names
+from dynapix.conf.compose import compose
+from dynapix.conf.schema import BuildCommand
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import SPLITS, Rationale
+from dynapix.data.store import MANIFEST, RATIONALES, Store
+from dynapix.evaluation.metrics.selection import Choices, build_selection_report
+from dynapix.evaluation.reporting.tables import selection_table
 from dynapix.selection import MIN_FAILURES_TO_STOP
-from evaluation.metrics.selection import Choices, build_selection_report
-from evaluation.reporting.tables import selection_table
-from teacher.journal import save_accepted
+from dynapix.teacher.journal import save_accepted
 from tests.dynapix.models import always_a, nearest
 from tests.test_house import COMMANDS as ALL_COMMANDS
 from tests.user_errors import raises_user_error
@@ -39,7 +39,7 @@ READING = {"numpy", "pyarrow", "PIL"}
 """The packages that reading a benchmark may import."""
 PRESETS = ["tiny_balanced", "tiny_balanced-above", "small", "small-clevrer"]
 """Names that open the folders tiny_balanced-above and small."""
-OWN = {"conf", "data", "dynapix", "evaluation", "models", "teacher"}
+OWN = {"dynapix"}
 
 
 def imported_packages(code: str, folder: Path) -> set[str]:
@@ -250,8 +250,8 @@ def test_results_are_compared_on_the_same_items(bench) -> None:
 
 
 def test_a_rationale_is_scored_by_the_oracle(micro_store) -> None:
-    from teacher.narrator import write_rationale
-    from teacher.predicates.extraction import extract_predicates
+    from dynapix.teacher.narrator import write_rationale
+    from dynapix.teacher.predicates.extraction import extract_predicates
 
     train = dynapix.load(micro_store.folder, split="train")
     item = next(
@@ -274,9 +274,9 @@ def test_a_rationale_is_scored_by_the_oracle(micro_store) -> None:
 
 
 def test_sufficiency_of_a_rationale_is_that_of_its_prediction(micro_store) -> None:
-    from conf.schema import RelationBounds
-    from teacher.narrator import write_rationale
-    from teacher.predicates.extraction import extract_predicates
+    from dynapix.conf.schema import RelationBounds
+    from dynapix.teacher.narrator import write_rationale
+    from dynapix.teacher.predicates.extraction import extract_predicates
 
     found = []
     for item in dynapix.load(micro_store.folder, split="test").selection[:20]:
@@ -299,7 +299,7 @@ def test_name_of_a_preset_and_a_world_builds_the_benchmark_in_the_world(
         built.append((cfg.store_name, cfg.world.physics.rolling_friction, root))
         return micro_store
 
-    monkeypatch.setattr("data.build.ensure_benchmark", remember)
+    monkeypatch.setattr("dynapix.data.build.ensure_benchmark", remember)
     assert dynapix.load("tiny-settling", store=tmp_path).store is micro_store
     assert built == [("tiny-settling", 0.025, tmp_path)]
 

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 import dynapix
-from data.checks import observer
-from data.checks.observer import ERRORS, EXTRAPOLATES, SIMULATES
+from dynapix.data.checks import observer
+from dynapix.data.checks.observer import ERRORS, EXTRAPOLATES, SIMULATES
 from tests.dynapix.models import always_a, nearest
 from tests.evaluation.reporting.measured import run_report
 from tests.user_errors import raises_user_error

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from teacher.servers.capabilities import CANARY, UNLIKELY
+from dynapix.teacher.servers.capabilities import CANARY, UNLIKELY
 from tests.local import JsonHandler, LocalServer
 
 Reply = str | int | dict[str, Any]

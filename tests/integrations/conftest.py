@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from conf.compose import compose
-from conf.entry import Run
-from conf.files import read_json_lines, write_json
-from conf.runs import open_run
-from conf.schema import (
+from dynapix.conf.compose import compose
+from dynapix.conf.entry import Run
+from dynapix.conf.files import read_json_lines, write_json
+from dynapix.conf.runs import open_run
+from dynapix.conf.schema import (
     ContrastiveCommand,
     ContrastiveTrainConfig,
     ExportModelCommand,
@@ -23,10 +23,10 @@ from conf.schema import (
     ServerConfig,
     SftCommand,
 )
-from data.store import Store
-from evaluation import retrieve, select
+from dynapix.data.store import Store
+from dynapix.evaluation import retrieve, select
+from dynapix.train import contrastive, export, sft
 from tests.teacher.server_process import ROOT, transformers_server
-from train import contrastive, export, sft
 
 HARNESSES = ROOT / ".venv-harnesses" / "bin"
 

@@ -10,17 +10,17 @@ import pytest
 from openai import OpenAI
 
 import dynapix
-from conf.files import read_json_lines
-from conf.schema import TeacherConfig
-from data.publish.huggingface import ensure_export
+from dynapix.conf.files import read_json_lines
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.publish.huggingface import ensure_export
+from dynapix.evaluation.reporting.runs import gather_runs
 from dynapix.integrations.saved_logs import save_log
-from evaluation.reporting.runs import gather_runs
-from teacher.predicates.vocabulary import describe_item
+from dynapix.teacher.predicates.vocabulary import describe_item
+from dynapix.train.rewards import REWARDS, judge_response
 from tests.evaluation.models import released
 from tests.integrations.conftest import Served
 from tests.teacher.server_process import ROOT, vllm_server
 from tests.user_errors import raises_user_error
-from train.rewards import REWARDS, judge_response
 
 UV = ROOT / ".venv" / "bin" / "uv"
 

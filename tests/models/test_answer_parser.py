@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from models.student.answer_parser import ParsedAnswer, Reason, parse_choice
+from dynapix.models.student.answer_parser import ParsedAnswer, Reason, parse_choice
 from tests.scaling import SIZE, is_linear
 
 NO, CUT, SEV, REF, BAD, MAL = Reason

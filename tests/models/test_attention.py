@@ -8,8 +8,8 @@ from torch import nn
 from transformers import PreTrainedModel
 from transformers.models.qwen3_vl.modeling_qwen3_vl import eager_attention_forward
 
-from models.layers import attention
-from models.layers.attention import (
+from dynapix.models.layers import attention
+from dynapix.models.layers.attention import (
     BY_FRAME,
     MATMUL,
     MATMUL_MAX_TOKENS,
@@ -17,10 +17,10 @@ from models.layers.attention import (
     attend_by_matmul,
     choose_attention,
 )
-from models.student.collator import Collator
-from models.student.kv_cache import BLOCK, create_cache
-from models.student.prompts import Sample, selection_sample
-from train.student.trainer import token_mean
+from dynapix.models.student.collator import Collator
+from dynapix.models.student.kv_cache import BLOCK, create_cache
+from dynapix.models.student.prompts import Sample, selection_sample
+from dynapix.train.student.trainer import token_mean
 
 LENGTH = 1500
 

@@ -21,9 +21,9 @@ from transformers.cache_utils import DynamicLayer
 from trl import GRPOTrainer
 from trl.trainer.utils import RepeatSampler
 
-from models import compat
-from models.layers import attention
-from models.layers.fast_layers import use_fast_layers
+from dynapix.models import compat
+from dynapix.models.layers import attention
+from dynapix.models.layers.fast_layers import use_fast_layers
 
 CHANGED = "a library changed this hook; correct models/compat.py or the version bounds:"
 

@@ -11,8 +11,8 @@ from tests.children import run_child
 ROOT = Path(__file__).parents[2]
 AVERAGE = """
 import torch
-from conf.runs import rank
-from models.distributed import average_gradients, end_ranks
+from dynapix.conf.runs import rank
+from dynapix.models.distributed import average_gradients, end_ranks
 
 gradients = [[[2.0, 4.0], None, None], [[4.0, 8.0], [1.0, 3.0], None]][rank()]
 parameters = [torch.nn.Parameter(torch.zeros(2)) for _ in gradients]

@@ -9,23 +9,23 @@ import pytest
 import torch
 from sentence_transformers import SentenceTransformer
 
-from conf.errors import UserError
-from conf.schema import LateConfig, LoraConfig
-from conf.schema.benchmark import POOLS
-from data.items.database import UniqueFrames
-from data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
-from models.compat import keep_differentiable
-from models.layers.attention import BY_FRAME
-from models.retriever import embedder
-from models.retriever.inputs import frame_input, query_input
-from models.towers import count_parameters
-from tests.user_errors import raises_user_error
-from train.common.audit import audit_retriever
-from train.retriever.evaluator import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import LateConfig, LoraConfig
+from dynapix.conf.schema.benchmark import POOLS
+from dynapix.data.items.database import UniqueFrames
+from dynapix.data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
+from dynapix.models.compat import keep_differentiable
+from dynapix.models.layers.attention import BY_FRAME
+from dynapix.models.retriever import embedder
+from dynapix.models.retriever.inputs import frame_input, query_input
+from dynapix.models.towers import count_parameters
+from dynapix.train.common.audit import audit_retriever
+from dynapix.train.retriever.evaluator import (
     FRAME_STEP,
     HeldOutEvaluator,
     build_database,
 )
+from tests.user_errors import raises_user_error
 
 
 def load(micro_store, cfg, folder) -> SentenceTransformer:

@@ -14,9 +14,9 @@ from transformers.models.qwen3_vl.modeling_qwen3_vl import (
     apply_rotary_pos_emb,
 )
 
-from conf.schema import LoraConfig
-from models import loading
-from models.layers.fast_layers import (
+from dynapix.conf.schema import LoraConfig
+from dynapix.models import loading
+from dynapix.models.layers.fast_layers import (
     AddedInPlace,
     FastAttention,
     FrozenNorm,
@@ -26,10 +26,10 @@ from models.layers.fast_layers import (
     RowsLinear,
     use_fast_layers,
 )
-from models.student.collator import Collator
-from models.student.prompts import selection_sample
+from dynapix.models.student.collator import Collator
+from dynapix.models.student.prompts import selection_sample
+from dynapix.train.student.trainer import token_mean
 from tests.tiny_models import randomize_adapters
-from train.student.trainer import token_mean
 
 KINDS = {
     "nf4": {"lora": LoraConfig(rank=4, alpha=12, dropout=0.2)},

@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from models.fingerprints import weights_digest
+from dynapix.models.fingerprints import weights_digest
 
 SHAPES = {"first": (300, 200), "middle": (7,), "visual": (2000, 300)}
 

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import torch
 
-from conf.schema import LateConfig, LoraConfig, RetrieverConfig
-from models.layers.attention import MATMUL
-from models.retriever import embedder
-from models.retriever.inputs import Retriever, model_inputs, preprocess
-from models.retriever.last_token import LastTokenTower, compute_last_token
+from dynapix.conf.schema import LateConfig, LoraConfig, RetrieverConfig
+from dynapix.models.layers.attention import MATMUL
+from dynapix.models.retriever import embedder
+from dynapix.models.retriever.inputs import Retriever, model_inputs, preprocess
+from dynapix.models.retriever.last_token import LastTokenTower, compute_last_token
 from tests.tiny_models import randomize_adapters
 
 Results = tuple[torch.Tensor, dict[str, torch.Tensor]]

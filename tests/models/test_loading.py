@@ -13,15 +13,15 @@ import pytest
 import torch
 from transformers import AutoModelForImageTextToText, AutoProcessor
 
-from conf.compose import compose
-from conf.schema import SftCommand
-from models import compat, loading
-from models.student.collator import Collator
-from models.student.prompts import selection_sample
-from models.towers import check_parameter_counts, count_parameters
+from dynapix.conf.compose import compose
+from dynapix.conf.schema import SftCommand
+from dynapix.models import compat, loading
+from dynapix.models.student.collator import Collator
+from dynapix.models.student.prompts import selection_sample
+from dynapix.models.towers import check_parameter_counts, count_parameters
+from dynapix.train.student.trainer import token_mean
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
-from train.student.trainer import token_mean
 
 
 def test_a_built_model_is_read_back_bit_for_bit(model, processor, tmp_path) -> None:

@@ -11,13 +11,13 @@ import torch
 from sentence_transformers import MultiVectorEncoder
 from transformers import dynamic_module_utils
 
-from conf.compose import compose, register
-from conf.schema import ContrastiveCommand, LateConfig
-from models.retriever.embedder import load_retriever, load_trained, tokenizer_texts
-from models.retriever.inputs import frame_input, query_input
-from models.retriever.multi_vector import find_scored_tokens
-from models.retriever.scored_tokens import ScoredTokens
-from train.common.audit import audit_retriever
+from dynapix.conf.compose import compose, register
+from dynapix.conf.schema import ContrastiveCommand, LateConfig
+from dynapix.models.retriever.embedder import load_retriever, load_trained, tokenizer_texts
+from dynapix.models.retriever.inputs import frame_input, query_input
+from dynapix.models.retriever.multi_vector import find_scored_tokens
+from dynapix.models.retriever.scored_tokens import ScoredTokens
+from dynapix.train.common.audit import audit_retriever
 
 FRAME_TOKENS = 9
 """Tokens of a frame of 96 px, and of each of the six pairs of frames of a clip."""
@@ -107,7 +107,7 @@ def test_a_saved_retriever_encodes_the_same_without_this_project(
     model.save_pretrained(str(saved), create_model_card=False)
     again = load_trained(cfg, "fp32", saved)
     monkeypatch.setattr(dynamic_module_utils, "HF_MODULES_CACHE", str(tmp_path / "modules"))
-    for name in [name for name in sys.modules if name.partition(".")[0] in ("train", "conf")]:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "dynapix"]:
         monkeypatch.setitem(sys.modules, name, None)
     alone = MultiVectorEncoder(str(saved), device="cpu", trust_remote_code=True)
     assert ScoredTokens not in map(type, alone)

@@ -29,18 +29,24 @@ from transformers import (
 )
 from transformers.quantizers.auto import AutoHfQuantizer
 
-from conf.compose import compose
-from conf.schema import LoraConfig, SftCommand, StudentConfig, TeacherConfig
-from data.frames.frame_cache import FrameReader
-from data.records import FPS, sample_prefix_frames
-from models import loading
-from models.student.collator import Collator, encode
-from models.student.prompts import Clip, Sample, build_response, build_sample, selection_sample
-from models.towers import check_parameter_counts, count_parameters
-from teacher.narrate import ensure_rationales
+from dynapix.conf.compose import compose
+from dynapix.conf.schema import LoraConfig, SftCommand, StudentConfig, TeacherConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import FPS, sample_prefix_frames
+from dynapix.models import loading
+from dynapix.models.student.collator import Collator, encode
+from dynapix.models.student.prompts import (
+    Clip,
+    Sample,
+    build_response,
+    build_sample,
+    selection_sample,
+)
+from dynapix.models.towers import check_parameter_counts, count_parameters
+from dynapix.teacher.narrate import ensure_rationales
+from dynapix.train.common.audit import audit_student
+from dynapix.train.student.dataset import supervised_items
 from tests.user_errors import raises_user_error
-from train.common.audit import audit_student
-from train.student.dataset import supervised_items
 
 RELEASED = {"qwen3_vl_8b": 8_767_123_696, "qwen3_vl_2b": 2_127_532_032}
 """Parameters in the safetensors of Qwen/Qwen3-VL-8B-Instruct and Qwen/Qwen3-VL-2B-Instruct."""

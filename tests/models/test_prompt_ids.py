@@ -9,10 +9,10 @@ import pytest
 import torch
 from sentence_transformers.sentence_transformer.modules import Transformer
 
-from data.records import FPS
-from models.compat import write_clips_as_released
-from models.student.collator import Encoded, encode
-from models.student.prompts import Clip, Sample, build_sample, selection_sample
+from dynapix.data.records import FPS
+from dynapix.models.compat import write_clips_as_released
+from dynapix.models.student.collator import Encoded, encode
+from dynapix.models.student.prompts import Clip, Sample, build_sample, selection_sample
 from tests.families import (
     QWEN3_5_TEMPLATE,
     QWEN3_VL_TEMPLATE,

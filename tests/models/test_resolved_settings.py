@@ -9,10 +9,10 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from conf.schema import RetrieverConfig, StudentConfig
-from models.fingerprints import model_id, pin_revisions
-from models.precision import resolve_precision
-from models.resolved_settings import (
+from dynapix.conf.schema import RetrieverConfig, StudentConfig
+from dynapix.models.fingerprints import model_id, pin_revisions
+from dynapix.models.precision import resolve_precision
+from dynapix.models.resolved_settings import (
     RESOLVED,
     check_base,
     data_digest,
@@ -46,9 +46,9 @@ def hub(tmp_path, monkeypatch):
 
 
 def test_a_resumed_run_keeps_its_precision(base, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("models.precision.supports_bf16", lambda on_cpu=False: True)
+    monkeypatch.setattr("dynapix.models.precision.supports_bf16", lambda on_cpu=False: True)
     assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
-    monkeypatch.setattr("models.precision.supports_bf16", lambda on_cpu=False: False)
+    monkeypatch.setattr("dynapix.models.precision.supports_bf16", lambda on_cpu=False: False)
     assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
     assert resolve_precision("auto") == "fp32"
 

@@ -11,15 +11,15 @@ import pytest
 import torch
 from torch import nn
 
-from conf.schema import LoraConfig
-from models import loading
-from models.layers.attention import MATMUL
-from models.layers.fast_layers import use_fast_layers
-from models.layers.shared_prompts import PADDING, SHARED, pack_samples, shares_prompts
-from models.student.collator import Collator
-from models.student.prompts import selection_sample
+from dynapix.conf.schema import LoraConfig
+from dynapix.models import loading
+from dynapix.models.layers.attention import MATMUL
+from dynapix.models.layers.fast_layers import use_fast_layers
+from dynapix.models.layers.shared_prompts import PADDING, SHARED, pack_samples, shares_prompts
+from dynapix.models.student.collator import Collator
+from dynapix.models.student.prompts import selection_sample
+from dynapix.train.student.trainer import token_mean
 from tests.tiny_models import randomize_adapters
-from train.student.trainer import token_mean
 
 RATIONALE = "the red cube moves to the right, and " * 8 + "it stops.\nAnswer: B"
 ONE_ITEM = [(0, "reasoning"), (0, "answer")]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from conf.schema import StudentConfig
-from models.student.collator import Collator
-from models.student.generation import generate, sampling_processors
-from models.student.prompts import selection_sample
+from dynapix.conf.schema import StudentConfig
+from dynapix.models.student.collator import Collator
+from dynapix.models.student.generation import generate, sampling_processors
+from dynapix.models.student.prompts import selection_sample
 
 LOGITS = torch.tensor([2.0, 1.0, 0.5, 0.0, -1.0, -3.0])
 

@@ -23,8 +23,8 @@ def start_server(
 ) -> Iterator[Callable[..., FaultyServer]]:
     """A function that starts a server. Its arguments are the faults of the first responses, in
     order. The pauses of the server pool are short."""
-    monkeypatch.setattr("teacher.servers.pool.PAUSE", 0.01)
-    monkeypatch.setattr("teacher.servers.pool.LONGEST_PAUSE", 0.05)
+    monkeypatch.setattr("dynapix.teacher.servers.pool.PAUSE", 0.01)
+    monkeypatch.setattr("dynapix.teacher.servers.pool.LONGEST_PAUSE", 0.05)
     servers = []
 
     def start(*faults: object) -> FaultyServer:

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from socket import SO_LINGER, SOL_SOCKET
 from typing import Any
 
-from conf.schema import TeacherConfig
-from teacher.servers.capabilities import CANARY, UNLIKELY
+from dynapix.conf.schema import TeacherConfig
+from dynapix.teacher.servers.capabilities import CANARY, UNLIKELY
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.memory_store import MemoryStore, prompts_and_rationales
 

@@ -12,11 +12,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from conf.schema import RelationBounds
-from data.records import Scene, SelectionItem
-from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.facts import RelationalPredicates
-from teacher.validation.claim_extraction import extract_claims
+from dynapix.conf.schema import RelationBounds
+from dynapix.data.records import Scene, SelectionItem
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.validation.claim_extraction import extract_claims
 from tests.data.simulated import simulate_scene
 from tests.teacher import synthetic
 

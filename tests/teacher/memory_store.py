@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from conf.schema import TeacherConfig
-from data.records import Scene, SelectionItem
-from teacher.narrator import write_rationale
-from teacher.predicates.extraction import extract_predicates
-from teacher.prompts import build_messages
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.records import Scene, SelectionItem
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.prompts import build_messages
 from tests.teacher import synthetic
 
 

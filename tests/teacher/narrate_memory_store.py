@@ -3,8 +3,8 @@
 import sys
 from pathlib import Path
 
-from conf.schema import TeacherConfig
-from teacher.narrate import narrate_store
+from dynapix.conf.schema import TeacherConfig
+from dynapix.teacher.narrate import narrate_store
 from tests.teacher.memory_store import make_store
 
 if __name__ == "__main__":

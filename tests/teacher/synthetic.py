@@ -6,7 +6,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from data.records import (
+from dynapix.data.records import (
     COLORS,
     FPS,
     FRAMES,

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from conf.schema import RelationBounds, TeacherConfig
-from data.records import LETTERS
-from teacher.cited_rationales import (
+from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.data.records import LETTERS
+from dynapix.teacher.cited_rationales import (
     CITED_VERSION,
     PREFIXES,
     CitationError,
@@ -19,13 +19,13 @@ from teacher.cited_rationales import (
     compose_rationale,
     list_facts,
 )
-from teacher.journal import read_rationales
-from teacher.narrate import narrate_store
-from teacher.predicates.vocabulary import describe_item, name_vocabulary
-from teacher.prompts import build_messages
-from teacher.sufficiency import measure_sufficiency
-from teacher.validation.claim_extraction import extract_claims
-from teacher.validation.validator import validate_rationale
+from dynapix.teacher.journal import read_rationales
+from dynapix.teacher.narrate import narrate_store
+from dynapix.teacher.predicates.vocabulary import describe_item, name_vocabulary
+from dynapix.teacher.prompts import build_messages
+from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.validator import validate_rationale
 from tests.teacher.faulty_server import FaultyServer, teacher_at
 from tests.teacher.memory_store import MemoryStore
 from tests.teacher.test_predicates import random_cases

@@ -21,18 +21,18 @@ from random import Random
 
 import pytest
 
-from benchmarks.experiments.mutations import is_contradicted, parse_predicates, read_rationales
-from conf.schema import RelationBounds, TeacherConfig
-from teacher.narrator import write_rationale
-from teacher.predicates.extraction import EVENT_MOMENTS
-from teacher.predicates.facts import REGIONS
-from teacher.predicates.relations import describe_distance
-from teacher.predicates.vocabulary import choose_vocabulary
-from teacher.reading.phrases import PHRASES_BY_FIRST_WORD
-from teacher.sections import SECTIONS
-from teacher.validation.claim_extraction import extract_claims
-from teacher.validation.mutations import MUTATIONS, RELATION_MUTATIONS
-from teacher.validation.validator import validate_rationale
+from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.extraction import EVENT_MOMENTS
+from dynapix.teacher.predicates.facts import REGIONS
+from dynapix.teacher.predicates.relations import describe_distance
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary
+from dynapix.teacher.reading.phrases import PHRASES_BY_FIRST_WORD
+from dynapix.teacher.sections import SECTIONS
+from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.mutations import MUTATIONS, RELATION_MUTATIONS
+from dynapix.teacher.validation.validator import validate_rationale
+from research.experiments.mutations import is_contradicted, parse_predicates, read_rationales
 from tests.teacher.marked import marked_items
 from tests.teacher.test_predicates import random_cases
 

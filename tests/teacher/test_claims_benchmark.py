@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from conf.entry import Run
-from conf.schema import BenchmarkConfig, ClaimsCommand
-from data.store import Store, load_rows
-from teacher import claims_benchmark
-from teacher.claims_benchmark import CARD, CLAIMS, FALSE_WORD, NARRATOR, TEXTS
-from teacher.narrator import write_rationale
-from teacher.validation.claim_extraction import extract_claims
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import BenchmarkConfig, ClaimsCommand
+from dynapix.data.store import Store, load_rows
+from dynapix.teacher import claims_benchmark
+from dynapix.teacher.claims_benchmark import CARD, CLAIMS, FALSE_WORD, NARRATOR, TEXTS
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.validation.claim_extraction import extract_claims
 from tests.user_errors import raises_user_error
 
 COUNT = 5000

@@ -2,8 +2,8 @@
 
 import pytest
 
-from teacher.narrator import write_rationale
-from teacher.sections import GRAMMAR
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.sections import GRAMMAR
 from tests.teacher.test_predicates import random_cases
 
 BROKEN = {

@@ -10,16 +10,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from conf.schema import TeacherConfig
-from conf.schema.world import WorldConfig
-from data.records import Scene
-from data.store import Store
-from teacher.journal import read_rationales
-from teacher.narrate import JOURNAL_FILE, narrate_store
-from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.grounding import Grounding, extrapolate_scene, extrapolate_target
-from teacher.predicates.vocabulary import describe_item
-from teacher.validation.validator import validate_rationale
+from dynapix.conf.schema import TeacherConfig
+from dynapix.conf.schema.world import WorldConfig
+from dynapix.data.records import Scene
+from dynapix.data.store import Store
+from dynapix.teacher.journal import read_rationales
+from dynapix.teacher.narrate import JOURNAL_FILE, narrate_store
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.predicates.grounding import Grounding, extrapolate_scene, extrapolate_target
+from dynapix.teacher.predicates.vocabulary import describe_item
+from dynapix.teacher.validation.validator import validate_rationale
 from tests.teacher import synthetic
 from tests.user_errors import raises_user_error
 

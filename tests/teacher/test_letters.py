@@ -5,11 +5,11 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from conf.schema import TeacherConfig
-from teacher.candidate_letters import find_letters, relabel_text, reorder_candidates
-from teacher.narrator import write_rationale
-from teacher.predicates.extraction import extract_predicates
-from teacher.validation.validator import validate_rationale
+from dynapix.conf.schema import TeacherConfig
+from dynapix.teacher.candidate_letters import find_letters, relabel_text, reorder_candidates
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.validation.validator import validate_rationale
 
 ORDERS = list(permutations(range(4)))
 

@@ -8,20 +8,20 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from conf.schema import RelationBounds
-from teacher import statement_choice
-from teacher.predicates.extraction import extract_predicates
-from teacher.predicates.facts import REGIONS, Relation, RelationalPredicates
-from teacher.predicates.margins import measure_margin
-from teacher.predicates.relations import (
+from dynapix.conf.schema import RelationBounds
+from dynapix.teacher import statement_choice
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.predicates.facts import REGIONS, Relation, RelationalPredicates
+from dynapix.teacher.predicates.margins import measure_margin
+from dynapix.teacher.predicates.relations import (
     CHANGES,
     VALUES,
     Places,
     find_relations,
     normalize_relation,
 )
-from teacher.prompts import format_facts
-from teacher.statement_choice import choose_statements
+from dynapix.teacher.prompts import format_facts
+from dynapix.teacher.statement_choice import choose_statements
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 from tests.teacher.test_relations import A, B, C, places, random_places

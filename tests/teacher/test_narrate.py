@@ -7,13 +7,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from conf.schema import RelationBounds, TeacherConfig
-from data.records import Rationale
-from teacher.journal import Journal, read_rationales
-from teacher.narrate import ensure_rationales, narrate_store
-from teacher.narrator import NARRATOR_VERSION
-from teacher.predicates.vocabulary import name_vocabulary
-from teacher.sections import GRAMMAR, GRAMMAR_VERSION
+from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.data.records import Rationale
+from dynapix.teacher.journal import Journal, read_rationales
+from dynapix.teacher.narrate import ensure_rationales, narrate_store
+from dynapix.teacher.narrator import NARRATOR_VERSION
+from dynapix.teacher.predicates.vocabulary import name_vocabulary
+from dynapix.teacher.sections import GRAMMAR, GRAMMAR_VERSION
 from tests.teacher import synthetic
 from tests.teacher.faulty_server import teacher_at
 from tests.teacher.memory_store import make_store
@@ -272,7 +272,7 @@ def test_fallback_is_marked_and_optional(store, start_server, monkeypatch):
     assert again.rationales == narration.rationales
     assert narrate_store(store, cfg).rationales == []
     # With another prompt, the server is asked again for items with fallbacks.
-    monkeypatch.setattr("teacher.validation.grader.PROMPT_VERSION", "another")
+    monkeypatch.setattr("dynapix.teacher.validation.grader.PROMPT_VERSION", "another")
     narrate_store(store, replace(cfg, fallback=True))
     assert len(server.requests) > requests
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conf.schema import TeacherConfig
-from teacher.narrator import write_rationale
-from teacher.predicates.extraction import extract_predicates
-from teacher.validation.validator import WORD, validate_rationale
+from dynapix.conf.schema import TeacherConfig
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.validation.validator import WORD, validate_rationale
 from tests.children import run_child
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
@@ -55,7 +55,7 @@ def test_text_varies_with_the_seed_and_is_reproducible():
 def test_text_is_the_same_in_another_process():
     code = (
         "from tests.teacher.test_predicates import random_cases\n"
-        "from teacher.narrator import write_rationale\n"
+        "from dynapix.teacher.narrator import write_rationale\n"
         "item, predicates = next(random_cases(9))\n"
         "print(write_rationale(predicates, item, 5))"
     )

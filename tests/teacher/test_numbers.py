@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from conf.schema import RelationBounds
-from teacher.narrator import write_facts, write_rationale
-from teacher.numbers.detection import find_numbers
+from dynapix.conf.schema import RelationBounds
+from dynapix.teacher.narrator import write_facts, write_rationale
+from dynapix.teacher.numbers.detection import find_numbers
 from tests.scaling import SIZE, is_linear
 from tests.teacher.adversarial_text import PIECES, repeat_piece
 from tests.teacher.test_predicates import random_cases

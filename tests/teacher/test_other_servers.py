@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from conf.schema import TeacherConfig
-from teacher.journal import read_rationales
-from teacher.narrate import narrate_store
-from teacher.sections import GRAMMAR_VERSION
-from teacher.server_narrator import request_fields
-from teacher.servers.capabilities import UNLIKELY, UNLIKELY_SCHEMA
-from teacher.servers.pool import NoResponseError, ServerPool
+from dynapix.conf.schema import TeacherConfig
+from dynapix.teacher.journal import read_rationales
+from dynapix.teacher.narrate import narrate_store
+from dynapix.teacher.sections import GRAMMAR_VERSION
+from dynapix.teacher.server_narrator import request_fields
+from dynapix.teacher.servers.capabilities import UNLIKELY, UNLIKELY_SCHEMA
+from dynapix.teacher.servers.pool import NoResponseError, ServerPool
 from tests.teacher.llama import CONTEXT
 from tests.teacher.memory_store import make_store, prompts_and_rationales
 from tests.teacher.server_process import ServerProcess, llama_server, transformers_server

@@ -8,13 +8,13 @@ from itertools import combinations
 
 import numpy as np
 
-from conf.schema import RelationBounds
-from teacher.numbers.detection import find_numbers
-from teacher.predicates.extraction import extract_facts, extract_predicates
-from teacher.predicates.facts import COMPASS, REGIONS
-from teacher.predicates.motion import find_collision_courses, find_cut
-from teacher.predicates.places import close_pairs, compass_direction
-from teacher.predicates.relations import Places, find_relations
+from dynapix.conf.schema import RelationBounds
+from dynapix.teacher.numbers.detection import find_numbers
+from dynapix.teacher.predicates.extraction import extract_facts, extract_predicates
+from dynapix.teacher.predicates.facts import COMPASS, REGIONS
+from dynapix.teacher.predicates.motion import find_collision_courses, find_cut
+from dynapix.teacher.predicates.places import close_pairs, compass_direction
+from dynapix.teacher.predicates.relations import Places, find_relations
 from tests.teacher import synthetic
 
 BOUNDS = RelationBounds()

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from conf.proxies import proxy_hint
-from conf.schema import ServerConfig
-from evaluation.generators.openai_server import served_origin
-from models.checks import check_available
+from dynapix.conf.proxies import proxy_hint
+from dynapix.conf.schema import ServerConfig
+from dynapix.evaluation.generators.openai_server import served_origin
+from dynapix.models.checks import check_available
 from tests.local import free_port
 from tests.teacher.faulty_server import teacher_at
 from tests.teacher.test_server import complete
@@ -45,7 +45,7 @@ def test_a_proxy_before_the_hub_is_named(monkeypatch) -> None:
     def refuse(_: str) -> None:
         raise ConnectionError("refused")
 
-    monkeypatch.setattr("models.checks.find_commit", refuse)
+    monkeypatch.setattr("dynapix.models.checks.find_commit", refuse)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     monkeypatch.setenv("ALL_PROXY", "socks5://127.0.0.1:9")
     with raises_user_error("missing-model", contains=("refused; requests", "ALL_PROXY")):

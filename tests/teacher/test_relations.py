@@ -8,10 +8,10 @@ from itertools import combinations, permutations
 import numpy as np
 import pytest
 
-from conf.schema import RelationBounds, TeacherConfig
-from data.oracle.displacement import MODEL_SIZE
-from teacher.predicates.facts import Relation
-from teacher.predicates.relations import (
+from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.data.oracle.displacement import MODEL_SIZE
+from dynapix.teacher.predicates.facts import Relation
+from dynapix.teacher.predicates.relations import (
     CLEARLY,
     DISPLACED,
     KINDS,

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from conf.schema import TeacherConfig
-from data.records import Rationale
-from teacher.narrate import narrate_store
-from teacher.predicates.vocabulary import name_vocabulary
-from teacher.report import (
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.records import Rationale
+from dynapix.teacher.narrate import narrate_store
+from dynapix.teacher.predicates.vocabulary import name_vocabulary
+from dynapix.teacher.report import (
     describe_sufficiency,
     format_figures,
     name_teacher,

@@ -15,13 +15,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from conf.schema import ServeCommand, TeacherConfig
-from teacher import serve
-from teacher.journal import read_rationales
-from teacher.narrate import narrate_store
-from teacher.sections import GRAMMAR_VERSION
-from teacher.server_narrator import request_fields
-from teacher.servers.pool import ServerPool
+from dynapix.conf.schema import ServeCommand, TeacherConfig
+from dynapix.teacher import serve
+from dynapix.teacher.journal import read_rationales
+from dynapix.teacher.narrate import narrate_store
+from dynapix.teacher.sections import GRAMMAR_VERSION
+from dynapix.teacher.server_narrator import request_fields
+from dynapix.teacher.servers.pool import ServerPool
 from tests.teacher.memory_store import make_store, prompts_and_rationales
 from tests.teacher.server_process import ROOT, vllm_server
 from tests.teacher.tiny_qwen3 import save_tiny_qwen3

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from conf.schema import TeacherConfig
-from teacher.cited_rationales import compose_rationale, list_facts
-from teacher.journal import read_rationales
-from teacher.narrate import narrate_store
-from teacher.narrator import write_rationale
-from teacher.predicates.vocabulary import choose_vocabulary, describe_item
-from teacher.prompts import build_messages
+from dynapix.conf.schema import TeacherConfig
+from dynapix.teacher.cited_rationales import compose_rationale, list_facts
+from dynapix.teacher.journal import read_rationales
+from dynapix.teacher.narrate import narrate_store
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary, describe_item
+from dynapix.teacher.prompts import build_messages
 from tests.teacher.memory_store import make_store
 from tests.teacher.server_process import ServerProcess, vllm_server
 from tests.teacher.test_cited_rationales import cite_all

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from teacher.journal import read_rationales
-from teacher.narrate import narrate_store
-from teacher.server_narrator import request_fields
-from teacher.servers.pool import ServerPool
-from teacher.servers.responses import parse_completion
+from dynapix.teacher.journal import read_rationales
+from dynapix.teacher.narrate import narrate_store
+from dynapix.teacher.server_narrator import request_fields
+from dynapix.teacher.servers.pool import ServerPool
+from dynapix.teacher.servers.responses import parse_completion
 from tests.teacher.faulty_server import FaultyServer, completion, teacher_at
 from tests.user_errors import raises_user_error
 from tests.waiting import wait_until

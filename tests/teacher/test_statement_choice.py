@@ -9,21 +9,21 @@ from math import dist, hypot
 import numpy as np
 import pytest
 
-from conf.schema import RelationBounds, TeacherConfig
-from teacher.narrator import FULL, write_match_lines, write_rationale
-from teacher.predicates.facts import Relation
-from teacher.predicates.relations import (
+from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.teacher.narrator import FULL, write_match_lines, write_rationale
+from dynapix.teacher.predicates.facts import Relation
+from dynapix.teacher.predicates.relations import (
     CHANGES,
     KINDS,
     VALUES,
     describe_distance,
     normalize_relation,
 )
-from teacher.statement_choice import UNSEEN_DISTANCE, choose_statements, measure_separation
-from teacher.sufficiency import measure_sufficiency
-from teacher.validation.claim_extraction import extract_claims
-from teacher.validation.validator import validate_rationale
-from teacher.writers.relational import RelationalWriter
+from dynapix.teacher.statement_choice import UNSEEN_DISTANCE, choose_statements, measure_separation
+from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.validator import validate_rationale
+from dynapix.teacher.writers.relational import RelationalWriter
 from tests.teacher.test_predicates import random_cases
 
 BOUNDS = RelationBounds()

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conf.schema import RelationBounds, TeacherConfig
-from data.records import Scene
-from teacher.narrator import write_rationale
-from teacher.predicates.vocabulary import choose_vocabulary
-from teacher.servers.responses import Response
-from teacher.sufficiency import find_predicted, measure_sufficiency
-from teacher.validation.claim_extraction import extract_claims
-from teacher.validation.grader import RationaleGrader
+from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.data.records import Scene
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary
+from dynapix.teacher.servers.responses import Response
+from dynapix.teacher.sufficiency import find_predicted, measure_sufficiency
+from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.grader import RationaleGrader
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 
@@ -35,7 +35,7 @@ def sufficiency_of(prediction: str, pixels: list[tuple[float, float]]) -> float:
 
 
 def _sufficiency(prediction: str, scene: Scene) -> float:
-    from teacher.predicates.extraction import extract_predicates
+    from dynapix.teacher.predicates.extraction import extract_predicates
 
     item = synthetic.item((60, 70, 80, 90))
     predicates = extract_predicates(item, scene, None, BOUNDS)

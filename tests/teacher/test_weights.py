@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from conf.schema import TeacherConfig
-from data.items.futures.contact import LEAD, collision_timings
-from data.oracle.contacts import next_collision
-from data.records import CONTACT, Candidate, Scene, SelectionItem
-from teacher.narrator import write_rationale
-from teacher.predicates.vocabulary import choose_vocabulary, describe_item
-from teacher.validation.claim_extraction import extract_claims
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.items.futures.contact import LEAD, collision_timings
+from dynapix.data.oracle.contacts import next_collision
+from dynapix.data.records import CONTACT, Candidate, Scene, SelectionItem
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary, describe_item
+from dynapix.teacher.validation.claim_extraction import extract_claims
 from tests.data.simulated import preset_world, simulate_scene
 
 WORLD = preset_world("above_masses")

@@ -19,7 +19,7 @@ def save_tiny_qwen3(folder: Path, texts: Iterable[str]) -> Path:
     import torch
     from transformers import Qwen3Config, Qwen3ForCausalLM
 
-    from models.tiny_qwen3_vl import build_processor
+    from dynapix.models.tiny_qwen3_vl import build_processor
 
     tokenizer = build_processor(texts, vocabulary=1024, image_size=32, patch=16).tokenizer
     tokenizer.chat_template = TEMPLATE

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from conf.schema import TeacherConfig
-from data.records import LETTERS, SelectionItem
-from data.store import Store
-from models.student.prompts import answer_line, build_response
-from teacher.narrator import write_match_lines, write_rationale
-from teacher.predicates.facts import REGIONS, RelationalPredicates
-from teacher.predicates.vocabulary import describe_item
-from train.rewards import REWARDS, judge_response, reward_form, reward_truth
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.records import LETTERS, SelectionItem
+from dynapix.data.store import Store
+from dynapix.models.student.prompts import answer_line, build_response
+from dynapix.teacher.narrator import write_match_lines, write_rationale
+from dynapix.teacher.predicates.facts import REGIONS, RelationalPredicates
+from dynapix.teacher.predicates.vocabulary import describe_item
+from dynapix.train.rewards import REWARDS, judge_response, reward_form, reward_truth
 
 TEACHER = TeacherConfig(name="template", predicates="relational")
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from conf.runs import Run
-from conf.schema import TrainConfig
-from models.compat import checkpointing_arguments
-from train.common.checkpoints import STATE
+from dynapix.conf.runs import Run
+from dynapix.conf.schema import TrainConfig
+from dynapix.models.compat import checkpointing_arguments
+from dynapix.train.common.checkpoints import STATE
 
 PROJECT = "dynapix"
 """Name of the project in experiment trackers."""

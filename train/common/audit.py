@@ -11,16 +11,16 @@ from typing import Any
 from torch import nn
 from transformers import PreTrainedTokenizerBase, ProcessorMixin
 
-from conf.errors import UserError
-from conf.schema import RetrieverConfig, StudentConfig
-from data.frames.frame_cache import FrameReader
-from data.records import RetrievalQuery
-from models.checks import check_widths
-from models.retriever.inputs import Retriever, model_inputs, preprocess
-from models.retriever.multi_vector import find_scored_tokens
-from models.student.collator import IGNORED, Collator
-from models.student.prompts import Sample
-from models.towers import check_parameter_counts, count_parameters
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import RetrieverConfig, StudentConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import RetrievalQuery
+from dynapix.models.checks import check_widths
+from dynapix.models.retriever.inputs import Retriever, model_inputs, preprocess
+from dynapix.models.retriever.multi_vector import find_scored_tokens
+from dynapix.models.student.collator import IGNORED, Collator
+from dynapix.models.student.prompts import Sample
+from dynapix.models.towers import check_parameter_counts, count_parameters
 
 
 def audit_student(

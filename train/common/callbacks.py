@@ -10,10 +10,10 @@ from typing import Any
 from transformers import ProgressCallback, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
-from conf.errors import UserError
-from conf.files import write_json_lines
-from train.common.curves import plot_curves
-from train.common.journal import ANSWERS, CURVES, JOURNAL, read_journal, read_lines
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_json_lines
+from dynapix.train.common.curves import plot_curves
+from dynapix.train.common.journal import ANSWERS, CURVES, JOURNAL, read_journal, read_lines
 
 NOT_REPRODUCIBLE = ("_runtime", "_per_second", "step_time", "total_flos", "train_loss")
 """Suffixes of logged names that the journal leaves out: timings, numbers of operations, and the

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 
-from conf.errors import UserError
+from dynapix.conf.errors import UserError
 
 log = logging.getLogger(__name__)
 

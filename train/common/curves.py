@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from data.checks.figures import COLORS, DPI, create_figure
+from dynapix.data.checks.figures import COLORS, DPI, create_figure
 
 MANY_PANELS, LOW_DPI = 8, 60
 """A figure with more panels than this has fewer dots per inch."""

@@ -7,8 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from conf.errors import UserError
-from data.store import Store
+from dynapix.conf.errors import UserError
+from dynapix.data.store import Store
 
 HELD_OUT_SHARE = 0.1
 """Share of the training scenes that are held out."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from conf.files import read_json_lines
-from conf.multirun.table import AT_START_SUFFIX
+from dynapix.conf.files import read_json_lines
+from dynapix.conf.multirun.table import AT_START_SUFFIX
 
 JOURNAL = "metrics.jsonl"
 ANSWERS = "samples.jsonl"

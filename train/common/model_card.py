@@ -9,17 +9,17 @@ import yaml
 from huggingface_hub import ModelCard, ModelCardData, try_to_load_from_cache
 from transformers import Qwen3VLProcessor
 
-from conf.files import read_json, read_json_if_valid
-from conf.multirun.table import AT_START_SUFFIX
-from conf.runs import Run
-from conf.schema import ContrastiveCommand, SftCommand
-from models.checks import ADAPTER_CONFIG
-from models.fingerprints import is_hub_model
-from models.resolved_settings import read_resolved
-from models.student.chat_format import TIMED_PROCESSORS
-from models.student.prompts import choose_instruction, write_time
-from models.trained_runs import modes_of_regime
-from train.common.journal import BEST_STEP
+from dynapix.conf.files import read_json, read_json_if_valid
+from dynapix.conf.multirun.table import AT_START_SUFFIX
+from dynapix.conf.runs import Run
+from dynapix.conf.schema import ContrastiveCommand, SftCommand
+from dynapix.models.checks import ADAPTER_CONFIG
+from dynapix.models.fingerprints import is_hub_model
+from dynapix.models.resolved_settings import read_resolved
+from dynapix.models.student.chat_format import TIMED_PROCESSORS
+from dynapix.models.student.prompts import choose_instruction, write_time
+from dynapix.models.trained_runs import modes_of_regime
+from dynapix.train.common.journal import BEST_STEP
 
 CARD = "README.md"
 TIMES = {

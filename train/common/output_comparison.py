@@ -8,10 +8,10 @@ from pathlib import Path
 
 import torch
 
-from conf.errors import UserError
-from conf.schema import BenchmarkConfig
-from data.build import ensure_benchmark
-from data.store import Store
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import BenchmarkConfig
+from dynapix.data.build import ensure_benchmark
+from dynapix.data.store import Store
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from transformers import PrinterCallback, ProgressCallback, Trainer
 from transformers.trainer_callback import TrainerState
 
-from conf.errors import UserError
-from conf.runs import Run, rank, run_id
-from models.distributed import is_sharded
-from models.memory import explain_out_of_memory
-from train.common.arguments import PROJECT
-from train.common.callbacks import BestCheckpointCallback, JournalCallback, MetricsBar
-from train.common.checkpoints import STATE, check_best_checkpoint
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import Run, rank, run_id
+from dynapix.models.distributed import is_sharded
+from dynapix.models.memory import explain_out_of_memory
+from dynapix.train.common.arguments import PROJECT
+from dynapix.train.common.callbacks import BestCheckpointCallback, JournalCallback, MetricsBar
+from dynapix.train.common.checkpoints import STATE, check_best_checkpoint
 
 log = logging.getLogger(__name__)
 

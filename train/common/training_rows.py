@@ -25,17 +25,17 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from conf.files import write_bytes
-from conf.schema import ExportCommand
-from data.checks.queries import read_queries
-from data.frames.frame_cache import FrameReader, encode_png
-from data.publish.folders import Shard, describe_file, write_folder
-from data.records import RetrievalQuery
-from data.store import Store
-from models.retriever.inputs import query_messages
-from models.student.prompts import Sample, show_frames_as_images
-from teacher.narrate import ensure_rationales
-from train.student.dataset import SupervisedItem, supervised_items
+from dynapix.conf.files import write_bytes
+from dynapix.conf.schema import ExportCommand
+from dynapix.data.checks.queries import read_queries
+from dynapix.data.frames.frame_cache import FrameReader, encode_png
+from dynapix.data.publish.folders import Shard, describe_file, write_folder
+from dynapix.data.records import RetrievalQuery
+from dynapix.data.store import Store
+from dynapix.models.retriever.inputs import query_messages
+from dynapix.models.student.prompts import Sample, show_frames_as_images
+from dynapix.teacher.narrate import ensure_rationales
+from dynapix.train.student.dataset import SupervisedItem, supervised_items
 
 IMAGES = "images"
 ROWS_FILES = {

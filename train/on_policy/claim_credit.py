@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from transformers import PreTrainedTokenizerBase
 
-from train.rewards import JudgedResponse, credit_claims
+from dynapix.train.rewards import JudgedResponse, credit_claims
 
 
 def credit_tokens(

@@ -12,23 +12,23 @@ import yaml
 from torch import nn
 from transformers import ProcessorMixin, Trainer
 
-from conf.errors import UserError
-from conf.files import write_text
-from conf.runs import Run, rank
-from conf.schema import DistillCommand, ReinforceCommand, SftCommand
-from models import loading
-from models.distributed import is_sharded, main_first, rank_device
-from models.layers.fast_layers import use_fast_layers
-from models.resolved_settings import check_base, resolve_run
-from models.trained_runs import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_text
+from dynapix.conf.runs import Run, rank
+from dynapix.conf.schema import DistillCommand, ReinforceCommand, SftCommand
+from dynapix.models import loading
+from dynapix.models.distributed import is_sharded, main_first, rank_device
+from dynapix.models.layers.fast_layers import use_fast_layers
+from dynapix.models.resolved_settings import check_base, resolve_run
+from dynapix.models.trained_runs import (
     STUDENT_SETTINGS,
     check_sees_frames,
     product_folder,
     read_trained_settings,
 )
-from train.common.journal import run_metrics
-from train.common.model_card import write_run_card
-from train.common.training_loop import run_training
+from dynapix.train.common.journal import run_metrics
+from dynapix.train.common.model_card import write_run_card
+from dynapix.train.common.training_loop import run_training
 
 log = logging.getLogger(__name__)
 

@@ -18,25 +18,31 @@ import torch
 from torch import Tensor, nn
 from transformers import ProcessorMixin
 
-from conf.runs import Run, world_size
-from conf.schema import DistillCommand, SftCommand
-from models.student.answer_parser import parse_choice
-from models.student.collator import IGNORED, Collator, append_response, letter_ids, make_batch
-from models.student.prompts import Sample
-from models.student.responses import GeneratedText
-from train.common.audit import audit_student
-from train.common.callbacks import EpochCallback
-from train.on_policy.mismatch import Mismatch
-from train.on_policy.paired_prompts import PairedPrompts
-from train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
-from train.on_policy.served_sampling import build_sampler
-from train.on_policy.teachers import Teacher
-from train.student.held_out_answers import HeldOutAnswers
-from train.student.lazy_samples import StudentDataset
-from train.student.length_sampler import LengthSampler
-from train.student.metrics import LetterAccuracy
-from train.student.trainer import StudentTrainer, TrainerCollator, token_mean
-from train.student.trainer_setup import student_arguments
+from dynapix.conf.runs import Run, world_size
+from dynapix.conf.schema import DistillCommand, SftCommand
+from dynapix.models.student.answer_parser import parse_choice
+from dynapix.models.student.collator import (
+    IGNORED,
+    Collator,
+    append_response,
+    letter_ids,
+    make_batch,
+)
+from dynapix.models.student.prompts import Sample
+from dynapix.models.student.responses import GeneratedText
+from dynapix.train.common.audit import audit_student
+from dynapix.train.common.callbacks import EpochCallback
+from dynapix.train.on_policy.mismatch import Mismatch
+from dynapix.train.on_policy.paired_prompts import PairedPrompts
+from dynapix.train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
+from dynapix.train.on_policy.served_sampling import build_sampler
+from dynapix.train.on_policy.teachers import Teacher
+from dynapix.train.student.held_out_answers import HeldOutAnswers
+from dynapix.train.student.lazy_samples import StudentDataset
+from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.metrics import LetterAccuracy
+from dynapix.train.student.trainer import StudentTrainer, TrainerCollator, token_mean
+from dynapix.train.student.trainer_setup import student_arguments
 
 log = logging.getLogger(__name__)
 

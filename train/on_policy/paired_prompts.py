@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from conf.schema import DistillCommand, SftCommand
-from data.frames.frame_cache import FrameReader
-from data.records import Rationale
-from data.store import Store
-from models.student.prompts import Sample
-from train.common.held_out import check_not_empty
-from train.student.dataset import SupervisedItem, split_items, supervised_items
-from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
+from dynapix.conf.schema import DistillCommand, SftCommand
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import Rationale
+from dynapix.data.store import Store
+from dynapix.models.student.prompts import Sample
+from dynapix.train.common.held_out import check_not_empty
+from dynapix.train.student.dataset import SupervisedItem, split_items, supervised_items
+from dynapix.train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
 
 
 @dataclass(frozen=True)

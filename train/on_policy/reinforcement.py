@@ -27,28 +27,28 @@ from transformers import ProcessorMixin
 from trl import GRPOConfig, GRPOTrainer
 from trl.trainer.utils import RepeatSampler
 
-from conf.errors import UserError
-from conf.runs import Run
-from conf.schema import ReinforceCommand, ReinforceTrainConfig, SftCommand, StudentConfig
-from data.frames.frame_cache import FrameReader
-from data.parallel import batched
-from data.records import SelectionItem
-from data.store import Store
-from models.distributed import split_batch
-from models.student.collator import pad
-from models.student.prompts import Sample, selection_sample
-from teacher.predicates.facts import RelationalPredicates
-from teacher.predicates.vocabulary import describe_item
-from train.common.arguments import common_arguments
-from train.common.callbacks import EpochCallback
-from train.common.held_out import check_not_empty
-from train.on_policy.claim_credit import credit_tokens
-from train.on_policy.mismatch import Mismatch
-from train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
-from train.on_policy.served_sampling import build_sampler
-from train.rewards import REWARDS, JudgedResponse, judge_response
-from train.student.dataset import split_items
-from train.student.lazy_samples import seeded_rng
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import Run
+from dynapix.conf.schema import ReinforceCommand, ReinforceTrainConfig, SftCommand, StudentConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.parallel import batched
+from dynapix.data.records import SelectionItem
+from dynapix.data.store import Store
+from dynapix.models.distributed import split_batch
+from dynapix.models.student.collator import pad
+from dynapix.models.student.prompts import Sample, selection_sample
+from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.predicates.vocabulary import describe_item
+from dynapix.train.common.arguments import common_arguments
+from dynapix.train.common.callbacks import EpochCallback
+from dynapix.train.common.held_out import check_not_empty
+from dynapix.train.on_policy.claim_credit import credit_tokens
+from dynapix.train.on_policy.mismatch import Mismatch
+from dynapix.train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
+from dynapix.train.on_policy.served_sampling import build_sampler
+from dynapix.train.rewards import REWARDS, JudgedResponse, judge_response
+from dynapix.train.student.dataset import split_items
+from dynapix.train.student.lazy_samples import seeded_rng
 
 PROMPT = "encoded"
 """Key of the encoded prompt in a row of the dataset."""

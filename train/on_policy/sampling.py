@@ -11,14 +11,14 @@ from torch import Tensor, nn
 from torch.nn.functional import log_softmax
 from transformers import ProcessorMixin, SuppressTokensLogitsProcessor
 
-from conf.errors import UserError
-from conf.schema import DistillTrainConfig, ReinforceTrainConfig, StudentConfig
-from data.parallel import batched
-from models.memory import explain_out_of_memory
-from models.student.collator import Encoded, encode, pad
-from models.student.generation import GumbelNoise, generate, sampling_processors
-from models.student.prompts import Sample
-from models.student.responses import GeneratedText
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import DistillTrainConfig, ReinforceTrainConfig, StudentConfig
+from dynapix.data.parallel import batched
+from dynapix.models.memory import explain_out_of_memory
+from dynapix.models.student.collator import Encoded, encode, pad
+from dynapix.models.student.generation import GumbelNoise, generate, sampling_processors
+from dynapix.models.student.prompts import Sample
+from dynapix.models.student.responses import GeneratedText
 
 MAX_UNPARSED = 64
 """Number of consecutive responses without an answer after which a run stops."""

@@ -14,27 +14,27 @@ import peft
 from torch import nn
 from transformers import ProcessorMixin
 
-from conf.errors import UserError
-from conf.runs import rank
-from conf.schema import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import rank
+from dynapix.conf.schema import (
     DistillTrainConfig,
     ReinforceTrainConfig,
     SamplingServerConfig,
     StudentConfig,
 )
-from models.distributed import main_first
-from models.student.chat_format import takes_clips
-from models.student.chat_requests import (
+from dynapix.models.distributed import main_first
+from dynapix.models.student.chat_format import takes_clips
+from dynapix.models.student.chat_requests import (
     build_messages,
     find_difference,
     qwen_fields,
     sampling_fields,
 )
-from models.student.prompts import show_frames_as_images
-from models.student.responses import GeneratedText
-from teacher.servers.pool import NoResponseError, ServerPool, run_limited
-from teacher.servers.responses import TRUNCATED, Response
-from train.on_policy.sampling import EncodedPrompt, ResponseSampler
+from dynapix.models.student.prompts import show_frames_as_images
+from dynapix.models.student.responses import GeneratedText
+from dynapix.teacher.servers.pool import NoResponseError, ServerPool, run_limited
+from dynapix.teacher.servers.responses import TRUNCATED, Response
+from dynapix.train.on_policy.sampling import EncodedPrompt, ResponseSampler
 
 ADAPTER_FOLDER = "sampled_adapters"
 """Folder of a run that contains the adapters of the current step."""

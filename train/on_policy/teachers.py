@@ -12,16 +12,16 @@ from torch import Tensor, nn
 from torch.nn.functional import log_softmax
 from transformers import PreTrainedTokenizerBase, ProcessorMixin
 
-from conf.errors import UserError
-from conf.schema import DistillCommand, SftCommand, TeacherServerConfig
-from models import loading
-from models.distributed import rank_device
-from models.resolved_settings import check_base
-from models.student.collator import IGNORED, Collator, Encoded, encode
-from models.student.prompts import Sample
-from models.trained_runs import product_folder, read_trained_settings
-from teacher.servers.pool import NoResponseError, ServerPool, run_limited
-from train.on_policy.divergence import estimate_divergence, measure_divergence
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import DistillCommand, SftCommand, TeacherServerConfig
+from dynapix.models import loading
+from dynapix.models.distributed import rank_device
+from dynapix.models.resolved_settings import check_base
+from dynapix.models.student.collator import IGNORED, Collator, Encoded, encode
+from dynapix.models.student.prompts import Sample
+from dynapix.models.trained_runs import product_folder, read_trained_settings
+from dynapix.teacher.servers.pool import NoResponseError, ServerPool, run_limited
+from dynapix.train.on_policy.divergence import estimate_divergence, measure_divergence
 
 PARTIAL_CHARACTER = "\N{REPLACEMENT CHARACTER}"
 """What a tokenizer decodes a token to that is a part of a character."""

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from sentence_transformers.base.sampler import DefaultBatchSampler
 
-from conf.errors import UserError
-from conf.schema import ContrastiveTrainConfig
-from data.checks.queries import check_training, read_queries
-from data.records import FrameRef, RetrievalQuery
-from data.store import Store
-from train.common.held_out import check_not_empty, held_out_scenes, shuffled
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import ContrastiveTrainConfig
+from dynapix.data.checks.queries import check_training, read_queries
+from dynapix.data.records import FrameRef, RetrievalQuery
+from dynapix.data.store import Store
+from dynapix.train.common.held_out import check_not_empty, held_out_scenes, shuffled
 
 
 def read_pools(store: Store, pools: Sequence[str]) -> list[RetrievalQuery]:

@@ -8,12 +8,12 @@ from operator import attrgetter
 import torch
 from sentence_transformers.base.evaluation import BaseEvaluator
 
-from conf.schema import RetrieverConfig
-from data.frames.frame_cache import FrameReader
-from data.items.database import UniqueFrames
-from data.records import FrameRef, RetrievalQuery
-from data.store import Store
-from models.retriever.inputs import Retriever, embed
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.items.database import UniqueFrames
+from dynapix.data.records import FrameRef, RetrievalQuery
+from dynapix.data.store import Store
+from dynapix.models.retriever.inputs import Retriever, embed
 
 FRAME_STEP = 6
 """Interval, in frames, between the frames of a scene that are considered for the database."""

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from accelerate.utils import send_to_device
 
-from conf.schema import RetrieverConfig
-from data.frames.frame_cache import FrameReader
-from models.compat import encode_images, encoder_outputs
-from models.retriever.inputs import QueryOrFrame, Retriever, model_inputs, preprocess
-from models.student.collator import MEDIA
+from dynapix.conf.schema import RetrieverConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.models.compat import encode_images, encoder_outputs
+from dynapix.models.retriever.inputs import QueryOrFrame, Retriever, model_inputs, preprocess
+from dynapix.models.student.collator import MEDIA
 
 log = logging.getLogger(__name__)
 

@@ -27,10 +27,10 @@ from sentence_transformers.util.similarity import maxsim
 from torch import nn
 from torch.nn.functional import cross_entropy, normalize
 
-from conf.runs import rank, world_size
-from data.records import FrameRef
-from models.retriever.inputs import QueryOrFrame, Retriever, check_finite, forward
-from train.retriever.inputs import RetrieverInputs
+from dynapix.conf.runs import rank, world_size
+from dynapix.data.records import FrameRef
+from dynapix.models.retriever.inputs import QueryOrFrame, Retriever, check_finite, forward
+from dynapix.train.retriever.inputs import RetrieverInputs
 
 In = TypeVar("In")
 Out = TypeVar("Out")

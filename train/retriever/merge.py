@@ -7,14 +7,14 @@ from pathlib import Path
 
 from torch.nn.utils.rnn import pad_sequence
 
-from conf.schema import ContrastiveCommand, LoraConfig
-from data.frames.frame_cache import FrameReader
-from data.records import RetrievalQuery
-from models import compat, loading
-from models.retriever.embedder import load_head, load_merged, load_retriever, load_trained
-from models.retriever.inputs import Retriever, embed
-from train.common.output_comparison import ModelOutputs, require_benchmark
-from train.retriever.batches import split_queries
+from dynapix.conf.schema import ContrastiveCommand, LoraConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import RetrievalQuery
+from dynapix.models import compat, loading
+from dynapix.models.retriever.embedder import load_head, load_merged, load_retriever, load_trained
+from dynapix.models.retriever.inputs import Retriever, embed
+from dynapix.train.common.output_comparison import ModelOutputs, require_benchmark
+from dynapix.train.retriever.batches import split_queries
 
 MAX_QUERIES = 64
 """Maximum number of held-out queries. Each is scored against the targets of all these queries."""

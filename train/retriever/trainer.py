@@ -17,10 +17,10 @@ from sentence_transformers.sentence_transformer.data_collator import (
     SentenceTransformerDataCollator,
 )
 
-from models.checks import ADAPTER_WEIGHTS
-from models.retriever.embedder import load_adapters
-from models.retriever.inputs import QueryOrFrame
-from train.retriever.batches import QueryBatchSampler
+from dynapix.models.checks import ADAPTER_WEIGHTS
+from dynapix.models.retriever.embedder import load_adapters
+from dynapix.models.retriever.inputs import QueryOrFrame
+from dynapix.train.retriever.batches import QueryBatchSampler
 
 NUMBER = "query"
 """Name of the only column of the training dataset: the number of a query."""

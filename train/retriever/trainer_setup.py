@@ -10,22 +10,22 @@ from sentence_transformers import (
     SentenceTransformerTrainingArguments,
 )
 
-from conf.errors import UserError
-from conf.runs import Run, world_size
-from conf.schema import ContrastiveCommand, ContrastiveTrainConfig, RetrieverConfig
-from data.frames.frame_cache import FrameReader
-from data.records import RetrievalQuery
-from data.store import Store
-from models.retriever.embedder import longest_query
-from models.retriever.inputs import Retriever, query_form
-from train.common.arguments import common_arguments
-from train.common.audit import audit_retriever
-from train.common.callbacks import EpochCallback
-from train.retriever.batches import QueryBatchSampler, batch_columns
-from train.retriever.evaluator import HeldOutEvaluator, build_database
-from train.retriever.inputs import RetrieverInputs
-from train.retriever.loss import RankingLoss
-from train.retriever.trainer import (
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import Run, world_size
+from dynapix.conf.schema import ContrastiveCommand, ContrastiveTrainConfig, RetrieverConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import RetrievalQuery
+from dynapix.data.store import Store
+from dynapix.models.retriever.embedder import longest_query
+from dynapix.models.retriever.inputs import Retriever, query_form
+from dynapix.train.common.arguments import common_arguments
+from dynapix.train.common.audit import audit_retriever
+from dynapix.train.common.callbacks import EpochCallback
+from dynapix.train.retriever.batches import QueryBatchSampler, batch_columns
+from dynapix.train.retriever.evaluator import HeldOutEvaluator, build_database
+from dynapix.train.retriever.inputs import RetrieverInputs
+from dynapix.train.retriever.loss import RankingLoss
+from dynapix.train.retriever.trainer import (
     IndexCollator,
     MultiVectorTrainer,
     RetrieverTrainer,

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from conf.schema import SftCommand, TeacherConfig
-from data.frames.frame_cache import FrameReader
-from data.records import LETTERS, Rationale, SelectionItem, original_scene_id
-from data.store import Store
-from models.student.prompts import (
+from dynapix.conf.schema import SftCommand, TeacherConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import LETTERS, Rationale, SelectionItem, original_scene_id
+from dynapix.data.store import Store
+from dynapix.models.student.prompts import (
     MODES,
     Sample,
     answer_line,
@@ -21,12 +21,12 @@ from models.student.prompts import (
     list_timestamps,
     selection_sample,
 )
-from teacher.candidate_letters import relabel_text, reorder_candidates
-from teacher.narrator import write_facts, write_match_lines
-from teacher.predicates.grounding import Grounding
-from teacher.predicates.vocabulary import choose_vocabulary
-from train.common.held_out import check_not_empty, held_out_scenes, shuffled
-from train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
+from dynapix.teacher.candidate_letters import relabel_text, reorder_candidates
+from dynapix.teacher.narrator import write_facts, write_match_lines
+from dynapix.teacher.predicates.grounding import Grounding
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary
+from dynapix.train.common.held_out import check_not_empty, held_out_scenes, shuffled
+from dynapix.train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,18 @@ from typing import Any
 from torch import nn
 from transformers import ProcessorMixin
 
-from conf.runs import rank
-from conf.schema import StudentConfig, StudentTrainConfig
-from data.parallel import batched
-from models.distributed import is_sharded, map_over_ranks
-from models.memory import explain_out_of_memory
-from models.student.answer_parser import parse_choice
-from models.student.collator import Collator
-from models.student.generation import generate
-from models.student.prompts import Sample
-from models.student.responses import GeneratedText, response_token_limit
-from train.common.journal import ANSWERS
-from train.student.lazy_samples import StudentDataset
+from dynapix.conf.runs import rank
+from dynapix.conf.schema import StudentConfig, StudentTrainConfig
+from dynapix.data.parallel import batched
+from dynapix.models.distributed import is_sharded, map_over_ranks
+from dynapix.models.memory import explain_out_of_memory
+from dynapix.models.student.answer_parser import parse_choice
+from dynapix.models.student.collator import Collator
+from dynapix.models.student.generation import generate
+from dynapix.models.student.prompts import Sample
+from dynapix.models.student.responses import GeneratedText, response_token_limit
+from dynapix.train.common.journal import ANSWERS
+from dynapix.train.student.lazy_samples import StudentDataset
 
 log = logging.getLogger(__name__)
 

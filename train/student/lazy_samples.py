@@ -10,8 +10,8 @@ import numpy as np
 from torch.utils.data import Dataset
 from transformers import ProcessorMixin
 
-from models.student.collator import encode
-from models.student.prompts import Sample, build_sample
+from dynapix.models.student.collator import encode
+from dynapix.models.student.prompts import Sample, build_sample
 
 LABEL_TOKENS = 6
 """Number of text tokens before each image or pair of video frames."""

@@ -8,15 +8,15 @@ from pathlib import Path
 import torch
 from transformers import ProcessorMixin
 
-from conf.errors import UserError
-from conf.schema import SftCommand
-from models import compat, loading
-from models.student.collator import Collator, letter_ids
-from teacher.narrate import JOURNAL_FILE, ensure_rationales
-from train.common.output_comparison import ModelOutputs, require_benchmark
-from train.student.dataset import load_datasets
-from train.student.lazy_samples import StudentDataset
-from train.student.metrics import LetterAccuracy
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import SftCommand
+from dynapix.models import compat, loading
+from dynapix.models.student.collator import Collator, letter_ids
+from dynapix.teacher.narrate import JOURNAL_FILE, ensure_rationales
+from dynapix.train.common.output_comparison import ModelOutputs, require_benchmark
+from dynapix.train.student.dataset import load_datasets
+from dynapix.train.student.lazy_samples import StudentDataset
+from dynapix.train.student.metrics import LetterAccuracy
 
 MAX_SAMPLES = 16
 """Number of validation samples per mode that are compared; at 8B, their logits take 3 GB."""

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from transformers import EvalPrediction
 
-from models.student.collator import IGNORED
-from train.student.lazy_samples import StudentDataset
+from dynapix.models.student.collator import IGNORED
+from dynapix.train.student.lazy_samples import StudentDataset
 
 
 class LetterAccuracy:

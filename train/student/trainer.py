@@ -20,14 +20,14 @@ from torch.nn.functional import cross_entropy
 from torch.utils.data import DataLoader, Sampler
 from transformers import EvalPrediction, Trainer
 
-from conf.errors import UserError
-from conf.files import write_json
-from conf.runs import rank
-from models.student.collator import IGNORED, Collator
-from models.student.prompts import Sample
-from train.student.held_out_answers import HeldOutAnswers
-from train.student.metrics import LetterAccuracy
-from train.student.vision_cache import PAIRS, VisionCache, pair_digests
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_json
+from dynapix.conf.runs import rank
+from dynapix.models.student.collator import IGNORED, Collator
+from dynapix.models.student.prompts import Sample
+from dynapix.train.student.held_out_answers import HeldOutAnswers
+from dynapix.train.student.metrics import LetterAccuracy
+from dynapix.train.student.vision_cache import PAIRS, VisionCache, pair_digests
 
 STOPPED = "stopped.json"
 """File with the samples of a non-finite loss or gradient; ranks above 0 prefix their number."""

@@ -9,22 +9,22 @@ from pathlib import Path
 from torch import nn
 from transformers import ProcessorMixin, TrainingArguments
 
-from conf.runs import Run, local_world_size, world_size
-from conf.schema import SftCommand, StudentTrainConfig
-from models.distributed import split_batch
-from models.layers.shared_prompts import shares_prompts
-from models.memory import available_cpu_bytes
-from models.student.chat_format import takes_clips
-from models.student.collator import Collator, letter_ids
-from train.common.arguments import common_arguments
-from train.common.audit import audit_student
-from train.common.callbacks import EpochCallback
-from train.student.held_out_answers import HeldOutAnswers
-from train.student.lazy_samples import StudentDataset
-from train.student.length_sampler import LengthSampler
-from train.student.metrics import LetterAccuracy
-from train.student.trainer import LOSSES, StudentTrainer, TrainerCollator
-from train.student.vision_cache import VisionCache
+from dynapix.conf.runs import Run, local_world_size, world_size
+from dynapix.conf.schema import SftCommand, StudentTrainConfig
+from dynapix.models.distributed import split_batch
+from dynapix.models.layers.shared_prompts import shares_prompts
+from dynapix.models.memory import available_cpu_bytes
+from dynapix.models.student.chat_format import takes_clips
+from dynapix.models.student.collator import Collator, letter_ids
+from dynapix.train.common.arguments import common_arguments
+from dynapix.train.common.audit import audit_student
+from dynapix.train.common.callbacks import EpochCallback
+from dynapix.train.student.held_out_answers import HeldOutAnswers
+from dynapix.train.student.lazy_samples import StudentDataset
+from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.metrics import LetterAccuracy
+from dynapix.train.student.trainer import LOSSES, StudentTrainer, TrainerCollator
+from dynapix.train.student.vision_cache import VisionCache
 
 log = logging.getLogger(__name__)
 

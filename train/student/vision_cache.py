@@ -16,11 +16,11 @@ import peft
 import torch
 from torch import nn
 
-from conf.errors import UserError
-from models.compat import encode_images, encoder_outputs
-from models.distributed import is_sharded
-from models.student.collator import MEDIA
-from models.student.prompts import Sample
+from dynapix.conf.errors import UserError
+from dynapix.models.compat import encode_images, encoder_outputs
+from dynapix.models.distributed import is_sharded
+from dynapix.models.student.collator import MEDIA
+from dynapix.models.student.prompts import Sample
 
 PAIRS = "frame_pairs"
 """Name of the digests of a batch's frame pairs: those of its images, then those of its clips."""

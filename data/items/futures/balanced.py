@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from conf.schema import WorldConfig
-from data.items.futures.simulation import (
+from dynapix.conf.schema import WorldConfig
+from dynapix.data.items.futures.simulation import (
     Group,
     alternative_scene,
     branches_of_velocities,
@@ -32,11 +32,11 @@ from data.items.futures.simulation import (
     scene_with_states,
     simulate_futures,
 )
-from data.items.pickers import DistractorPicker, Recipe, Timing, new_item
-from data.items.scores import Balance, CandidateFrames, render_small
-from data.oracle.displacement import frame_displacements
-from data.records import ALTERNATIVE, Candidate, Collision, Scene, SelectionItem
-from data.store import save_scene, scene_path
+from dynapix.data.items.pickers import DistractorPicker, Recipe, Timing, new_item
+from dynapix.data.items.scores import Balance, CandidateFrames, render_small
+from dynapix.data.oracle.displacement import frame_displacements
+from dynapix.data.records import ALTERNATIVE, Candidate, Collision, Scene, SelectionItem
+from dynapix.data.store import save_scene, scene_path
 
 FUTURES = {"event": 10, "time": 12, "window": 12}
 """Number of alternative futures from which the distractors of an item are chosen, by family."""

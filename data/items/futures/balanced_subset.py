@@ -19,7 +19,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data.items.scores import compare_candidates, rank_excess
+from dynapix.data.items.scores import compare_candidates, rank_excess
 
 RESERVE = 1.15
 """Factor on the quota of a balanced cell: the number of items from which its items are chosen."""

@@ -22,28 +22,34 @@ from itertools import combinations
 
 import numpy as np
 
-from data.items.futures.balanced import (
+from dynapix.data.items.futures.balanced import (
     TARGET,
     TRIES,
     BalancedPicker,
     distinct_choices,
     least_displacement,
 )
-from data.items.futures.simulation import (
+from dynapix.data.items.futures.simulation import (
     future_frames,
     own_motion,
     scene_states,
     simulate_futures,
     turn_velocity,
 )
-from data.items.pickers import Recipe, Timing, new_item
-from data.items.recipes import EVENT_QUESTION
-from data.items.scores import COLLISION_SCORES, SCORES, Balance, CandidateFrames, collision_scores
-from data.oracle.contacts import is_next, next_collision, touching_pairs
-from data.oracle.displacement import frame_displacements, visible_positions
-from data.records import ALTERNATIVE, CONTACT, GHOST, Candidate, Scene, SelectionItem
-from data.sim.camera import Camera
-from data.sim.physics import Branch, Motion
+from dynapix.data.items.pickers import Recipe, Timing, new_item
+from dynapix.data.items.recipes import EVENT_QUESTION
+from dynapix.data.items.scores import (
+    COLLISION_SCORES,
+    SCORES,
+    Balance,
+    CandidateFrames,
+    collision_scores,
+)
+from dynapix.data.oracle.contacts import is_next, next_collision, touching_pairs
+from dynapix.data.oracle.displacement import frame_displacements, visible_positions
+from dynapix.data.records import ALTERNATIVE, CONTACT, GHOST, Candidate, Scene, SelectionItem
+from dynapix.data.sim.camera import Camera
+from dynapix.data.sim.physics import Branch, Motion
 
 CELLS = {"collision_gap10": 10, "collision_gap16": 16, "collision_gap26": 26}
 """Frames from the collision to the target, by subtype."""

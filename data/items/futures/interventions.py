@@ -19,17 +19,17 @@ from typing import Any
 
 import numpy as np
 
-from conf.schema import WorldConfig
-from conf.schema.benchmark import INTERVENTIONS
-from data.items.futures.balanced import distinct_choices, least_displacement
-from data.items.futures.contact import (
+from dynapix.conf.schema import WorldConfig
+from dynapix.conf.schema.benchmark import INTERVENTIONS
+from dynapix.data.items.futures.balanced import distinct_choices, least_displacement
+from dynapix.data.items.futures.contact import (
     DIRECTIONS,
     STRAY,
     ContactPicker,
     collision_timings,
     sample_outcomes,
 )
-from data.items.futures.simulation import (
+from dynapix.data.items.futures.simulation import (
     MAX_LOG_FACTOR,
     MOVING,
     future_frames,
@@ -38,12 +38,12 @@ from data.items.futures.simulation import (
     simulate_futures,
     turn_velocity,
 )
-from data.items.pickers import Recipe, Timing, new_item
-from data.items.recipes import EVENT_QUESTION, pair_key
-from data.items.scores import Balance
-from data.oracle.contacts import group_contacts, next_collision
-from data.oracle.displacement import frame_displacements
-from data.records import (
+from dynapix.data.items.pickers import Recipe, Timing, new_item
+from dynapix.data.items.recipes import EVENT_QUESTION, pair_key
+from dynapix.data.items.scores import Balance
+from dynapix.data.oracle.contacts import group_contacts, next_collision
+from dynapix.data.oracle.displacement import frame_displacements
+from dynapix.data.records import (
     ALTERNATIVE,
     GHOST,
     INTERVENTION,
@@ -52,8 +52,8 @@ from data.records import (
     Scene,
     SelectionItem,
 )
-from data.sim.camera import Camera
-from data.sim.physics import Branch, Motion
+from dynapix.data.sim.camera import Camera
+from dynapix.data.sim.physics import Branch, Motion
 
 CHANGES = {
     "absent": "the {} vanished",

@@ -12,12 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from conf.schema import WorldConfig
-from data.oracle.contacts import collisions_in
-from data.oracle.displacement import visible_positions
-from data.records import Scene
-from data.sim.physics import Branch, Motion, shared_simulator
-from data.sources.scenes import oracle_arrays
+from dynapix.conf.schema import WorldConfig
+from dynapix.data.oracle.contacts import collisions_in
+from dynapix.data.oracle.displacement import visible_positions
+from dynapix.data.records import Scene
+from dynapix.data.sim.physics import Branch, Motion, shared_simulator
+from dynapix.data.sources.scenes import oracle_arrays
 
 MOVING = 0.1
 """Speed (simulator units/s) above which an object counts as moving."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.checks.baselines import score_scene_alone
-from data.records import FrameRef
-from data.store import Store
+from dynapix.data.checks.baselines import score_scene_alone
+from dynapix.data.records import FrameRef
+from dynapix.data.store import Store
 
 
 def test_ranker_of_scenes_has_the_mean_of_random_orders(benchmark_store: Store) -> None:

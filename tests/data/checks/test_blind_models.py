@@ -7,18 +7,18 @@ import pytest
 import torch
 from PIL import Image
 
-from data.checks import blind_models
-from data.checks.blind_models import (
+from dynapix.data.checks import blind_models
+from dynapix.data.checks.blind_models import (
     BlindModel,
     encode_items,
     is_right,
     score_blind_models,
     train_model,
 )
-from data.checks.statistics import measure_shortcuts
-from data.frames.frame_cache import render_frames
-from data.items.scores import SCORES
-from data.store import Store
+from dynapix.data.checks.statistics import measure_shortcuts
+from dynapix.data.frames.frame_cache import render_frames
+from dynapix.data.items.scores import SCORES
+from dynapix.data.store import Store
 from tests.user_errors import raises_user_error
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from data.checks.intervals import SceneBootstrap
+from dynapix.data.checks.intervals import SceneBootstrap
 from tests.evaluation.metrics.reference import scene_interval
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from data.checks.intervals import Interval
-from data.checks.observer import (
+from dynapix.data.checks.intervals import Interval
+from dynapix.data.checks.observer import (
     DRAWS,
     ERRORS,
     EXTRAPOLATES,
@@ -23,17 +23,17 @@ from data.checks.observer import (
     observe_benchmark,
     observe_item,
 )
-from data.checks.observer_curve import (
+from dynapix.data.checks.observer_curve import (
     ObserverCurve,
     format_observers,
     observer_curves,
     plot_observers,
     summarize_observers,
 )
-from data.oracle.contacts import touching_pairs
-from data.parallel import Workers
-from data.records import SPLITS
-from data.store import Store, open_store
+from dynapix.data.oracle.contacts import touching_pairs
+from dynapix.data.parallel import Workers
+from dynapix.data.records import SPLITS
+from dynapix.data.store import Store, open_store
 from tests.user_errors import raises_user_error
 
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from conf.schema.benchmark import POOLS
-from data.checks.queries import check_test, check_training, read_queries
-from data.records import SPLITS, FrameRef
-from data.store import Store
+from dynapix.conf.schema.benchmark import POOLS
+from dynapix.data.checks.queries import check_test, check_training, read_queries
+from dynapix.data.records import SPLITS, FrameRef
+from dynapix.data.store import Store
 from tests.user_errors import raises_user_error
 
 

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from conf.entry import Run
-from conf.schema import ExportCommand, StatisticsCommand, WorldConfig
-from data import export, statistics
-from data.checks.baselines import score_baselines
-from data.checks.statistics import compute_statistics, format_statistics
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import ExportCommand, StatisticsCommand, WorldConfig
+from dynapix.data import export, statistics
+from dynapix.data.checks.baselines import score_baselines
+from dynapix.data.checks.statistics import compute_statistics, format_statistics
 from tests.teacher import synthetic
 
 STANDARD = {"config": {"simulator": "bullet", "world": asdict(WorldConfig())}}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.frames import frame_cache
-from data.frames.frame_cache import FrameReader, load_frames, render_frames, save_frames
+from dynapix.data.frames import frame_cache
+from dynapix.data.frames.frame_cache import FrameReader, load_frames, render_frames, save_frames
 
 
 def test_decoded_frames_are_bounded_for_any_access_pattern(micro_store, monkeypatch) -> None:

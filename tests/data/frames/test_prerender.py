@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from data.frames import prerender
-from data.frames.prerender import prerender_frames
-from data.parallel import Workers
-from data.store import FRAMES_FOLDER, Store, open_store
+from dynapix.data.frames import prerender
+from dynapix.data.frames.prerender import prerender_frames
+from dynapix.data.parallel import Workers
+from dynapix.data.store import FRAMES_FOLDER, Store, open_store
 
 
 def test_jobs_that_waited_for_one_build_render_its_frames_once(

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conf.compose import compose
-from conf.schema import (
+from dynapix.conf.compose import compose
+from dynapix.conf.schema import (
     BenchmarkConfig,
     BuildCommand,
     Quota,
@@ -19,22 +19,22 @@ from conf.schema import (
     SelectionConfig,
     WorldConfig,
 )
-from data.build import ensure_items
-from data.checks.counts import summarize_store
-from data.items.futures import balanced as balanced_items
-from data.items.futures.balanced_subset import choose_items
-from data.items.pickers import CellInputs, shuffle_candidates
-from data.items.recipes import TIME_CELLS, time_timings
-from data.items.scores import compare_item, order_target_first
-from data.oracle.displacement import cross_scene_displacement
-from data.parallel import Workers
-from data.records import ALTERNATIVE, SelectionItem, original_scene_id
-from data.sim.parts import world_boxes
-from data.sim.shapes import RADIUS, rotation_matrix
-from data.store import Store
-from teacher.predicates.extraction import extract_predicates
+from dynapix.data.build import ensure_items
+from dynapix.data.checks.counts import summarize_store
+from dynapix.data.items.futures import balanced as balanced_items
+from dynapix.data.items.futures.balanced_subset import choose_items
+from dynapix.data.items.pickers import CellInputs, shuffle_candidates
+from dynapix.data.items.recipes import TIME_CELLS, time_timings
+from dynapix.data.items.scores import compare_item, order_target_first
+from dynapix.data.oracle.displacement import cross_scene_displacement
+from dynapix.data.parallel import Workers
+from dynapix.data.records import ALTERNATIVE, SelectionItem, original_scene_id
+from dynapix.data.sim.parts import world_boxes
+from dynapix.data.sim.shapes import RADIUS, rotation_matrix
+from dynapix.data.store import Store
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.train.student.dataset import uses_only
 from tests.teacher import synthetic
-from train.student.dataset import uses_only
 
 QUOTAS = {"future_match_gap10": 2, "future_cross_gap10": 2, "contact_offset": 2}
 

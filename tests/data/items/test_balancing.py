@@ -6,9 +6,20 @@ from collections import Counter
 
 import numpy as np
 
-from data.checks.shortcuts import fit_logistic, score_logistic_model, score_simple_strategies
-from data.items.futures.balanced_subset import choose_items, item_deviations
-from data.items.scores import LIMIT, SCORES, TOLERANCE, Balance, compare_candidates, rank_shares
+from dynapix.data.checks.shortcuts import (
+    fit_logistic,
+    score_logistic_model,
+    score_simple_strategies,
+)
+from dynapix.data.items.futures.balanced_subset import choose_items, item_deviations
+from dynapix.data.items.scores import (
+    LIMIT,
+    SCORES,
+    TOLERANCE,
+    Balance,
+    compare_candidates,
+    rank_shares,
+)
 
 
 def rng() -> np.random.Generator:

@@ -10,13 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conf.compose import compose
-from conf.errors import UserError
-from conf.schema import BenchmarkConfig, BuildCommand, Quota, RetrievalTrackConfig, SelectionConfig
-from data.build import check_quota_names, empty_benchmark, ensure_items
-from data.checks.counts import summarize_store
-from data.checks.statistics import compute_statistics, format_statistics
-from data.items.futures.contact import (
+from dynapix.conf.compose import compose
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import (
+    BenchmarkConfig,
+    BuildCommand,
+    Quota,
+    RetrievalTrackConfig,
+    SelectionConfig,
+)
+from dynapix.data.build import check_quota_names, empty_benchmark, ensure_items
+from dynapix.data.checks.counts import summarize_store
+from dynapix.data.checks.statistics import compute_statistics, format_statistics
+from dynapix.data.items.futures.contact import (
     APART,
     CELLS,
     GHOST_SHARE,
@@ -28,15 +34,15 @@ from data.items.futures.contact import (
     sample_outcomes,
     share_of_quota,
 )
-from data.items.futures.simulation import scene_states, simulate_futures
-from data.items.pickers import fill_quota
-from data.items.scores import compare_item, rank_excess
-from data.oracle.contacts import collisions_in, next_collision, touching_pairs
-from data.oracle.displacement import cross_scene_displacement
-from data.parallel import Workers
-from data.records import CONTACT, GHOST, Scene, SelectionItem
-from data.sim.physics import Branch, Motion, shared_simulator
-from data.store import Store
+from dynapix.data.items.futures.simulation import scene_states, simulate_futures
+from dynapix.data.items.pickers import fill_quota
+from dynapix.data.items.scores import compare_item, rank_excess
+from dynapix.data.oracle.contacts import collisions_in, next_collision, touching_pairs
+from dynapix.data.oracle.displacement import cross_scene_displacement
+from dynapix.data.parallel import Workers
+from dynapix.data.records import CONTACT, GHOST, Scene, SelectionItem
+from dynapix.data.sim.physics import Branch, Motion, shared_simulator
+from dynapix.data.store import Store
 from tests.data.simulated import preset_world, simulate_scene
 
 WORLD = preset_world("above_masses")

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from conf.schema.benchmark import MATCHED_ANCHOR
-from data.items.controls import prefix_under_control
-from data.records import sample_prefix_frames
+from dynapix.conf.schema.benchmark import MATCHED_ANCHOR
+from dynapix.data.items.controls import prefix_under_control
+from dynapix.data.records import sample_prefix_frames
 
 SHARED_FIELDS = (
     "scene_id", "prefix_start", "prefix_stop", "target_frame", "event_frame", "candidates",

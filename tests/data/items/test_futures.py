@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data.items.futures.simulation import (
+from dynapix.data.items.futures.simulation import (
     MOVING,
     alternative_scene,
     branches_of_velocities,
@@ -16,8 +16,8 @@ from data.items.futures.simulation import (
     sample_velocities,
     simulate_futures,
 )
-from data.records import Scene
-from data.sim.physics import shared_simulator
+from dynapix.data.records import Scene
+from dynapix.data.sim.physics import shared_simulator
 from tests.data.simulated import CLEVRER, simulate_scene
 
 

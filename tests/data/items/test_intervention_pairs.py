@@ -9,23 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conf.schema import Quota
-from conf.schema.world import ByMaterial
-from data.items.controls import pair_items
-from data.items.futures.contact import collision_timings
-from data.items.futures.interventions import (
+from dynapix.conf.schema import Quota
+from dynapix.conf.schema.world import ByMaterial
+from dynapix.data.items.controls import pair_items
+from dynapix.data.items.futures.contact import collision_timings
+from dynapix.data.items.futures.interventions import (
     InterventionPicker,
     find_interventions,
     join_collisions,
     make_intervention_pair,
     make_intervention_recipe,
 )
-from data.items.futures.simulation import scene_states, simulate_futures
-from data.items.pickers import CellInputs, fill_quota
-from data.records import Candidate, Scene, SelectionItem
-from data.sim.physics import Branch, shared_simulator
-from data.store import load_scene, scene_path
-from evaluation.metrics.pairs import score_pairs
+from dynapix.data.items.futures.simulation import scene_states, simulate_futures
+from dynapix.data.items.pickers import CellInputs, fill_quota
+from dynapix.data.records import Candidate, Scene, SelectionItem
+from dynapix.data.sim.physics import Branch, shared_simulator
+from dynapix.data.store import load_scene, scene_path
+from dynapix.evaluation.metrics.pairs import score_pairs
 from tests.data.simulated import CLEVRER, simulate_scene
 
 MASSES = replace(
@@ -236,9 +236,9 @@ def test_guesses_get_the_stated_shares_of_pairs() -> None:
 
 
 def test_masses_of_a_world_are_checked_before_its_scenes_are_simulated() -> None:
-    from conf.compose import compose
-    from conf.errors import SettingsError
-    from conf.schema import BuildCommand
+    from dynapix.conf.compose import compose
+    from dynapix.conf.errors import SettingsError
+    from dynapix.conf.schema import BuildCommand
 
     overrides = ["benchmark=tiny_interventions", "world=above"]
     with pytest.raises(SettingsError, match=r"metal is not heavier than rubber.*world=masses"):

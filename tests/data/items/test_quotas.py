@@ -7,21 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from conf.compose import compose
-from conf.schema import (
+from dynapix.conf.compose import compose
+from dynapix.conf.schema import (
     BenchmarkConfig,
     BuildCommand,
     Quota,
     RetrievalTrackConfig,
     SelectionConfig,
 )
-from conf.schema.benchmark import divide_window_quotas
-from data.build import ensure_items
-from data.frames.frame_cache import FrameReader
-from data.parallel import Workers
-from data.records import original_scene_id
-from data.sources.scenes import scene_prefix, split_scenes
-from data.store import DATABASES
+from dynapix.conf.schema.benchmark import divide_window_quotas
+from dynapix.data.build import ensure_items
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.parallel import Workers
+from dynapix.data.records import original_scene_id
+from dynapix.data.sources.scenes import scene_prefix, split_scenes
+from dynapix.data.store import DATABASES
 
 
 def config(**selection) -> BenchmarkConfig:

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conf.schema import Quota
-from data.items.pickers import CellInputs, fill_quota
-from data.items.recipes import EVENT_QUESTION, TIME_QUESTION
-from data.items.transfer import CELLS as TRANSFER_CELLS
-from data.items.transfer import make_transfer_recipe
-from data.oracle.events import find_motion_onsets
-from data.records import Collision, Landing, Scene, SceneObject, SelectionItem
-from data.sources.validation import RecordError
+from dynapix.conf.schema import Quota
+from dynapix.data.items.pickers import CellInputs, fill_quota
+from dynapix.data.items.recipes import EVENT_QUESTION, TIME_QUESTION
+from dynapix.data.items.transfer import CELLS as TRANSFER_CELLS
+from dynapix.data.items.transfer import make_transfer_recipe
+from dynapix.data.oracle.events import find_motion_onsets
+from dynapix.data.records import Collision, Landing, Scene, SceneObject, SelectionItem
+from dynapix.data.sources.validation import RecordError
 
 MIN_DISPLACEMENT = 12.0
 SCENARIOS = ("Collide", "Drop", "Roll")

@@ -7,18 +7,18 @@ from itertools import combinations, pairwise
 
 import pytest
 
-from conf.schema import WorldConfig
-from data.items.pickers import Timing
-from data.items.queries import BUILDERS
-from data.items.recipes import EVENT_CELLS, MATCHED, make_recipe
-from data.items.transfer import make_transfer_recipe
-from data.oracle.contacts import first_collisions
-from data.records import FPS, Scene
-from data.sim.physics import Touching
-from data.sim.sampling import sample_scene
-from data.sources.scenes import record_scene
-from teacher.predicates.extraction import extract_facts
-from teacher.predicates.motion import describe_meeting, find_collision_courses
+from dynapix.conf.schema import WorldConfig
+from dynapix.data.items.pickers import Timing
+from dynapix.data.items.queries import BUILDERS
+from dynapix.data.items.recipes import EVENT_CELLS, MATCHED, make_recipe
+from dynapix.data.items.transfer import make_transfer_recipe
+from dynapix.data.oracle.contacts import first_collisions
+from dynapix.data.records import FPS, Scene
+from dynapix.data.sim.physics import Touching
+from dynapix.data.sim.sampling import sample_scene
+from dynapix.data.sources.scenes import record_scene
+from dynapix.teacher.predicates.extraction import extract_facts
+from dynapix.teacher.predicates.motion import describe_meeting, find_collision_courses
 from tests.data.oracle.test_random_worlds import random_world
 from tests.data.simulated import WORLDS, preset_world
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from conf.schema import WorldConfig
-from conf.schema.world import CameraConfig
-from data.records import Scene, SceneObject
-from data.render.bullet import OVERSAMPLING, BulletRenderer
-from data.sim.physics import Body, shared_simulator
-from data.sim.starts import Sample
-from data.sources.scenes import record_scene
+from dynapix.conf.schema import WorldConfig
+from dynapix.conf.schema.world import CameraConfig
+from dynapix.data.records import Scene, SceneObject
+from dynapix.data.render.bullet import OVERSAMPLING, BulletRenderer
+from dynapix.data.sim.physics import Body, shared_simulator
+from dynapix.data.sim.starts import Sample
+from dynapix.data.sources.scenes import record_scene
 from tests.data.oracle.test_random_worlds import random_world
 from tests.data.simulated import WORLDS, preset_world, simulate_scene
 

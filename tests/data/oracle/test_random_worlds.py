@@ -8,15 +8,15 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from conf.schema import PartConfig, PhysicsConfig, WorldConfig
-from conf.schema.world import ByMaterial, CameraConfig, ObjectsConfig, StartConfig
-from data.oracle import visibility
-from data.records import Scene, SceneObject
-from data.sim.parts import world_boxes
-from data.sim.physics import Body, shared_simulator
-from data.sim.sampling import sample_scene
-from data.sim.shapes import BOUNDING_RADIUS, CUBE_HALF, RADIUS, half_height, rotation_matrix
-from data.sources.scenes import record_scene, simulate_without
+from dynapix.conf.schema import PartConfig, PhysicsConfig, WorldConfig
+from dynapix.conf.schema.world import ByMaterial, CameraConfig, ObjectsConfig, StartConfig
+from dynapix.data.oracle import visibility
+from dynapix.data.records import Scene, SceneObject
+from dynapix.data.sim.parts import world_boxes
+from dynapix.data.sim.physics import Body, shared_simulator
+from dynapix.data.sim.sampling import sample_scene
+from dynapix.data.sim.shapes import BOUNDING_RADIUS, CUBE_HALF, RADIUS, half_height, rotation_matrix
+from dynapix.data.sources.scenes import record_scene, simulate_without
 from tests.data.simulated import CLEVRER, simulate_scene
 
 ROOM = {

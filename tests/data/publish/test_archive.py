@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import dynapix
-from data.publish.archive import write_archive
-from data.store import Store, with_checksum
+from dynapix.data.publish.archive import write_archive
+from dynapix.data.store import Store, with_checksum
 from tests.user_errors import raises_user_error
 
 

@@ -18,16 +18,22 @@ from datasets import load_dataset
 from huggingface_hub import DatasetCard
 from PIL import Image
 
-from conf.schema import TeacherConfig
-from conf.schema.benchmark import MATCHED_ANCHOR, POOLS
-from data.frames.frame_cache import FrameReader
-from data.publish import huggingface
-from data.publish.columns import DESCRIPTIONS, dataset_features
-from data.publish.huggingface import ensure_export, render_card
-from data.publish.leaderboard import CELL_WIDTH, EVAL_FILE, GAP
-from data.records import SPLITS, Rationale, RetrievalQuery, SelectionItem, sample_prefix_frames
-from data.store import Store
-from teacher.narrate import narrate_store
+from dynapix.conf.schema import TeacherConfig
+from dynapix.conf.schema.benchmark import MATCHED_ANCHOR, POOLS
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.publish import huggingface
+from dynapix.data.publish.columns import DESCRIPTIONS, dataset_features
+from dynapix.data.publish.huggingface import ensure_export, render_card
+from dynapix.data.publish.leaderboard import CELL_WIDTH, EVAL_FILE, GAP
+from dynapix.data.records import (
+    SPLITS,
+    Rationale,
+    RetrievalQuery,
+    SelectionItem,
+    sample_prefix_frames,
+)
+from dynapix.data.store import Store
+from dynapix.teacher.narrate import narrate_store
 from tests.user_errors import raises_user_error
 
 pytestmark = pytest.mark.slow

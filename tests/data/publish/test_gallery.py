@@ -8,11 +8,11 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from data.frames.frame_cache import FrameReader
-from data.publish.contact_sheets import SheetRows
-from data.publish.gallery import draw_sheets, render_page
-from data.records import LETTERS
-from data.store import Store
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.publish.contact_sheets import SheetRows
+from dynapix.data.publish.gallery import draw_sheets, render_page
+from dynapix.data.records import LETTERS
+from dynapix.data.store import Store
 
 pytestmark = pytest.mark.slow
 

@@ -15,15 +15,15 @@ from pathlib import Path
 
 import pytest
 
-from data.publish.huggingface import ensure_export
+from dynapix.data.publish.huggingface import ensure_export
 
 pytestmark = pytest.mark.slow
 REPOSITORY = "someone/moving-objects"
 UPLOAD = """
 import sys
 from pathlib import Path
-from conf.failures import report_failures
-from data.publish.hub import push_folder
+from dynapix.conf.failures import report_failures
+from dynapix.data.publish.hub import push_folder
 with report_failures():
     print(push_folder(Path(sys.argv[1]), sys.argv[2]))
 """

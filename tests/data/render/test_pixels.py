@@ -10,11 +10,11 @@ import pytest
 from PIL import Image
 from sklearn.neighbors import KNeighborsClassifier
 
-from data.oracle.displacement import frame_displacements, object_match_scores
-from data.records import COLORS, MATERIALS, SHAPES, Scene, SceneObject
-from data.render import get_renderer
-from data.render.bullet import BulletRenderer
-from data.sim.camera import Camera
+from dynapix.data.oracle.displacement import frame_displacements, object_match_scores
+from dynapix.data.records import COLORS, MATERIALS, SHAPES, Scene, SceneObject
+from dynapix.data.render import get_renderer
+from dynapix.data.render.bullet import BulletRenderer
+from dynapix.data.sim.camera import Camera
 from tests.data.simulated import CLEVRER, simulate_scene
 
 

@@ -9,14 +9,14 @@ import sys
 import numpy as np
 import pytest
 
-from conf.schema import PartConfig, PhysicsConfig, WorldConfig
-from conf.schema.world import ByMaterial, ObjectsConfig
-from data.oracle.contacts import group_contacts
-from data.records import FPS, Collision, Scene, SceneObject
-from data.sim.parts import part_box, surface_height
-from data.sim.physics import Body, Branch, has_repeated, shared_simulator
-from data.sim.sampling import sample_scene
-from data.sim.shapes import RADIUS
+from dynapix.conf.schema import PartConfig, PhysicsConfig, WorldConfig
+from dynapix.conf.schema.world import ByMaterial, ObjectsConfig
+from dynapix.data.oracle.contacts import group_contacts
+from dynapix.data.records import FPS, Collision, Scene, SceneObject
+from dynapix.data.sim.parts import part_box, surface_height
+from dynapix.data.sim.physics import Body, Branch, has_repeated, shared_simulator
+from dynapix.data.sim.sampling import sample_scene
+from dynapix.data.sim.shapes import RADIUS
 from tests.children import run_child
 from tests.data.simulated import CLEVRER, simulate_scene
 

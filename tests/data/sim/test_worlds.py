@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conf.compose import compose
-from conf.schema import (
+from dynapix.conf.compose import compose
+from dynapix.conf.schema import (
     BenchmarkConfig,
     BuildCommand,
     PartConfig,
@@ -20,30 +20,30 @@ from conf.schema import (
     SelectionConfig,
     WorldConfig,
 )
-from conf.schema.benchmark import SCENE_FPS, SCENE_FRAMES
-from conf.schema.world import (
+from dynapix.conf.schema.benchmark import SCENE_FPS, SCENE_FRAMES
+from dynapix.conf.schema.world import (
     SLIDE_FRAMES,
     CameraConfig,
     LightConfig,
     ObjectsConfig,
     StartConfig,
 )
-from data.build import check_quota_names, ensure_items, world_changes
-from data.frames.frame_cache import render_frames
-from data.oracle.contacts import group_contacts
-from data.oracle.events import find_motion_onsets
-from data.parallel import Workers
-from data.records import FPS, FRAMES, SPEED_BOUNDS, SceneObject
-from data.render.bullet import BulletRenderer
-from data.sim import starts as sliding
-from data.sim.camera import Camera
-from data.sim.physics import Body, shared_simulator
-from data.sim.sampling import FALLEN, REMEDIES, check_sample, sample_scene
-from data.sim.shapes import RADIUS
-from data.sim.starts import RejectedError
-from data.store import Store
-from data.versions import component_versions
-from teacher.predicates.extraction import extract_predicates
+from dynapix.data.build import check_quota_names, ensure_items, world_changes
+from dynapix.data.frames.frame_cache import render_frames
+from dynapix.data.oracle.contacts import group_contacts
+from dynapix.data.oracle.events import find_motion_onsets
+from dynapix.data.parallel import Workers
+from dynapix.data.records import FPS, FRAMES, SPEED_BOUNDS, SceneObject
+from dynapix.data.render.bullet import BulletRenderer
+from dynapix.data.sim import starts as sliding
+from dynapix.data.sim.camera import Camera
+from dynapix.data.sim.physics import Body, shared_simulator
+from dynapix.data.sim.sampling import FALLEN, REMEDIES, check_sample, sample_scene
+from dynapix.data.sim.shapes import RADIUS
+from dynapix.data.sim.starts import RejectedError
+from dynapix.data.store import Store
+from dynapix.data.versions import component_versions
+from dynapix.teacher.predicates.extraction import extract_predicates
 from tests.conftest import micro_config
 from tests.data.sim.test_physics import fingerprint
 from tests.data.simulated import WORLDS, preset_world, simulate_scene

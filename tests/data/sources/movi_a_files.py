@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from data.sources.tfrecord import example_class
+from dynapix.data.sources.tfrecord import example_class
 from tests.data.sources.pictures import picture, png
 
 MOVI_COLORS = ["blue", "brown", "cyan", "gray", "green", "purple", "red", "yellow"]

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
-from data.build import ensure_benchmark, ensure_items
-from data.frames.frame_cache import FrameReader
-from data.parallel import Workers
-from data.sources.releases import READERS
-from data.sources.scenes import make_scenes
+from dynapix.conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig
+from dynapix.data.build import ensure_benchmark, ensure_items
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.parallel import Workers
+from dynapix.data.sources.releases import READERS
+from dynapix.data.sources.scenes import make_scenes
 from tests.data.sources.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.sources.movi_a_files import movi_example, write_movi_folder
 from tests.data.sources.pictures import picture

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data.records import Collision
-from data.sim.shapes import half_height, rotation_matrix
-from data.sources import clevrer
-from data.sources.validation import RecordError
+from dynapix.data.records import Collision
+from dynapix.data.sim.shapes import half_height, rotation_matrix
+from dynapix.data.sources import clevrer
+from dynapix.data.sources.validation import RecordError
 from tests.data.sources.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.user_errors import raises_user_error
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data.records import Collision, Landing, Scene
-from data.sim.shapes import rotation_matrix
-from data.sources import movi_a, tfrecord
+from dynapix.data.records import Collision, Landing, Scene
+from dynapix.data.sim.shapes import rotation_matrix
+from dynapix.data.sources import movi_a, tfrecord
 from tests.data.sources.movi_a_files import (
     movi_example,
     movi_features,

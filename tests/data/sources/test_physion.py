@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data.oracle.contacts import collision_frames, first_collisions
-from data.oracle.events import find_motion_onsets
-from data.records import Collision, Landing, Scene
-from data.sources import physion
+from dynapix.data.oracle.contacts import collision_frames, first_collisions
+from dynapix.data.oracle.events import find_motion_onsets
+from dynapix.data.records import Collision, Landing, Scene
+from dynapix.data.sources import physion
 from tests.data.sources.physion_files import COLORS, IDS, physion_trial, write_physion
 from tests.user_errors import raises_user_error
 

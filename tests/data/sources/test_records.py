@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from data.parallel import Workers
-from data.records import original_scene_id
-from data.sources import clevrer, movi_a, physion, releases, tracks
-from data.sources.releases import read_release
-from data.sources.validation import scene_id
+from dynapix.data.parallel import Workers
+from dynapix.data.records import original_scene_id
+from dynapix.data.sources import clevrer, movi_a, physion, releases, tracks
+from dynapix.data.sources.releases import read_release
+from dynapix.data.sources.validation import scene_id
 from tests.data.sources.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.sources.movi_a_files import (
     movi_example,

@@ -12,28 +12,34 @@ import numpy as np
 import pytest
 import yaml
 
-from conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, SelectionConfig, TeacherConfig
-from data.build import build, ensure_benchmark
-from data.checks.baselines import constant_velocity_error
-from data.frames.frame_cache import FrameReader
-from data.items.queries import BUILDERS
-from data.items.recipes import (
+from dynapix.conf.schema import (
+    BenchmarkConfig,
+    Quota,
+    RetrievalTrackConfig,
+    SelectionConfig,
+    TeacherConfig,
+)
+from dynapix.data.build import build, ensure_benchmark
+from dynapix.data.checks.baselines import constant_velocity_error
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.items.queries import BUILDERS
+from dynapix.data.items.recipes import (
     CELLS_WITHOUT_CONTACTS,
     TIME_CELLS,
     TIME_QUESTION,
     spell_seconds,
 )
-from data.parallel import Workers
-from data.sources import tracks
-from data.sources.scenes import make_scenes
-from data.sources.validation import RecordError
-from data.store import Store, load_scene, open_store, save_scene
-from teacher.narrate import narrate_store
-from teacher.narrator import write_rationale
-from teacher.predicates.extraction import extract_facts
-from teacher.predicates.places import close_pairs
-from teacher.predicates.relations import Places, find_relations
-from teacher.predicates.vocabulary import describe_item
+from dynapix.data.parallel import Workers
+from dynapix.data.sources import tracks
+from dynapix.data.sources.scenes import make_scenes
+from dynapix.data.sources.validation import RecordError
+from dynapix.data.store import Store, load_scene, open_store, save_scene
+from dynapix.teacher.narrate import narrate_store
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.extraction import extract_facts
+from dynapix.teacher.predicates.places import close_pairs
+from dynapix.teacher.predicates.relations import Places, find_relations
+from dynapix.teacher.predicates.vocabulary import describe_item
 from tests.data.sources.tracks_files import (
     SIZE,
     box_lines,

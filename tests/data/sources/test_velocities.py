@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data.records import FPS, Collision, Scene
-from data.sources import clevrer, movi_a, physion
-from data.sources.validation import (
+from dynapix.data.records import FPS, Collision, Scene
+from dynapix.data.sources import clevrer, movi_a, physion
+from dynapix.data.sources.validation import (
     MIN_FRAMES,
     RescaledVelocities,
     compare_velocities,
     reconcile_velocities,
 )
-from data.store import load_scene, save_scene
+from dynapix.data.store import load_scene, save_scene
 from tests.data.sources.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.sources.movi_a_files import movi_example, write_movi_folder
 from tests.data.sources.physion_files import physion_trial, write_physion

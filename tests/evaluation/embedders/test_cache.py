@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.embedders import cache
-from evaluation.embedders.cache import EmbeddingCache
+from dynapix.evaluation.embedders import cache
+from dynapix.evaluation.embedders.cache import EmbeddingCache
 from tests.user_errors import raises_user_error
 
 SETTINGS = {"weights": "ab12", "image_size": 96}
@@ -79,7 +79,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from tests.evaluation.embedders.test_cache import SETTINGS, INPUTS, Model
-from evaluation.embedders.cache import EmbeddingCache
+from dynapix.evaluation.embedders.cache import EmbeddingCache
 class Dying(Model):
     def __call__(self, some):
         if len(self.inputs) >= 1300:
@@ -91,7 +91,7 @@ EmbeddingCache(Path(sys.argv[1]), "frame", SETTINGS).complete(INPUTS, Dying(), 6
 
 def test_a_kill_costs_one_batch(tmp_path) -> None:
     command = [sys.executable, "-c", KILLED, str(tmp_path)]
-    root = Path(cache.__file__).parents[2]
+    root = Path(__file__).parents[3]
     ended = subprocess.run(command, cwd=root, capture_output=True, timeout=120)
     assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
     model = Model()

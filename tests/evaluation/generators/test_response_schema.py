@@ -8,14 +8,14 @@ from dataclasses import asdict, fields
 import pytest
 from jsonschema import Draft202012Validator
 
-from evaluation.generators.response_schema import (
+from dynapix.evaluation.generators.response_schema import (
     FIELDS,
     Record,
     build_record_schema,
     read_record,
     write_record_instruction,
 )
-from models.student.answer_parser import parse_choice
+from dynapix.models.student.answer_parser import parse_choice
 
 RECORD = Record(
     "C",

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from evaluation.metrics.ranking import count_above_and_equal, query_metrics, target_scores
+from dynapix.evaluation.metrics.ranking import count_above_and_equal, query_metrics, target_scores
 
 
 def scene_interval(

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from evaluation.metrics.calibration import measure_calibration, measure_position_bias
+from dynapix.evaluation.metrics.calibration import measure_calibration, measure_position_bias
 
 
 def test_certain_answers_are_calibrated_if_they_are_correct():

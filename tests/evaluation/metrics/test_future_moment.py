@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data.checks.intervals import SceneBootstrap
-from data.items.recipes import TIME_CELLS
-from data.records import LETTERS, Candidate, Scene, SelectionItem
-from evaluation.metrics.future_moment import (
+from dynapix.data.checks.intervals import SceneBootstrap
+from dynapix.data.items.recipes import TIME_CELLS
+from dynapix.data.records import LETTERS, Candidate, Scene, SelectionItem
+from dynapix.evaluation.metrics.future_moment import (
     FutureMoment,
     Shares,
     has_two_futures,
     measure_future_moment,
 )
-from evaluation.reporting.figures import plot_future_moment
-from evaluation.reporting.tables import future_moment_tables
+from dynapix.evaluation.reporting.figures import plot_future_moment
+from dynapix.evaluation.reporting.tables import future_moment_tables
 from tests.teacher.synthetic import random_scene
 
 ITEMS = 240

@@ -7,7 +7,7 @@ from itertools import pairwise, permutations
 import numpy as np
 import pytest
 
-from evaluation.metrics.ranking import rank_metrics
+from dynapix.evaluation.metrics.ranking import rank_metrics
 from tests.user_errors import raises_user_error
 
 KS = (1, 2, 5)

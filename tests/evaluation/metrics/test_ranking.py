@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import pytrec_eval
 
-from evaluation.metrics.ranking import count_above_and_equal, target_scores
+from dynapix.evaluation.metrics.ranking import count_above_and_equal, target_scores
 from tests.evaluation.metrics.reference import count_ranks, matrix_metrics, ranking_metrics
 
 KS = (1, 2, 3, 10)

@@ -8,17 +8,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from conf.schema import RelationBounds
-from data.checks.intervals import SceneBootstrap
-from data.records import LETTERS, SelectionItem
-from data.store import Store
-from evaluation.metrics.reasons import ReasonSummary, measure_reasons, read_reasons
-from evaluation.reporting.item_browser import mark_claims
-from evaluation.reporting.run_responses import parse_response
-from evaluation.reporting.tables import reason_table
-from teacher.narrator import write_match_lines, write_rationale
-from teacher.predicates.extraction import extract_predicates
-from teacher.validation.reasons import PARTS
+from dynapix.conf.schema import RelationBounds
+from dynapix.data.checks.intervals import SceneBootstrap
+from dynapix.data.records import LETTERS, SelectionItem
+from dynapix.data.store import Store
+from dynapix.evaluation.metrics.reasons import ReasonSummary, measure_reasons, read_reasons
+from dynapix.evaluation.reporting.item_browser import mark_claims
+from dynapix.evaluation.reporting.run_responses import parse_response
+from dynapix.evaluation.reporting.tables import reason_table
+from dynapix.teacher.narrator import write_match_lines, write_rationale
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.validation.reasons import PARTS
 
 
 @pytest.fixture(scope="module")

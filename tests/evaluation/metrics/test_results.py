@@ -1,7 +1,7 @@
 import pytest
 
-from data.checks.intervals import SceneBootstrap
-from evaluation.metrics.results import accuracy_by_family
+from dynapix.data.checks.intervals import SceneBootstrap
+from dynapix.evaluation.metrics.results import accuracy_by_family
 
 
 def test_accuracy_by_family_has_the_families_macro_and_micro():

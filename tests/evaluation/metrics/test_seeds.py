@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data.checks.intervals import SceneBootstrap
-from evaluation.metrics.seeds import SeedBootstrap
+from dynapix.data.checks.intervals import SceneBootstrap
+from dynapix.evaluation.metrics.seeds import SeedBootstrap
 
 FAMILIES = np.array(["event", "time", "window"] * 40)
 SCENES = np.repeat([f"s{k}" for k in range(30)], 4)

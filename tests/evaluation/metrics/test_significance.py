@@ -9,11 +9,11 @@ import pytest
 from scipy.stats import binomtest, norm, permutation_test
 from statsmodels.stats.multitest import multipletests
 
-from conf.schema.benchmark import MATCHED_ANCHOR
-from data.checks.intervals import SceneBootstrap
-from data.records import FAMILIES, Candidate, SelectionItem
-from evaluation.metrics.results import accuracy_by_family, from_json
-from evaluation.metrics.significance import (
+from dynapix.conf.schema.benchmark import MATCHED_ANCHOR
+from dynapix.data.checks.intervals import SceneBootstrap
+from dynapix.data.records import FAMILIES, Candidate, SelectionItem
+from dynapix.evaluation.metrics.results import accuracy_by_family, from_json
+from dynapix.evaluation.metrics.significance import (
     EXACT_SCENES,
     PairedComparison,
     adjust_holm,
@@ -21,7 +21,7 @@ from evaluation.metrics.significance import (
     compare_runs,
     sign_flip_test,
 )
-from evaluation.reporting.tables import paired_table
+from dynapix.evaluation.reporting.tables import paired_table
 from tests.user_errors import raises_user_error
 
 NAMES = ("one", "two")

@@ -9,8 +9,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from conf.entry import Run
-from conf.schema import (
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import (
     BenchmarkConfig,
     ContrastiveCommand,
     ContrastiveTrainConfig,
@@ -20,11 +20,11 @@ from conf.schema import (
     StudentConfig,
     TeacherConfig,
 )
-from data.store import Store
-from models import loading
-from models.retriever import embedder
+from dynapix.data.store import Store
+from dynapix.models import loading
+from dynapix.models.retriever import embedder
+from dynapix.train.student import dataset
 from tests.tiny_models import SMALL
-from train.student import dataset
 
 NO_LORA = {"quantization": "none", "lora": LoraConfig(rank=0)}
 STUDENT = StudentConfig(

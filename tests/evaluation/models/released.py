@@ -31,8 +31,8 @@ from transformers import (
     SiglipProcessor,
 )
 
-from evaluation.embedders.languagebind import LanguageBindVideo
-from models.tiny_qwen3_vl import CHAT_TEMPLATE, SPECIAL_TOKENS
+from dynapix.evaluation.embedders.languagebind import LanguageBindVideo
+from dynapix.models.tiny_qwen3_vl import CHAT_TEMPLATE, SPECIAL_TOKENS
 
 IMAGE_SIZE, CLIP_FRAMES = 56, 4
 TOWER = {

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 from omegaconf import OmegaConf
 
-from conf.schema import (
+from dynapix.conf.schema import (
     ContrastiveCommand,
     EmbedderConfig,
     ReportCommand,
@@ -17,9 +17,9 @@ from conf.schema import (
     SftCommand,
     StudentConfig,
 )
-from evaluation import report, select
-from evaluation.generators.response_log import ResponseLog
-from models.trained_runs import check_unseen, read_trained_settings, resolve_model
+from dynapix.evaluation import report, select
+from dynapix.evaluation.generators.response_log import ResponseLog
+from dynapix.models.trained_runs import check_unseen, read_trained_settings, resolve_model
 from tests.evaluation.models.conftest import (
     STUDENT,
     check_resumed,

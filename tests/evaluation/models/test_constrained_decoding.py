@@ -8,13 +8,13 @@ from dataclasses import replace
 import jsonschema
 import pytest
 
-from conf.entry import Run
-from conf.files import read_json_lines
-from conf.schema import SelectCommand
-from evaluation import select
-from evaluation.generators.response_log import ResponseLog
-from evaluation.generators.response_schema import build_record_schema
-from models.student.answer_parser import parse_choice
+from dynapix.conf.entry import Run
+from dynapix.conf.files import read_json_lines
+from dynapix.conf.schema import SelectCommand
+from dynapix.evaluation import select
+from dynapix.evaluation.generators.response_log import ResponseLog
+from dynapix.evaluation.generators.response_schema import build_record_schema
+from dynapix.models.student.answer_parser import parse_choice
 from tests.evaluation.models.conftest import STUDENT
 
 

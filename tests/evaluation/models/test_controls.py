@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from conf.entry import Run
-from conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentConfig
-from conf.schema.benchmark import MATCHED_ANCHOR
-from data.items.controls import pair_items
-from evaluation import select
-from evaluation.generators.response_log import score_response
-from evaluation.metrics.results import SelectionResult, from_json
-from evaluation.metrics.selection import Choices, build_selection_report
-from evaluation.reporting.selection_report import write_report
-from models.student.responses import GeneratedText
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import BenchmarkConfig, SelectCommand, ServerConfig, StudentConfig
+from dynapix.conf.schema.benchmark import MATCHED_ANCHOR
+from dynapix.data.items.controls import pair_items
+from dynapix.evaluation import select
+from dynapix.evaluation.generators.response_log import score_response
+from dynapix.evaluation.metrics.results import SelectionResult, from_json
+from dynapix.evaluation.metrics.selection import Choices, build_selection_report
+from dynapix.evaluation.reporting.selection_report import write_report
+from dynapix.models.student.responses import GeneratedText
 from tests.user_errors import raises_user_error
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from sentence_transformers.util.similarity import maxsim
 
-from evaluation.embedders.cache import pad_rows
-from evaluation.retrieval import late_interaction
-from evaluation.retrieval.late_interaction import late_ranks, pair_scores
+from dynapix.evaluation.embedders.cache import pad_rows
+from dynapix.evaluation.retrieval import late_interaction
+from dynapix.evaluation.retrieval.late_interaction import late_ranks, pair_scores
 from tests.evaluation.metrics.reference import count_ranks
 
 WIDTH = 24

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conf.runs import Run
-from conf.schema import (
+from dynapix.conf.runs import Run
+from dynapix.conf.schema import (
     ContrastiveTrainConfig,
     EmbedderConfig,
     RetrieveCommand,
@@ -25,8 +25,8 @@ from conf.schema import (
     SimilarityCommand,
     TwoStageCommand,
 )
-from data.store import Store
-from evaluation import select
+from dynapix.data.store import Store
+from dynapix.evaluation import select
 from tests.children import run_child
 from tests.evaluation.models import released
 from tests.evaluation.models.conftest import NO_LORA, STUDENT
@@ -35,11 +35,11 @@ ROOT = Path(__file__).parents[3]
 EVALUATE = """
 import importlib, pickle, sys
 from pathlib import Path
-from conf.runs import Run
+from dynapix.conf.runs import Run
 
 command, settings, folder = sys.argv[1:]
 cfg = pickle.loads(Path(settings).read_bytes())
-main = importlib.import_module(f"evaluation.{command}").main
+main = importlib.import_module(f"dynapix.evaluation.{command}").main
 sampling = ("student.temperature", "student.top_k")
 main.__wrapped__(cfg, Run("run", Path(folder), sampling))
 """

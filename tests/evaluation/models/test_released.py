@@ -15,25 +15,25 @@ from peft import PeftModel
 from safetensors.torch import load_file, save_file
 from transformers import AutoModel, AutoProcessor, CLIPModel, Qwen2VLForConditionalGeneration
 
-from conf.entry import Run
-from conf.errors import UserError
-from conf.files import read_json_lines
-from conf.schema import (
+from dynapix.conf.entry import Run
+from dynapix.conf.errors import UserError
+from dynapix.conf.files import read_json_lines
+from dynapix.conf.schema import (
     ContrastiveTrainConfig,
     LoraConfig,
     RetrieveCommand,
     RetrieverConfig,
     SimilarityCommand,
 )
-from data.frames.frame_cache import FrameReader
-from data.records import FPS, FRAMES, LETTERS, FrameRef, sample_prefix_frames
-from evaluation import retrieve, similarity
-from evaluation.embedders.dual_encoder import unit_rows
-from evaluation.embedders.embedder import EMBEDDINGS
-from evaluation.embedders.joint_encoder import load_encoder
-from evaluation.embedders.languagebind import LanguageBindVideo, spread
-from evaluation.metrics.results import SCENE_ALONE
-from evaluation.metrics.selection import choose_letters, credit_choices
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import FPS, FRAMES, LETTERS, FrameRef, sample_prefix_frames
+from dynapix.evaluation import retrieve, similarity
+from dynapix.evaluation.embedders.dual_encoder import unit_rows
+from dynapix.evaluation.embedders.embedder import EMBEDDINGS
+from dynapix.evaluation.embedders.joint_encoder import load_encoder
+from dynapix.evaluation.embedders.languagebind import LanguageBindVideo, spread
+from dynapix.evaluation.metrics.results import SCENE_ALONE
+from dynapix.evaluation.metrics.selection import choose_letters, credit_choices
 from tests.evaluation.models import released
 from tests.user_errors import raises_user_error
 

@@ -15,18 +15,18 @@ from omegaconf import OmegaConf
 from sentence_transformers import SentenceTransformer
 
 import dynapix
-from conf.files import read_json_lines
-from conf.schema import ContrastiveTrainConfig, LateConfig, RetrieveCommand, RetrieverConfig
-from conf.schema.benchmark import POOLS
-from data.checks.baselines import score_scene_alone
-from data.frames.frame_cache import FrameReader
-from data.store import open_store
-from evaluation import retrieve
-from evaluation.embedders import joint_encoder
-from evaluation.embedders.embedder import EMBEDDINGS, Embedder, open_embedders
-from evaluation.metrics.results import SCENE_ALONE
-from models.retriever import embedder
-from models.retriever import inputs as retriever_inputs
+from dynapix.conf.files import read_json_lines
+from dynapix.conf.schema import ContrastiveTrainConfig, LateConfig, RetrieveCommand, RetrieverConfig
+from dynapix.conf.schema.benchmark import POOLS
+from dynapix.data.checks.baselines import score_scene_alone
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.store import open_store
+from dynapix.evaluation import retrieve
+from dynapix.evaluation.embedders import joint_encoder
+from dynapix.evaluation.embedders.embedder import EMBEDDINGS, Embedder, open_embedders
+from dynapix.evaluation.metrics.results import SCENE_ALONE
+from dynapix.models.retriever import embedder
+from dynapix.models.retriever import inputs as retriever_inputs
 from tests.evaluation.metrics.reference import matrix_metrics, ranking_metrics
 from tests.evaluation.models.conftest import RETRIEVER, new_run, save_retriever
 from tests.user_errors import raises_user_error

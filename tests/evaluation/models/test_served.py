@@ -14,21 +14,28 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from conf.entry import Run
-from conf.schema import SelectCommand, ServerConfig, StudentConfig
-from data.frames.frame_cache import FrameReader
-from evaluation import select
-from evaluation.generators.generator import item_sample, response_settings
-from evaluation.generators.openai_server import ServedModel, restore_thought, served_origin
-from evaluation.generators.response_log import ResponseLog, collect_responses, score_response
-from evaluation.generators.response_schema import build_record_schema, write_record_instruction
-from models import loading
-from models.student.collator import encode
-from teacher.servers.responses import TRUNCATED, Response
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import SelectCommand, ServerConfig, StudentConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.evaluation import select
+from dynapix.evaluation.generators.generator import item_sample, response_settings
+from dynapix.evaluation.generators.openai_server import ServedModel, restore_thought, served_origin
+from dynapix.evaluation.generators.response_log import (
+    ResponseLog,
+    collect_responses,
+    score_response,
+)
+from dynapix.evaluation.generators.response_schema import (
+    build_record_schema,
+    write_record_instruction,
+)
+from dynapix.models import loading
+from dynapix.models.student.collator import encode
+from dynapix.teacher.servers.responses import TRUNCATED, Response
+from dynapix.train.student import dataset
 from tests.evaluation.generators.test_response_schema import FULL
 from tests.tiny_models import SMALL
 from tests.user_errors import raises_user_error
-from train.student import dataset
 
 STUDENT = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
 THINKING = replace(STUDENT, thinking=True, temperature=0.6, top_p=0.95, top_k=20)

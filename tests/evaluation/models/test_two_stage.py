@@ -13,7 +13,7 @@ import pytest
 from omegaconf import OmegaConf
 from transformers import CLIPVisionModel
 
-from conf.schema import (
+from dynapix.conf.schema import (
     ContrastiveTrainConfig,
     EmbedderConfig,
     LateConfig,
@@ -22,15 +22,15 @@ from conf.schema import (
     StudentConfig,
     TwoStageCommand,
 )
-from data.store import Store, open_store
-from evaluation import two_stage
-from evaluation.embedders.embedder import Embedder, open_embedders
-from evaluation.embedders.joint_encoder import load_encoder
-from evaluation.metrics.ranking import query_metrics
-from evaluation.metrics.results import SCENE_ALONE, retrieval_results
-from evaluation.retrieval.exact_search import Ranks
-from evaluation.retrieval.standard_test import load_test
-from evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
+from dynapix.data.store import Store, open_store
+from dynapix.evaluation import two_stage
+from dynapix.evaluation.embedders.embedder import Embedder, open_embedders
+from dynapix.evaluation.embedders.joint_encoder import load_encoder
+from dynapix.evaluation.metrics.ranking import query_metrics
+from dynapix.evaluation.metrics.results import SCENE_ALONE, retrieval_results
+from dynapix.evaluation.retrieval.exact_search import Ranks
+from dynapix.evaluation.retrieval.standard_test import load_test
+from dynapix.evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
 from tests.evaluation.metrics.reference import matrix_metrics
 from tests.evaluation.models import released
 from tests.evaluation.models.conftest import NO_LORA, STUDENT, check_resumed, new_run, tear
@@ -268,7 +268,7 @@ def test_a_sentence_encoder_matches_captions_and_nothing_else(
     }
     ranks = rank_by_text(ROUTES["predict_caption"], matcher, texts, queries, database)
     assert not ranks.above.any()
-    monkeypatch.setattr("evaluation.generators.generator.open_generator", None)
+    monkeypatch.setattr("dynapix.evaluation.generators.generator.open_generator", None)
     for number, routes in enumerate((["predict_image"], None, ["cot_text", "predict_caption"])):
         cfg = TwoStageCommand(
             benchmark=micro, student=SERVED, store=str(store.folder.parent), routes=routes,

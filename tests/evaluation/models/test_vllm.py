@@ -10,21 +10,21 @@ import pytest
 import torch
 from transformers import AutoModelForImageTextToText, AutoProcessor
 
-from conf.entry import Run
-from conf.files import read_json_lines
-from conf.schema import LoraConfig, SelectCommand, ServerConfig, StudentConfig
-from data.frames.frame_cache import FrameReader
-from evaluation import select
-from evaluation.generators.generator import item_sample
-from evaluation.generators.response_schema import build_record_schema
-from models import loading
-from models.compat import write_clips_as_released
-from models.student.answer_parser import Reason, parse_choice
-from models.student.chat_requests import build_messages, qwen_fields, sampling_fields
-from models.student.collator import Collator, encode
+from dynapix.conf.entry import Run
+from dynapix.conf.files import read_json_lines
+from dynapix.conf.schema import LoraConfig, SelectCommand, ServerConfig, StudentConfig
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.evaluation import select
+from dynapix.evaluation.generators.generator import item_sample
+from dynapix.evaluation.generators.response_schema import build_record_schema
+from dynapix.models import loading
+from dynapix.models.compat import write_clips_as_released
+from dynapix.models.student.answer_parser import Reason, parse_choice
+from dynapix.models.student.chat_requests import build_messages, qwen_fields, sampling_fields
+from dynapix.models.student.collator import Collator, encode
+from dynapix.train.student import dataset
 from tests.teacher.server_process import vllm_server
 from tests.tiny_models import SMALL, randomize_adapters
-from train.student import dataset
 
 pytestmark = pytest.mark.slow
 

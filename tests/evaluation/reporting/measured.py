@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
-from conf.entry import Run
-from conf.files import write_json_lines
-from conf.schema import (
+from dynapix.conf.entry import Run
+from dynapix.conf.files import write_json_lines
+from dynapix.conf.schema import (
     ContrastiveCommand,
     ReportCommand,
     RetrieveCommand,
@@ -24,23 +24,23 @@ from conf.schema import (
     StudentConfig,
     TeacherConfig,
 )
-from conf.schema.training import SftTrainConfig
-from data.records import SelectionItem
-from data.store import Store
-from evaluation import report
-from evaluation.generators.response_log import score_response
-from evaluation.metrics.results import SIMILARITY, compare_retrievers, retrieval_results
-from evaluation.metrics.selection import (
+from dynapix.conf.schema.training import SftTrainConfig
+from dynapix.data.records import SelectionItem
+from dynapix.data.store import Store
+from dynapix.evaluation import report
+from dynapix.evaluation.generators.response_log import score_response
+from dynapix.evaluation.metrics.results import SIMILARITY, compare_retrievers, retrieval_results
+from dynapix.evaluation.metrics.selection import (
     Choices,
     build_selection_report,
     choose_letters,
     credit_choices,
 )
-from evaluation.reporting.selection_report import write_report
-from evaluation.retrieval import candidate_similarity
-from evaluation.retrieval.exact_search import Ranks
-from evaluation.select import limit_items
-from models.student.responses import GeneratedText
+from dynapix.evaluation.reporting.selection_report import write_report
+from dynapix.evaluation.retrieval import candidate_similarity
+from dynapix.evaluation.retrieval.exact_search import Ranks
+from dynapix.evaluation.select import limit_items
+from dynapix.models.student.responses import GeneratedText
 
 STUDENT = StudentConfig(name="small")
 Respond = Callable[[SelectionItem], str]

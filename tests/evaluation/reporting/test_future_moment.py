@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 import dynapix
-from conf.compose import compose
-from conf.schema import BuildCommand, Quota, SelectionConfig
-from data.build import ensure_items
-from data.parallel import Workers
-from data.records import LETTERS, SelectionItem
+from dynapix.conf.compose import compose
+from dynapix.conf.schema import BuildCommand, Quota, SelectionConfig
+from dynapix.data.build import ensure_items
+from dynapix.data.parallel import Workers
+from dynapix.data.records import LETTERS, SelectionItem
 from tests.evaluation.reporting.measured import read_table, run_report, select_run
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from conf.errors import UserError
-from data.frames.frame_cache import FrameReader
-from data.records import LETTERS
-from evaluation.metrics.reasons import item_predicates, read_reasons
-from evaluation.reporting import item_browser
-from evaluation.reporting.run_responses import nearest_candidates, parse_response
+from dynapix.conf.errors import UserError
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import LETTERS
+from dynapix.evaluation.metrics.reasons import item_predicates, read_reasons
+from dynapix.evaluation.reporting import item_browser
+from dynapix.evaluation.reporting.run_responses import nearest_candidates, parse_response
 
 
 @pytest.fixture(scope="module")

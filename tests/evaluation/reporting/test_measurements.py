@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conf.schema import ExportStudyCommand
-from data.records import FAMILIES, SelectionItem
-from data.store import Store
-from evaluation.reporting import measurements
+from dynapix.conf.schema import ExportStudyCommand
+from dynapix.data.records import FAMILIES, SelectionItem
+from dynapix.data.store import Store
+from dynapix.evaluation.reporting import measurements
 from tests.evaluation.reporting import measured
 from tests.evaluation.reporting.measured import finish, read_table, retrieve_run, run_report
 from tests.evaluation.study.test_agreement import summarize, vote

@@ -14,9 +14,9 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select
 
-from conf.entry import Run
-from conf.schema import ReportCommand
-from evaluation import report
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import ReportCommand
+from dynapix.evaluation import report
 from tests.evaluation.chromium import IS_TOO_WIDE, chromium_in
 from tests.evaluation.reporting.conftest import HOSTILE
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from evaluation.reporting.reference import COT_STUDENT, reference
+from dynapix.evaluation.reporting.reference import COT_STUDENT, reference
 
 ITEMS = {"Event": 249, "Time": 374, "Window": 1585}
 HORIZON_ITEMS = {"1 s": 111, "2 s": 263}

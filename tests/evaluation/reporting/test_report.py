@@ -12,10 +12,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from conf.schema import ExportStudyCommand, ReportCommand
-from conf.schema.benchmark import MATCHED_ANCHOR
-from data.checks.observer import ERRORS, EXTRAPOLATES, SIMULATES
-from evaluation.reporting import item_browser
+from dynapix.conf.schema import ExportStudyCommand, ReportCommand
+from dynapix.conf.schema.benchmark import MATCHED_ANCHOR
+from dynapix.data.checks.observer import ERRORS, EXTRAPOLATES, SIMULATES
+from dynapix.evaluation.reporting import item_browser
 from tests.evaluation.reporting.measured import (
     finish,
     read_table,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import html
 import re
 
-from data.checks.intervals import Interval
-from evaluation.reporting.item_browser import ItemBrowser
-from evaluation.reporting.page import render_page
-from evaluation.reporting.sections import Section
-from evaluation.reporting.table import Table
+from dynapix.data.checks.intervals import Interval
+from dynapix.evaluation.reporting.item_browser import ItemBrowser
+from dynapix.evaluation.reporting.page import render_page
+from dynapix.evaluation.reporting.sections import Section
+from dynapix.evaluation.reporting.table import Table
 
 ESCAPED = {
     "a & b | c_d # 100% $x$": (r"a \& b \| c\_d \# 100% \$x\$", r"a \& b | c\_d \# 100\% \$x\$"),

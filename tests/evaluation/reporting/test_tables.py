@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data.checks.intervals import SceneBootstrap
-from data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
-from evaluation.metrics.ranking import query_metrics
-from evaluation.metrics.results import (
+from dynapix.data.checks.intervals import SceneBootstrap
+from dynapix.data.records import Candidate, FrameRef, RetrievalQuery, SelectionItem
+from dynapix.evaluation.metrics.ranking import query_metrics
+from dynapix.evaluation.metrics.results import (
     MEASURES,
     RECALLS,
     UNTRAINED,
@@ -26,13 +26,17 @@ from evaluation.metrics.results import (
     from_json,
     retrieval_results,
 )
-from evaluation.metrics.selection import Choices, build_selection_report
-from evaluation.reporting import figures
-from evaluation.reporting.reference import COT_STUDENT
-from evaluation.reporting.tables import rank_differences_table, retrieval_table, selection_table
-from evaluation.retrieval.exact_search import Ranks
+from dynapix.evaluation.metrics.selection import Choices, build_selection_report
+from dynapix.evaluation.reporting import figures
+from dynapix.evaluation.reporting.reference import COT_STUDENT
+from dynapix.evaluation.reporting.tables import (
+    rank_differences_table,
+    retrieval_table,
+    selection_table,
+)
+from dynapix.evaluation.retrieval.exact_search import Ranks
+from dynapix.train.common.curves import plot_curves
 from tests.evaluation.metrics.reference import ranking_metrics, scene_interval
-from train.common.curves import plot_curves
 
 SCENES = 15
 FAMILIES = ["event"] * 20 + ["time"] * 30 + ["window"] * 50

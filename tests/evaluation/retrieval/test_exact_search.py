@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.retrieval import exact_search
-from evaluation.retrieval.exact_search import (
+from dynapix.evaluation.retrieval import exact_search
+from dynapix.evaluation.retrieval.exact_search import (
     GridEmbeddings,
     block_scores,
     exact_ranks,

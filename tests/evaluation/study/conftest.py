@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from conf.schema import StudyCommand
-from evaluation.study import setup, storage
+from dynapix.conf.schema import StudyCommand
+from dynapix.evaluation.study import setup, storage
 from tests.evaluation.study.running import Server, Visitor
 
 ITEMS = 59

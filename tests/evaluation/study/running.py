@@ -14,7 +14,7 @@ from http.client import HTTPConnection, HTTPException, HTTPMessage
 from pathlib import Path
 from urllib.parse import urlencode
 
-from evaluation.study import storage
+from dynapix.evaluation.study import storage
 from tests.local import free_port
 
 ROOT = Path(__file__).parents[3]

@@ -13,13 +13,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from conf.entry import Run
-from conf.schema import ReportCommand
-from data.records import FAMILIES
-from evaluation import report
-from evaluation.metrics.results import Agreement, StudyReport, from_json
-from evaluation.reporting.tables import human_table
-from evaluation.study.agreement import fleiss_kappa, krippendorff_alpha, majority, summarize_votes
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import ReportCommand
+from dynapix.data.records import FAMILIES
+from dynapix.evaluation import report
+from dynapix.evaluation.metrics.results import Agreement, StudyReport, from_json
+from dynapix.evaluation.reporting.tables import human_table
+from dynapix.evaluation.study.agreement import (
+    fleiss_kappa,
+    krippendorff_alpha,
+    majority,
+    summarize_votes,
+)
 from tests.user_errors import raises_user_error
 
 

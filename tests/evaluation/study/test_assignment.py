@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conf.schema import StudyCommand
-from data.records import FAMILIES, Candidate, SelectionItem
-from evaluation.study import storage
-from evaluation.study.assignment import assign_items
-from evaluation.study.setup import choose_items, item_scenes, read_item_ids, sample_items
-from evaluation.study.workflow import _open_item, _open_token
+from dynapix.conf.schema import StudyCommand
+from dynapix.data.records import FAMILIES, Candidate, SelectionItem
+from dynapix.evaluation.study import storage
+from dynapix.evaluation.study.assignment import assign_items
+from dynapix.evaluation.study.setup import choose_items, item_scenes, read_item_ids, sample_items
+from dynapix.evaluation.study.workflow import _open_item, _open_token
 from tests.user_errors import raises_user_error
 
 NAMES = ["A1", "A2", "A3", "A4", "A5"]

@@ -6,9 +6,9 @@ import stat
 
 import pytest
 
-from data.records import LETTERS
-from evaluation.study import storage
-from evaluation.study.auth import HEADERS
+from dynapix.data.records import LETTERS
+from dynapix.evaluation.study import storage
+from dynapix.evaluation.study.auth import HEADERS
 from tests.evaluation.study.running import Visitor, key_of, rows
 
 pytestmark = pytest.mark.slow

@@ -14,8 +14,8 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
-from evaluation.study import storage
-from evaluation.study.storage import read_votes
+from dynapix.evaluation.study import storage
+from dynapix.evaluation.study.storage import read_votes
 from tests.evaluation.chromium import IS_TOO_WIDE, chromium_in
 
 pytestmark = pytest.mark.slow

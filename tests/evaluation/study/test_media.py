@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data.frames.frame_cache import FrameReader
-from evaluation.study.media import IMAGE, PREFIX, VIDEO, encode_media, encode_video
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.evaluation.study.media import IMAGE, PREFIX, VIDEO, encode_media, encode_video
 
 END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 

@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from conf.entry import Run
-from conf.schema import ExportStudyCommand, StudyCommand
-from data.frames.frame_cache import FrameReader
-from data.records import LETTERS
-from evaluation.study import auth, export, storage
-from evaluation.study.auth import HEADERS
-from evaluation.study.routes import build_app
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import ExportStudyCommand, StudyCommand
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import LETTERS
+from dynapix.evaluation.study import auth, export, storage
+from dynapix.evaluation.study.auth import HEADERS
+from dynapix.evaluation.study.routes import build_app
 from tests.evaluation.study.conftest import ITEMS, SMALL
 from tests.evaluation.study.running import Annotator, Visitor, key_of, rows
 

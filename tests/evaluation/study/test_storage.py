@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from conf.schema import StudyCommand
-from evaluation.study import routes, setup, storage
+from dynapix.conf.schema import StudyCommand
+from dynapix.evaluation.study import routes, setup, storage
 from tests.evaluation.study.running import ROOT, Server
 from tests.user_errors import raises_user_error
 

@@ -13,11 +13,11 @@ from accelerate.state import AcceleratorState, PartialState
 from accelerate.utils import DistributedType
 from hydra.core.config_store import ConfigStore
 
-from conf.errors import UserError
-from conf.runs import rank
-from train import contrastive, sft
-from train.student import dataset
-from train.student.trainer import LOSSES
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import rank
+from dynapix.train import contrastive, sft
+from dynapix.train.student import dataset
+from dynapix.train.student.trainer import LOSSES
 
 TRAINERS = {"sft": sft.main, "contrastive": contrastive.main}
 VALIDATION_ITEMS = 3

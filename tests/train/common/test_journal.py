@@ -18,20 +18,20 @@ from tqdm import tqdm
 from transformers import ProcessorMixin, Qwen3VLConfig
 from transformers.trainer_callback import TrainerControl, TrainerState
 
-from conf import trackers
-from conf.entry import Run
-from conf.schema import SelectCommand, SftCommand
-from evaluation.generators.generator import item_sample
-from evaluation.generators.local import LocalModel
-from evaluation.generators.response_log import ResponseLog, collect_responses
-from models import compat
-from models.student.prompts import build_sample
+from dynapix.conf import trackers
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import SelectCommand, SftCommand
+from dynapix.evaluation.generators.generator import item_sample
+from dynapix.evaluation.generators.local import LocalModel
+from dynapix.evaluation.generators.response_log import ResponseLog, collect_responses
+from dynapix.models import compat
+from dynapix.models.student.prompts import build_sample
+from dynapix.train import sft
+from dynapix.train.common.callbacks import MetricsBar
+from dynapix.train.common.journal import read_journal, read_lines
+from dynapix.train.student.held_out_answers import HeldOutAnswers
+from dynapix.train.student.lazy_samples import LazySample, StudentDataset
 from tests.user_errors import raises_user_error
-from train import sft
-from train.common.callbacks import MetricsBar
-from train.common.journal import read_journal, read_lines
-from train.student.held_out_answers import HeldOutAnswers
-from train.student.lazy_samples import LazySample, StudentDataset
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.linalg import qr, svdvals
 
-from train.common.muon import Muon, orthogonalize
+from dynapix.train.common.muon import Muon, orthogonalize
 
 
 @pytest.mark.parametrize("shape", [(12, 12), (8, 30), (30, 8)])

@@ -20,22 +20,22 @@ from accelerate.data_loader import BatchSamplerShard
 from safetensors.torch import load_file
 from torch.utils.data import BatchSampler
 
-from conf.entry import Run
-from conf.schema import ContrastiveCommand, LateConfig, LoraConfig, SftCommand
-from models import distributed
-from models.student.collator import IGNORED, Collator
-from models.student.prompts import selection_sample
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import ContrastiveCommand, LateConfig, LoraConfig, SftCommand
+from dynapix.models import distributed
+from dynapix.models.student.collator import IGNORED, Collator
+from dynapix.models.student.prompts import selection_sample
+from dynapix.train import contrastive, sft
+from dynapix.train.common import journal
+from dynapix.train.common.checkpoints import find_damage
+from dynapix.train.common.journal import read_journal
+from dynapix.train.student import dataset
+from dynapix.train.student.lazy_samples import LazySample, StudentDataset
+from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.trainer import token_losses, token_mean
 from tests.children import run_child
 from tests.train.common import launched
 from tests.user_errors import raises_user_error
-from train import contrastive, sft
-from train.common import journal
-from train.common.checkpoints import find_damage
-from train.common.journal import read_journal
-from train.student import dataset
-from train.student.lazy_samples import LazySample, StudentDataset
-from train.student.length_sampler import LengthSampler
-from train.student.trainer import token_losses, token_mean
 
 ROOT = Path(__file__).parents[3]
 SHARDED = ("--use_fsdp", "--fsdp_version=2", "--fsdp_auto_wrap_policy=TRANSFORMER_BASED_WRAP")

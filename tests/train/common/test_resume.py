@@ -13,14 +13,14 @@ import torch
 from safetensors.torch import load_file
 from sentence_transformers import SentenceTransformerTrainer
 
-from conf.entry import Run
-from conf.schema import LateConfig, LoraConfig, SftCommand
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import LateConfig, LoraConfig, SftCommand
+from dynapix.train import contrastive, sft
+from dynapix.train.common import checkpoints
+from dynapix.train.common.checkpoints import newest_checkpoint
+from dynapix.train.common.journal import read_journal
+from dynapix.train.student import dataset
 from tests.user_errors import raises_user_error
-from train import contrastive, sft
-from train.common import checkpoints
-from train.common.checkpoints import newest_checkpoint
-from train.common.journal import read_journal
-from train.student import dataset
 
 DROPOUT = LoraConfig(rank=4, dropout=0.1)
 """Adapters with dropout; a resumed run must draw the same random numbers."""

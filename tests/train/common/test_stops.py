@@ -12,17 +12,17 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from conf import gpus
-from conf.entry import Run
-from conf.failures import report_failures
-from conf.schema import SftCommand
-from data.records import SelectionItem
-from data.store import Store
+from dynapix.conf import gpus
+from dynapix.conf.entry import Run
+from dynapix.conf.failures import report_failures
+from dynapix.conf.schema import SftCommand
+from dynapix.data.records import SelectionItem
+from dynapix.data.store import Store
+from dynapix.train import sft
+from dynapix.train.common.held_out import HELD_OUT_SHARE, held_out_scenes
+from dynapix.train.student.dataset import load_datasets, uses_only
+from dynapix.train.student.trainer import LOSSES, token_mean
 from tests.user_errors import raises_user_error
-from train import sft
-from train.common.held_out import HELD_OUT_SHARE, held_out_scenes
-from train.student.dataset import load_datasets, uses_only
-from train.student.trainer import LOSSES, token_mean
 
 
 @pytest.fixture

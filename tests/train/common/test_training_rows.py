@@ -20,17 +20,17 @@ from transformers import AutoModelForImageTextToText, AutoProcessor
 from trl import SFTConfig, SFTTrainer
 from trl.trainer.sft_trainer import DataCollatorForVisionLanguageModeling
 
-from conf.compose import compose
-from conf.schema import ExportCommand
-from data.frames.frame_cache import FrameReader
-from data.store import Store
-from models.retriever.inputs import preprocess, query_messages
-from models.student.collator import encode
-from models.student.prompts import show_frames_as_images
-from teacher.narrate import ensure_rationales
+from dynapix.conf.compose import compose
+from dynapix.conf.schema import ExportCommand
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.store import Store
+from dynapix.models.retriever.inputs import preprocess, query_messages
+from dynapix.models.student.collator import encode
+from dynapix.models.student.prompts import show_frames_as_images
+from dynapix.teacher.narrate import ensure_rationales
+from dynapix.train.common.training_rows import ensure_rows
+from dynapix.train.student.dataset import supervised_items
 from tests.user_errors import raises_user_error
-from train.common.training_rows import ensure_rows
-from train.student.dataset import supervised_items
 
 pytestmark = pytest.mark.slow
 BASE = "checkpoints/bases/tiny"

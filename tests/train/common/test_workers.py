@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 from torch.utils.data import DataLoader
 
-from conf.entry import Run
-from conf.errors import UserError
-from models.student.collator import Collator
-from models.student.prompts import selection_sample
+from dynapix.conf.entry import Run
+from dynapix.conf.errors import UserError
+from dynapix.models.student.collator import Collator
+from dynapix.models.student.prompts import selection_sample
+from dynapix.train import sft
+from dynapix.train.common.training_loop import user_message
+from dynapix.train.student.trainer_setup import prefetch_factor
 from tests.user_errors import raises_user_error
-from train import sft
-from train.common.training_loop import user_message
-from train.student.trainer_setup import prefetch_factor
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 5])
@@ -44,7 +44,7 @@ def test_the_error_of_a_worker_is_reported_without_its_traceback(
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_sample_that_is_too_long_ends_the_run(few_steps, tmp_path, monkeypatch, workers) -> None:
     """The audit may miss the longest sample, because lengths are estimated."""
-    monkeypatch.setattr("train.student.trainer_setup.audit_student", lambda *_: "")
+    monkeypatch.setattr("dynapix.train.student.trainer_setup.audit_student", lambda *_: "")
     settings = few_steps(regime="answer_only", workers=workers)
     settings = replace(settings, student=replace(settings.student, max_length=150))
     # The error of a worker process loses its code.

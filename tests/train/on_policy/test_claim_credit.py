@@ -8,13 +8,13 @@ import pytest
 import torch
 from transformers import PreTrainedTokenizerBase
 
-from conf.schema import TeacherConfig
-from data.store import Store
-from teacher.narrator import write_match_lines, write_rationale
-from teacher.predicates.facts import REGIONS
-from teacher.predicates.vocabulary import describe_item
-from train.on_policy.claim_credit import credit_tokens, find_spans
-from train.rewards import JudgedResponse, credit_claims, judge_response, reward_truth
+from dynapix.conf.schema import TeacherConfig
+from dynapix.data.store import Store
+from dynapix.teacher.narrator import write_match_lines, write_rationale
+from dynapix.teacher.predicates.facts import REGIONS
+from dynapix.teacher.predicates.vocabulary import describe_item
+from dynapix.train.on_policy.claim_credit import credit_tokens, find_spans
+from dynapix.train.rewards import JudgedResponse, credit_claims, judge_response, reward_truth
 
 TEACHER = TeacherConfig(name="template", predicates="relational")
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from conf.compose import compose
-from conf.entry import Run
-from conf.runs import open_run
-from conf.schema import (
+from dynapix.conf.compose import compose
+from dynapix.conf.entry import Run
+from dynapix.conf.runs import open_run
+from dynapix.conf.schema import (
     DistillCommand,
     DistillTrainConfig,
     ExportModelCommand,
@@ -22,19 +22,19 @@ from conf.schema import (
     ReinforceTrainConfig,
     SftCommand,
 )
-from data.store import Store
-from models import loading
-from models.student.answer_parser import ParsedAnswer
-from models.trained_runs import read_trained_settings
-from teacher.narrate import ensure_rationales
+from dynapix.data.store import Store
+from dynapix.models import loading
+from dynapix.models.student.answer_parser import ParsedAnswer
+from dynapix.models.trained_runs import read_trained_settings
+from dynapix.teacher.narrate import ensure_rationales
+from dynapix.train import distill, export, sft
+from dynapix.train.common.journal import read_journal
+from dynapix.train.export import find_run
+from dynapix.train.on_policy import distillation, paired_prompts, sampling
+from dynapix.train.on_policy.continuation import inherit_settings
+from dynapix.train.on_policy.paired_prompts import PairedPrompts
+from dynapix.train.on_policy.teachers import LocalTeacher, check_tokenizer
 from tests.user_errors import raises_user_error
-from train import distill, export, sft
-from train.common.journal import read_journal
-from train.export import find_run
-from train.on_policy import distillation, paired_prompts, sampling
-from train.on_policy.continuation import inherit_settings
-from train.on_policy.paired_prompts import PairedPrompts
-from train.on_policy.teachers import LocalTeacher, check_tokenizer
 
 pytestmark = pytest.mark.slow
 

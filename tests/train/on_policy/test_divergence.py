@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.nn.functional import log_softmax
 
-from train.on_policy.divergence import estimate_divergence, measure_divergence
+from dynapix.train.on_policy.divergence import estimate_divergence, measure_divergence
 
 
 def binary(p: float) -> torch.Tensor:

@@ -16,18 +16,18 @@ from accelerate.data_loader import BatchSamplerShard
 from torch import nn
 from torch.utils.data import BatchSampler
 
-from conf.entry import Run
-from conf.runs import open_run
-from conf.schema import ReinforceCommand, ReinforceTrainConfig, RewardWeights, SftCommand
-from conf.schema.training import LOSS_TYPES
-from data.store import Store
-from models.student.collator import Collator
-from models.trained_runs import read_trained_settings
+from dynapix.conf.entry import Run
+from dynapix.conf.runs import open_run
+from dynapix.conf.schema import ReinforceCommand, ReinforceTrainConfig, RewardWeights, SftCommand
+from dynapix.conf.schema.training import LOSS_TYPES
+from dynapix.data.store import Store
+from dynapix.models.student.collator import Collator
+from dynapix.models.trained_runs import read_trained_settings
+from dynapix.train import reinforce, sft
+from dynapix.train.common.journal import read_journal
+from dynapix.train.on_policy import reinforcement, sampling
+from dynapix.train.student.trainer import token_losses
 from tests.user_errors import raises_user_error
-from train import reinforce, sft
-from train.common.journal import read_journal
-from train.on_policy import reinforcement, sampling
-from train.student.trainer import token_losses
 
 pytestmark = pytest.mark.slow
 

@@ -12,9 +12,9 @@ import torch
 from torch.nn.functional import log_softmax
 from transformers import AutoModelForImageTextToText, ProcessorMixin
 
-from conf.entry import Run
-from conf.runs import open_run
-from conf.schema import (
+from dynapix.conf.entry import Run
+from dynapix.conf.runs import open_run
+from dynapix.conf.schema import (
     DistillCommand,
     DistillTrainConfig,
     LoraConfig,
@@ -22,23 +22,23 @@ from conf.schema import (
     SftCommand,
     TeacherServerConfig,
 )
-from data.store import Store
-from models import loading
-from models.student.collator import IGNORED, Collator
-from models.student.prompts import Sample
-from models.trained_runs import read_trained_settings
-from teacher.narrate import ensure_rationales
+from dynapix.data.store import Store
+from dynapix.models import loading
+from dynapix.models.student.collator import IGNORED, Collator
+from dynapix.models.student.prompts import Sample
+from dynapix.models.trained_runs import read_trained_settings
+from dynapix.teacher.narrate import ensure_rationales
+from dynapix.train import distill
+from dynapix.train.common.journal import read_journal
+from dynapix.train.on_policy.paired_prompts import load_datasets
+from dynapix.train.on_policy.sampling import encode_prompt
+from dynapix.train.on_policy.served_sampling import build_sampler
+from dynapix.train.on_policy.teachers import ServerTeacher
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.server_process import ServerProcess, vllm_server
 from tests.tiny_models import randomize_adapters
 from tests.train.on_policy.test_distillation import finish_run
 from tests.user_errors import raises_user_error
-from train import distill
-from train.common.journal import read_journal
-from train.on_policy.paired_prompts import load_datasets
-from train.on_policy.sampling import encode_prompt
-from train.on_policy.served_sampling import build_sampler
-from train.on_policy.teachers import ServerTeacher
 
 pytestmark = pytest.mark.slow
 

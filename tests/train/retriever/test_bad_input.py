@@ -14,17 +14,17 @@ from safetensors.torch import load_file, save_file
 from sentence_transformers import SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Dense, Pooling, Transformer
 
-from conf.entry import Run
-from conf.errors import UserError
-from conf.schema import ContrastiveCommand, LateConfig, LoraConfig
-from data import store
-from data.store import load_rows, save_rows, with_checksum
-from models.retriever.embedder import load_retriever
-from models.towers import check_parameter_counts, count_parameters
+from dynapix.conf.entry import Run
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import ContrastiveCommand, LateConfig, LoraConfig
+from dynapix.data import store
+from dynapix.data.store import load_rows, save_rows, with_checksum
+from dynapix.models.retriever.embedder import load_retriever
+from dynapix.models.towers import check_parameter_counts, count_parameters
+from dynapix.train import contrastive
 from tests.families import save_family
 from tests.saved_retrievers import sentence_encoder
 from tests.user_errors import raises_user_error
-from train import contrastive
 
 Rows = list[dict]
 

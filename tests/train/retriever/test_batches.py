@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from train.retriever.batches import QueryBatchSampler, batch_columns
+from dynapix.train.retriever.batches import QueryBatchSampler, batch_columns
 
 
 @pytest.fixture

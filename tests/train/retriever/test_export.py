@@ -13,24 +13,24 @@ import torch
 from huggingface_hub import ModelCard
 from safetensors.torch import load_file
 
-from conf.entry import Run
-from conf.runs import open_run
-from conf.schema import (
+from dynapix.conf.entry import Run
+from dynapix.conf.runs import open_run
+from dynapix.conf.schema import (
     ContrastiveCommand,
     ExportModelCommand,
     LateConfig,
     LoraConfig,
 )
-from models import compat, loading
-from models.resolved_settings import resolve_run
-from models.retriever.embedder import load_retriever, load_trained
-from models.retriever.inputs import frame_input, query_input
+from dynapix.models import compat, loading
+from dynapix.models.resolved_settings import resolve_run
+from dynapix.models.retriever.embedder import load_retriever, load_trained
+from dynapix.models.retriever.inputs import frame_input, query_input
+from dynapix.train import export
+from dynapix.train.common.model_card import write_run_card
+from dynapix.train.common.output_comparison import require_benchmark
 from tests.children import run_card, run_child
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
-from train import export
-from train.common.model_card import write_run_card
-from train.common.output_comparison import require_benchmark
 
 METRICS = {"recall@10_at_start": 0.25, "recall@10": 0.5}
 
@@ -105,7 +105,7 @@ if kind == "one":
 else:
     model = MultiVectorEncoder(folder, device="cpu", trust_remote_code=True)
 embedded = model.encode_query(data["queries"]), model.encode_document(data["frames"])
-assert not {"train", "conf", "data"} & set(sys.modules)
+assert "dynapix" not in sys.modules
 torch.save([[torch.as_tensor(one) for one in some] for some in embedded], outputs)
 """
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 from sentence_transformers import SentenceTransformer
 
-from conf.entry import Run
-from conf.runs import open_run
-from conf.schema import (
+from dynapix.conf.entry import Run
+from dynapix.conf.runs import open_run
+from dynapix.conf.schema import (
     ContrastiveCommand,
     ExportModelCommand,
     LoraConfig,
@@ -20,14 +20,14 @@ from conf.schema import (
     RetrieverConfig,
     SimilarityCommand,
 )
-from data.frames.frame_cache import FrameReader
-from evaluation import retrieve, similarity
-from models.retriever.embedder import load_retriever, load_trained
-from models.retriever.inputs import embed, encode, model_inputs
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.evaluation import retrieve, similarity
+from dynapix.models.retriever.embedder import load_retriever, load_trained
+from dynapix.models.retriever.inputs import embed, encode, model_inputs
+from dynapix.train import contrastive, export
 from tests.children import run_card
 from tests.saved_retrievers import PROMPTS, RETRIEVERS, saved_retriever
 from tests.train.common.test_resume import check_same_weights, train_twice
-from train import contrastive, export
 
 SIZE, FRAMES = 56, 4
 

@@ -19,15 +19,15 @@ from sentence_transformers.util.similarity import maxsim
 from torch.nn.functional import cross_entropy, normalize
 from torch.nn.utils.rnn import pad_sequence
 
-from conf.schema import LateConfig, LoraConfig, RetrieverConfig
-from models.layers.fast_layers import use_fast_layers
-from models.retriever.embedder import load_retriever, tokenizer_texts
-from models.retriever.inputs import Retriever, embed, model_inputs
+from dynapix.conf.schema import LateConfig, LoraConfig, RetrieverConfig
+from dynapix.models.layers.fast_layers import use_fast_layers
+from dynapix.models.retriever.embedder import load_retriever, tokenizer_texts
+from dynapix.models.retriever.inputs import Retriever, embed, model_inputs
+from dynapix.train.retriever.batches import batch_columns
+from dynapix.train.retriever.inputs import RetrieverInputs
+from dynapix.train.retriever.loss import RankingLoss, prefetched
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
-from train.retriever.batches import batch_columns
-from train.retriever.inputs import RetrieverInputs
-from train.retriever.loss import RankingLoss, prefetched
 
 NEGATIVES = 2
 WEIGHTS = [1.0, 0.5]

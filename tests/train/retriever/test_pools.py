@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from conf.entry import Run
-from conf.schema import ContrastiveTrainConfig
-from conf.schema.benchmark import POOLS
-from data.store import Store
+from dynapix.conf.entry import Run
+from dynapix.conf.schema import ContrastiveTrainConfig
+from dynapix.conf.schema.benchmark import POOLS
+from dynapix.data.store import Store
+from dynapix.train import contrastive
+from dynapix.train.common.held_out import held_out_scenes
+from dynapix.train.retriever.batches import batch_columns, split_queries
 from tests.user_errors import raises_user_error
-from train import contrastive
-from train.common.held_out import held_out_scenes
-from train.retriever.batches import batch_columns, split_queries
 
 
 @pytest.mark.parametrize("pools", [["future"], ["counterfactual"], [*POOLS]])

@@ -19,25 +19,25 @@ from transformers import (
     Qwen3ForCausalLM,
 )
 
-from conf.entry import Run
-from conf.errors import UserError
-from conf.runs import open_run
-from conf.schema import (
+from dynapix.conf.entry import Run
+from dynapix.conf.errors import UserError
+from dynapix.conf.runs import open_run
+from dynapix.conf.schema import (
     LoraConfig,
     RetrieverConfig,
     SelectCommand,
     SftCommand,
     StudentConfig,
 )
-from evaluation import select
-from models import loading, resolved_settings
-from models.retriever import embedder
-from models.tiny_qwen3_vl import build_model
-from teacher.journal import Journal
-from teacher.narrate import JOURNAL_FILE, ensure_rationales
+from dynapix.evaluation import select
+from dynapix.models import loading, resolved_settings
+from dynapix.models.retriever import embedder
+from dynapix.models.tiny_qwen3_vl import build_model
+from dynapix.teacher.journal import Journal
+from dynapix.teacher.narrate import JOURNAL_FILE, ensure_rationales
+from dynapix.train import sft
+from dynapix.train.common.checkpoints import newest_checkpoint
 from tests.user_errors import raises_user_error
-from train import sft
-from train.common.checkpoints import newest_checkpoint
 
 
 @pytest.fixture(scope="module")

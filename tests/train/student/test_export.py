@@ -16,9 +16,9 @@ import torch
 from huggingface_hub import ModelCard
 from safetensors.torch import load_file, save_file
 
-from conf.entry import Run
-from conf.runs import open_run
-from conf.schema import (
+from dynapix.conf.entry import Run
+from dynapix.conf.runs import open_run
+from dynapix.conf.schema import (
     ExportModelCommand,
     SelectCommand,
     SftCommand,
@@ -26,20 +26,20 @@ from conf.schema import (
     StudentConfig,
     TeacherConfig,
 )
-from evaluation import select
-from models import compat, loading
-from models.resolved_settings import resolve_run
-from models.student.collator import encode
-from models.student.prompts import selection_sample
-from models.trained_runs import read_trained_settings, run_title
-from teacher.narrate import ensure_rationales
+from dynapix.evaluation import select
+from dynapix.models import compat, loading
+from dynapix.models.resolved_settings import resolve_run
+from dynapix.models.student.collator import encode
+from dynapix.models.student.prompts import selection_sample
+from dynapix.models.trained_runs import read_trained_settings, run_title
+from dynapix.teacher.narrate import ensure_rationales
+from dynapix.train import export
+from dynapix.train.common.model_card import build_model_card, write_run_card
+from dynapix.train.common.output_comparison import ModelOutputs, compare_outputs
+from dynapix.train.student.merge import StudentMerge
 from tests.children import run_card, run_child
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
-from train import export
-from train.common.model_card import build_model_card, write_run_card
-from train.common.output_comparison import ModelOutputs, compare_outputs
-from train.student.merge import StudentMerge
 
 METRICS = {"answer_loss_at_start": 2.5, "answer_loss": 0.375}
 
@@ -145,7 +145,7 @@ batch = processor(
 )
 with torch.no_grad():
     logits = model(**batch).logits
-assert not {"train", "conf", "peft", "bitsandbytes"} & set(sys.modules)
+assert not {"dynapix", "peft", "bitsandbytes"} & set(sys.modules)
 torch.save((batch["input_ids"], logits), outputs)
 """
 

@@ -13,19 +13,25 @@ import torch
 from safetensors.torch import load_file
 from transformers import AutoModelForImageTextToText, AutoProcessor
 
-from conf.entry import Run
-from conf.runs import open_run
-from conf.schema import ExportModelCommand, LoraConfig, SelectCommand, SftCommand, StudentConfig
-from data.records import LETTERS
-from evaluation import select
-from models import loading
-from models.student.chat_format import find_end_token, write_prompt
-from models.student.collator import IGNORED, Collator, encode
-from models.student.prompts import Sample, selection_sample
+from dynapix.conf.entry import Run
+from dynapix.conf.runs import open_run
+from dynapix.conf.schema import (
+    ExportModelCommand,
+    LoraConfig,
+    SelectCommand,
+    SftCommand,
+    StudentConfig,
+)
+from dynapix.data.records import LETTERS
+from dynapix.evaluation import select
+from dynapix.models import loading
+from dynapix.models.student.chat_format import find_end_token, write_prompt
+from dynapix.models.student.collator import IGNORED, Collator, encode
+from dynapix.models.student.prompts import Sample, selection_sample
+from dynapix.train import export, sft
+from dynapix.train.student.dataset import tokenizer_corpus
 from tests.families import FAMILIES, IMAGE_SIZE, save_family
 from tests.train.common.test_resume import check_same_weights
-from train import export, sft
-from train.student.dataset import tokenizer_corpus
 
 END = {
     "qwen2_5_vl": "<|im_end|>", "qwen3_5": "<|im_end|>", "smolvlm": "<end_of_utterance>",

@@ -9,18 +9,18 @@ import pytest
 import torch
 from transformers import EvalPrediction, PreTrainedModel, ProcessorMixin
 
-from conf.schema import LoraConfig
-from data.records import SelectionItem
-from models import loading
-from models.layers.attention import BY_FRAME
-from models.student.collator import IGNORED, Collator, Encoded, encode, letter_ids, pad
-from models.student.prompts import Sample, selection_sample
+from dynapix.conf.schema import LoraConfig
+from dynapix.data.records import SelectionItem
+from dynapix.models import loading
+from dynapix.models.layers.attention import BY_FRAME
+from dynapix.models.student.collator import IGNORED, Collator, Encoded, encode, letter_ids, pad
+from dynapix.models.student.prompts import Sample, selection_sample
+from dynapix.train.student.lazy_samples import LazySample, StudentDataset
+from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.metrics import LetterAccuracy
+from dynapix.train.student.trainer import sample_mean, token_mean
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
-from train.student.lazy_samples import LazySample, StudentDataset
-from train.student.length_sampler import LengthSampler
-from train.student.metrics import LetterAccuracy
-from train.student.trainer import sample_mean, token_mean
 
 # The attention of the language tower and of the vision tower.
 ATTENTIONS = {

@@ -8,26 +8,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conf.schema import SftCommand, SftTrainConfig, TeacherConfig
-from conf.schema.training import REGIMES
-from data.records import LETTERS
-from data.store import Store
-from models.student.answer_parser import parse_choice
-from models.student.collator import encode
-from models.student.prompts import answer_line, choose_instruction
-from models.tiny_qwen3_vl import build_processor
-from teacher.narrate import ensure_rationales
-from teacher.predicates.extraction import extract_predicates
-from teacher.sections import SECTIONS, split_sections
-from teacher.validation.claim_extraction import extract_claims
-from teacher.validation.validator import validate_rationale
-from train.student.dataset import (
+from dynapix.conf.schema import SftCommand, SftTrainConfig, TeacherConfig
+from dynapix.conf.schema.training import REGIMES
+from dynapix.data.records import LETTERS
+from dynapix.data.store import Store
+from dynapix.models.student.answer_parser import parse_choice
+from dynapix.models.student.collator import encode
+from dynapix.models.student.prompts import answer_line, choose_instruction
+from dynapix.models.tiny_qwen3_vl import build_processor
+from dynapix.teacher.narrate import ensure_rationales
+from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.sections import SECTIONS, split_sections
+from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.validator import validate_rationale
+from dynapix.train.student.dataset import (
     SupervisedItem,
     load_datasets,
     supervised_items,
     tokenizer_corpus,
 )
-from train.student.lazy_samples import StudentDataset
+from dynapix.train.student.lazy_samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
 COT = [r for r in REGIMES if r != "answer_only"]

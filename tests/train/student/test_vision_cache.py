@@ -9,16 +9,16 @@ import pytest
 import torch
 from torch import nn
 
-from conf.entry import Run
-from models.loading import load_student
-from models.student.collator import Collator
-from models.student.prompts import Clip, Sample, build_sample, selection_sample
+from dynapix.conf.entry import Run
+from dynapix.models.loading import load_student
+from dynapix.models.student.collator import Collator
+from dynapix.models.student.prompts import Clip, Sample, build_sample, selection_sample
+from dynapix.train import sft
+from dynapix.train.common.journal import read_journal
+from dynapix.train.student.trainer import TrainerCollator, token_mean
+from dynapix.train.student.vision_cache import PAIRS, VisionCache, pair_digests
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
-from train import sft
-from train.common.journal import read_journal
-from train.student.trainer import TrainerCollator, token_mean
-from train.student.vision_cache import PAIRS, VisionCache, pair_digests
 
 PLENTY = 1 << 40
 """A limit in bytes that no test reaches."""

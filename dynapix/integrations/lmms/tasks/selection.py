@@ -22,10 +22,10 @@ from datasets import Dataset, DatasetDict
 from lmms_eval.api.task import ConfigurableMessagesTask
 from PIL import Image
 
-from conf.errors import UserError
 from dynapix.benchmark import Item, load
+from dynapix.conf.errors import UserError
 from dynapix.integrations import TOKENS
-from models.student.answer_parser import parse_choice
+from dynapix.models.student.answer_parser import parse_choice
 
 
 class SelectionTask(ConfigurableMessagesTask):

@@ -17,17 +17,17 @@ from pathlib import Path
 
 import verifiers.v1 as vf
 
-from conf.compose import compose
-from conf.errors import UserError
-from conf.schema import BuildCommand, TeacherConfig
-from conf.schema.training import RewardWeights
-from data.build import ensure_benchmark
-from data.store import Store
 from dynapix.benchmark import Benchmark, Item, load
+from dynapix.conf.compose import compose
+from dynapix.conf.errors import UserError
+from dynapix.conf.schema import BuildCommand, TeacherConfig
+from dynapix.conf.schema.training import RewardWeights
+from dynapix.data.build import ensure_benchmark
+from dynapix.data.store import Store
 from dynapix.integrations import TOKENS
-from teacher.predicates.facts import RelationalPredicates
-from teacher.predicates.vocabulary import describe_item
-from train.rewards import REWARDS, JudgedResponse, judge_response
+from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.predicates.vocabulary import describe_item
+from dynapix.train.rewards import REWARDS, JudgedResponse, judge_response
 
 WEIGHTS = RewardWeights()
 
