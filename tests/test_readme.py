@@ -37,11 +37,11 @@ def run_folder(command: str, overrides: list[str]) -> str:
 def test_named_modules_exist() -> None:
     for page in PAGES:
         for module in re.findall(r"python -m\s+([\w.]+)", page.read_text()):
-            is_benchmark = module.startswith("benchmarks.")
+            is_script = module.startswith(("benchmarks.", "research."))
             path = ROOT / f"{module.replace('.', '/')}.py"
             is_program = (ROOT / module.replace(".", "/") / "__main__.py").exists()
-            is_command = module in SCHEMAS or is_program
-            assert path.exists() if is_benchmark else is_command, f"{page.name}: {module}"
+            is_command = module.removeprefix("dynapix.") in SCHEMAS or is_program
+            assert path.exists() if is_script else is_command, f"{page.name}: {module}"
 
 
 @pytest.mark.slow
