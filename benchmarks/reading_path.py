@@ -20,6 +20,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from importlib import import_module
+from inspect import CO_OPTIMIZED
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
@@ -62,7 +63,8 @@ def walk(act: Callable[[], Any], end: CodeType | None = None) -> list[str]:
         code = frame.f_code
         if event == "call" and code is end:
             raise Arrived
-        if event == "call" and code.co_name != "<module>":
+        # The body of a module or class is no function, and has no fast locals.
+        if event == "call" and code.co_flags & CO_OPTIMIZED:
             files[code.co_filename] = None
 
     try:
