@@ -19,6 +19,7 @@ from dynapix.teacher.predicates.facts import (
 )
 from dynapix.teacher.predicates.relations import (
     CHANGES,
+    DISPLACED,
     SYMMETRIC,
     find_topic,
     flip_relation,
@@ -191,7 +192,7 @@ class RelationalWriter(Writer):
         shown = {v.letter: v.places.image[name] for v in views if name in v.places.image}
         distances = sorted((math.dist(place, target), letter) for letter, place in shown.items())
         (nearest, letter), *others = distances or [(math.inf, None)]
-        if any(d - nearest < self.facts.bounds.displaced for d, _ in others):
+        if any(d - nearest < DISPLACED for d, _ in others):
             return None
         return letter
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.conf.schema import TeacherConfig
 from dynapix.data.records import Scene
 from dynapix.teacher.narrator import write_rationale
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary
@@ -18,7 +18,6 @@ from dynapix.teacher.validation.grader import RationaleGrader
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 
-BOUNDS = RelationBounds()
 SUFFICIENT = "Prediction: At the target moment, the {a} will be {place}."
 
 
@@ -38,7 +37,7 @@ def _sufficiency(prediction: str, scene: Scene) -> float:
     from dynapix.teacher.predicates.extraction import extract_predicates
 
     item = synthetic.item((60, 70, 80, 90))
-    predicates = extract_predicates(item, scene, None, BOUNDS)
+    predicates = extract_predicates(item, scene, None)
     first, second = (o.noun_phrase for o in scene.objects)
     text = f"Prediction: {prediction.format(b=first, a=second)}\nOutcome: none."
     return measure_sufficiency(text, extract_claims(text, predicates), predicates)
@@ -67,7 +66,7 @@ def test_sufficiency_is_the_chance_of_a_reader_who_knows_only_the_prediction(
 
 
 def test_only_the_prediction_counts() -> None:
-    for item, predicates in random_cases(20, BOUNDS):
+    for item, predicates in random_cases(20, relational=True):
         text = write_rationale(predicates, item, 0)
         claims = extract_claims(text, predicates)
         without = "\n".join(x for x in text.splitlines() if not x.startswith("Prediction"))
@@ -78,7 +77,7 @@ def test_only_the_prediction_counts() -> None:
 def test_a_rationale_that_does_not_decide_a_decidable_item_is_insufficient() -> None:
     """The paper's words decide fewer items than relations."""
     reasons = {"paper": set(), "relational": set()}
-    for item, predicates in random_cases(60, BOUNDS):
+    for item, predicates in random_cases(60, relational=True):
         for vocabulary, found in reasons.items():
             cfg = TeacherConfig(name="t", predicates=vocabulary, sufficient=True)
             text = write_rationale(choose_vocabulary(predicates, cfg), item, 0)
