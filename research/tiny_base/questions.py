@@ -42,7 +42,7 @@ from dynapix.teacher.predicates.relations import (
     flip_relation,
     normalize_relation,
 )
-from dynapix.teacher.statement_choice import Decision, choose_statements
+from dynapix.teacher.predicates.statement_choice import Decision, choose_statements
 from dynapix.teacher.writers.paper import Detail, join_sentences
 from dynapix.teacher.writers.relational import RelationalWriter, leave_out_unseen
 

@@ -13,13 +13,13 @@ from dynapix.teacher.cited_rationales import CITED_VERSION
 from dynapix.teacher.narrator import NARRATOR_VERSION
 from dynapix.teacher.predicates.facts import RelationalPredicates
 from dynapix.teacher.predicates.relations import BOUNDS
+from dynapix.teacher.predicates.statement_choice import choose_statements
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary, name_vocabulary
 from dynapix.teacher.prompts import PROMPT_VERSION
 from dynapix.teacher.reading.claims import VERDICTS
 from dynapix.teacher.sections import GRAMMAR_VERSION
 from dynapix.teacher.servers.responses import Response
-from dynapix.teacher.statement_choice import choose_statements
-from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.validation.sufficiency import measure_sufficiency
 from dynapix.teacher.validation.validator import VALIDATOR_VERSION, Validation, validate_rationale
 
 MAX_CHARACTERS = 20_000

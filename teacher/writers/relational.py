@@ -25,7 +25,7 @@ from dynapix.teacher.predicates.relations import (
     flip_relation,
     normalize_relation,
 )
-from dynapix.teacher.statement_choice import Decision
+from dynapix.teacher.predicates.statement_choice import Decision
 from dynapix.teacher.writers.paper import Detail, Writer
 
 PHRASES = yaml.safe_load((files("dynapix.teacher") / "templates" / "relations.yaml").read_text())
@@ -64,9 +64,9 @@ class RelationalWriter(Writer):
     """Writes the sections of a rationale from relational predicates.
 
     The prediction begins with the statements that decide the item (see
-    `teacher.statement_choice`). The candidate analysis describes each candidate by the topics of
-    these statements only. The outcome names the candidate that shows the object of the first
-    statement closest to its place.
+    `teacher.predicates.statement_choice`). The candidate analysis describes each candidate by the
+    topics of these statements only. The outcome names the candidate that shows the object of the
+    first statement closest to its place.
     Other objects that are out of view at the cut are left out.
     """
 

@@ -16,7 +16,7 @@ from dynapix.models.student.collator import IGNORED, encode
 from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.facts import RelationalPredicates, View
 from dynapix.teacher.predicates.relations import normalize_relation
-from dynapix.teacher.statement_choice import choose_statements
+from dynapix.teacher.predicates.statement_choice import choose_statements
 from dynapix.teacher.validation.claim_extraction import extract_claims
 from research.tiny_base.questions import (
     ASK,

@@ -23,8 +23,8 @@ from dynapix.teacher.journal import read_rationales
 from dynapix.teacher.narrate import narrate_store
 from dynapix.teacher.predicates.vocabulary import describe_item, name_vocabulary
 from dynapix.teacher.prompts import build_messages
-from dynapix.teacher.sufficiency import measure_sufficiency
 from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.sufficiency import measure_sufficiency
 from dynapix.teacher.validation.validator import validate_rationale
 from tests.teacher.faulty_server import FaultyServer, teacher_at
 from tests.teacher.memory_store import MemoryStore

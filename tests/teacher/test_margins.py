@@ -8,7 +8,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from dynapix.teacher import statement_choice
+from dynapix.teacher.predicates import statement_choice
 from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.facts import REGIONS, Relation, RelationalPredicates
 from dynapix.teacher.predicates.margins import measure_margin
@@ -19,8 +19,8 @@ from dynapix.teacher.predicates.relations import (
     find_relations,
     normalize_relation,
 )
+from dynapix.teacher.predicates.statement_choice import choose_statements
 from dynapix.teacher.prompts import format_facts
-from dynapix.teacher.statement_choice import choose_statements
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 from tests.teacher.test_relations import A, B, C, places, random_places

@@ -20,9 +20,13 @@ from dynapix.teacher.predicates.relations import (
     describe_distance,
     normalize_relation,
 )
-from dynapix.teacher.statement_choice import UNSEEN_DISTANCE, choose_statements, measure_separation
-from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.predicates.statement_choice import (
+    UNSEEN_DISTANCE,
+    choose_statements,
+    measure_separation,
+)
 from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.sufficiency import measure_sufficiency
 from dynapix.teacher.validation.validator import validate_rationale
 from dynapix.teacher.writers.relational import RelationalWriter
 from tests.teacher.test_predicates import random_cases

@@ -12,9 +12,9 @@ from dynapix.data.records import Scene
 from dynapix.teacher.narrator import write_rationale
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary
 from dynapix.teacher.servers.responses import Response
-from dynapix.teacher.sufficiency import find_predicted, measure_sufficiency
 from dynapix.teacher.validation.claim_extraction import extract_claims
 from dynapix.teacher.validation.grader import RationaleGrader
+from dynapix.teacher.validation.sufficiency import find_predicted, measure_sufficiency
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 
