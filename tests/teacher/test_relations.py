@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations, permutations
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -85,30 +85,20 @@ def test_between_follows_its_bounds(share: float, offset: float, between: bool) 
     assert (((A, B, C), "between") in values(found, "between")) == between
 
 
-def test_nearer_and_extremes_follow_their_bounds() -> None:
+def test_nearer_follows_its_bound() -> None:
     found = find_relations(places(a=(0.3, 0.3), b=(0.2, 0.3), c=(0.43, 0.3)))
     assert ((A, B, C), "nearer to") in values(found, "nearer")
-    assert values(found, "extreme") == {((B,), "leftmost"), ((C,), "rightmost")}
     found = find_relations(places(a=(0.3, 0.3), b=(0.2, 0.3), c=(0.42, 0.3)))
     assert [v for o, v in values(found, "nearer") if o[0] == A] == ["as near to"]
-    level = find_relations(places(a=(0.3, 0.3), b=(0.33, 0.3), c=(0.8, 0.5)))
-    assert ((A,), "leftmost") not in values(level, "extreme")
-
-
-def test_lower_object_covers_one_that_is_partly_hidden() -> None:
-    seen = places(a=(0.5, 0.5), b=(0.52, 0.45))
-    hidden = seen._replace(fraction={A: 1.0, B: 0.6})
-    assert values(find_relations(seen), "cover") == set()
-    assert values(find_relations(hidden), "cover") == {((A, B), "in front of")}
-    unknown = seen._replace(fraction={A: float("nan"), B: float("nan")})
-    assert values(find_relations(unknown), "cover") == set()
 
 
 @pytest.mark.parametrize(
     ("fraction", "distance", "covers"),
-    [(0.89, 0.11, True), (0.91, 0.11, False), (0.89, 0.13, False)],
+    [(0.89, 0.11, True), (0.91, 0.11, False), (0.89, 0.13, False), (float("nan"), 0.11, False)],
 )
-def test_covering_follows_its_bounds(fraction: float, distance: float, covers: bool) -> None:
+def test_lower_object_covers_a_near_one_that_is_partly_hidden(
+    fraction: float, distance: float, covers: bool
+) -> None:
     where = places(a=(0.5, 0.5), b=(0.5, 0.5 - distance))
     hidden = where._replace(fraction={A: 1.0, B: fraction})
     found = values(find_relations(hidden), "cover")
@@ -189,15 +179,6 @@ def test_objects_that_look_alike_have_no_relations() -> None:
     twins = replace(scene, objects=(scene.objects[0], scene.objects[0], scene.objects[2]))
     assert len(Places.from_frame(scene, 0).image) == 3
     assert list(Places.from_frame(twins, 0).image) == [scene.objects[2].noun_phrase]
-
-
-@pytest.mark.parametrize("order", list(permutations(range(2))))
-def test_interchangeable_objects_state_the_same(order: tuple[int, int]) -> None:
-    found = places(a=(0.3, 0.5), b=(0.6, 0.5))
-    relations = find_relations(found)
-    names = [(A, B)[k] for k in order]
-    value = "left of" if order == (0, 1) else "right of"
-    assert normalize_relation(Relation("side", tuple(names), value)) in relations
 
 
 @pytest.mark.parametrize("words", [{"min_words": 100}, {"max_words": 200}])
