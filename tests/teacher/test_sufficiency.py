@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dynapix.conf.schema import TeacherConfig
-from dynapix.data.records import Scene
 from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary
 from dynapix.teacher.servers.responses import Response
 from dynapix.teacher.validation.claim_extraction import extract_claims
@@ -17,8 +17,6 @@ from dynapix.teacher.validation.grader import RationaleGrader
 from dynapix.teacher.validation.sufficiency import find_predicted, measure_sufficiency
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
-
-SUFFICIENT = "Prediction: At the target moment, the {a} will be {place}."
 
 
 def sufficiency_of(prediction: str, pixels: list[tuple[float, float]]) -> float:
@@ -30,14 +28,7 @@ def sufficiency_of(prediction: str, pixels: list[tuple[float, float]]) -> float:
     for frame, pixel in zip((60, 70, 80, 90), pixels, strict=True):
         positions[frame, 1, :2], image[frame, 1] = synthetic.on_ground(pixel)[:2], pixel
     scene = replace(still, positions=positions, image_positions=image, collisions=())
-    return _sufficiency(prediction, scene)
-
-
-def _sufficiency(prediction: str, scene: Scene) -> float:
-    from dynapix.teacher.predicates.extraction import extract_predicates
-
-    item = synthetic.item((60, 70, 80, 90))
-    predicates = extract_predicates(item, scene, None)
+    predicates = extract_predicates(synthetic.item((60, 70, 80, 90)), scene, None)
     first, second = (o.noun_phrase for o in scene.objects)
     text = f"Prediction: {prediction.format(b=first, a=second)}\nOutcome: none."
     return measure_sufficiency(text, extract_claims(text, predicates), predicates)
