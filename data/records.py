@@ -343,10 +343,10 @@ class Rationale:
     """Vocabulary of the predicates from which the text is written, and its version."""
     sufficiency: float | None = None
     """Probability that a reader who knows only the prediction picks the target; None if it was not
-    measured (see `teacher.sufficiency`)."""
+    measured (see `teacher.validation.sufficiency`)."""
     undecided: bool = False
     """Whether there is a distractor of which all statements about the target's frame are true
-    (`teacher.statement_choice`)."""
+    (`teacher.predicates.statement_choice`)."""
     sample: str | None = None
     """The random sample of items that was narrated when the text was written; None for all."""
 

@@ -11,8 +11,8 @@ from dynapix.teacher.numbers.detection import find_numbers
 from dynapix.teacher.predicates.facts import RelationalPredicates
 from dynapix.teacher.predicates.vocabulary import describe_item
 from dynapix.teacher.reading.claims import VERDICTS, Claim
-from dynapix.teacher.sufficiency import measure_sufficiency
 from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.sufficiency import measure_sufficiency
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 from dynapix.conf.schema.servers import NARRATOR_WORDS
 from dynapix.data.records import SelectionItem
 from dynapix.teacher.predicates.facts import Predicates, RelationalPredicates
-from dynapix.teacher.statement_choice import Decision, choose_statements
+from dynapix.teacher.predicates.statement_choice import Decision, choose_statements
 from dynapix.teacher.writers.paper import Detail, Writer, join_sentences
 from dynapix.teacher.writers.relational import RelationalWriter
 

@@ -17,8 +17,8 @@ from dynapix.data.records import SelectionItem
 from dynapix.teacher.cited_rationales import CONNECTIVES, list_facts
 from dynapix.teacher.predicates.facts import Predicates, Relation, RelationalPredicates
 from dynapix.teacher.predicates.relations import find_topic
+from dynapix.teacher.predicates.statement_choice import choose_statements
 from dynapix.teacher.sections import SECTIONS
-from dynapix.teacher.statement_choice import choose_statements
 
 TEMPLATES = files("dynapix.teacher") / "templates"
 SYSTEM = (TEMPLATES / "system_prompt.txt").read_text().rstrip()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from importlib.resources import files
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dynapix.conf.files import write_json, write_text
-from dynapix.data.records import COLORS, MATERIALS, Rationale, SelectionItem
+from dynapix.data.records import Rationale, SelectionItem
 from dynapix.teacher.predicates.grounding import Grounding
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary, name_vocabulary
 from dynapix.teacher.prompts import format_facts
@@ -29,11 +28,8 @@ Figures = dict[str, Any]
 
 EXAMPLES = 3
 """Maximum number of rejected responses that are quoted for each reason."""
-COMMON_WORDS = 20
-"""Number of the most frequent words that are listed."""
 IDLE_SECONDS = 60.0
 """Time (s) without any response from which the servers count as idle."""
-OBJECT_NAME = re.compile(rf"\b(?:{'|'.join(COLORS)}) (?:{'|'.join(MATERIALS)}) \w+")
 
 
 def summarize(
@@ -52,9 +48,7 @@ def summarize(
     - `constraints`: numbers of responses by the grammar or schema that constrained them.
     - `responses` and `accepted_responses`: numbers of the teacher's responses, by attempt.
     - `rejected`: number of responses by kind of reason; `examples`: items and details of some.
-    - `lengths`: number of words of each accepted rationale; `words`: the most frequent words.
-    - `same_text`: number of accepted rationales with the text of an earlier one; `same_but_names`:
-      the same if the names of objects are ignored.
+    - `lengths`: number of words of each accepted rationale.
     - `sufficiency`: mean sufficiency of the accepted rationales, and share of those with
       sufficiency 1, over all items, by family and by difficulty. `undecided`: number of items with
       a response that the statements about the target's frame do not decide.
@@ -63,7 +57,6 @@ def summarize(
     """
     every = [r for item in items for r in responses.get(item.item_id, ())]
     accepted = select_accepted(items, responses)
-    without_names = {OBJECT_NAME.sub("object", r.text) for r in accepted}
     narrated = {r.item_id for r in every}
     open_items = narrated - {r.item_id for r in accepted} - set(unanswered)
     by_attempt = Counter(r.attempt for r in every if not r.fallback)
@@ -73,7 +66,6 @@ def summarize(
         for kind, detail in rejection_reasons(r).items():
             rejections[kind].append((r.item_id, detail))
     rejections = dict(sorted(rejections.items(), key=lambda pair: (-len(pair[1]), pair[0])))
-    words = Counter(word for r in accepted for word in WORD.findall(r.text.lower()))
     claims: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))
     for r in every:
         for kind, counts in r.claims.items():
@@ -93,10 +85,6 @@ def summarize(
         "rejected": {kind: len(details) for kind, details in rejections.items()},
         "examples": {kind: details[:EXAMPLES] for kind, details in rejections.items()},
         "lengths": [len(WORD.findall(r.text)) for r in accepted],
-        "words": dict(words.most_common(COMMON_WORDS)),
-        "distinct_words": len(words),
-        "same_text": len(accepted) - len({r.text for r in accepted}),
-        "same_but_names": len(accepted) - len(without_names),
         "sufficiency": _summarize_sufficiency(items, accepted),
         "undecided": len({r.item_id for r in every if r.undecided}),
         "claims": {kind: counts.tolist() for kind, counts in sorted(claims.items())},
@@ -191,7 +179,7 @@ def format_figures(figures: Figures) -> str:
         pd.Series(counts).to_string(),
         *(_format_table(table) for table in (attempts, rejected)),
         "\n".join(examples),
-        _format_words(f) if f["accepted"] else "",
+        _format_lengths(f["lengths"]) if f["accepted"] else "",
         _format_table(sufficiency.astype({"rationales": int}).rename_axis("sufficiency")),
         _format_table(claims.rename_axis("claims")),
         _format_cost(f) if f["requests"] else "",
@@ -203,18 +191,12 @@ def _format_table(table: pd.DataFrame) -> str:
     return "" if table.empty else table.to_string(float_format="{:.1%}".format, na_rep="none")
 
 
-def _format_words(figures: Figures) -> str:
-    lengths = figures["lengths"]
+def _format_lengths(lengths: Sequence[int]) -> str:
     low, median, high = np.percentile(lengths, [5, 50, 95])
-    lines = [
+    return (
         f"words per rationale: {min(lengths)} to {max(lengths)}, mean {np.mean(lengths):.0f}, "
-        f"median {median:.0f}, 5% to 95% {low:.0f} to {high:.0f}",
-        f"vocabulary: {figures['distinct_words']:,} distinct words; most frequent: "
-        + ", ".join(f"{word} {count:,}" for word, count in figures["words"].items()),
-        f"duplicates: {figures['same_text']:,} accepted rationales repeat another one's text, "
-        f"{figures['same_but_names']:,} do so up to the objects' names",
-    ]
-    return "\n".join(lines)
+        f"median {median:.0f}, 5% to 95% {low:.0f} to {high:.0f}"
+    )
 
 
 def _format_cost(figures: Figures) -> str:

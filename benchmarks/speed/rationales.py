@@ -22,9 +22,9 @@ from dynapix.conf.failures import report_failures
 from dynapix.conf.schema import TeacherConfig
 from dynapix.data.store import open_store
 from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.statement_choice import choose_statements
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary, describe_item
-from dynapix.teacher.statement_choice import choose_statements
-from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.validation.sufficiency import measure_sufficiency
 from dynapix.teacher.validation.validator import validate_rationale
 
 ITEMS = 10_000

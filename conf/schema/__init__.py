@@ -44,7 +44,6 @@ from dynapix.conf.schema.models import (
     StudentConfig,
 )
 from dynapix.conf.schema.servers import (
-    RelationBounds,
     SamplingServerConfig,
     ServerConfig,
     ServersConfig,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from dynapix.conf.schema.settings import MISSING, Settings, is_url, path, setting
@@ -100,55 +100,6 @@ class SamplingServerConfig(ServersConfig):
 
 
 @dataclass
-class RelationBounds(Settings):
-    """Bounds of the words for relations between objects (`teacher.predicates=relational`)."""
-
-    level: float = setting(0.04, above=0, below=1)
-    """Share of the image's width or height below which two objects are aligned or level, and by
-    which the leftmost object must lie to the left of all others."""
-    against: float = setting(0.15, above=0)
-    """Gap, as a share of an object's width, below which two objects are against each other."""
-    near: float = setting(1.0, above=0)
-    """Gap, as a share of an object's width, below which two objects are near each other."""
-    between_ends: float = setting(0.2, least=0, below=0.5)
-    """An object between two others divides their distance; each part has at least this share."""
-    between_offset: float = setting(0.25, above=0)
-    """Maximum distance of an object between two others from the line through them, as a share of
-    their distance."""
-    nearer: float = setting(1.25, above=1)
-    """a is nearer to b than to c if it is at least this many times as far from c as from b."""
-    covered: float = setting(0.9, above=0, most=1)
-    """An object is partly hidden if its visible fraction is below this. A close object that is
-    lower in the image is then in front of it."""
-    cover_distance: float = setting(0.12, above=0)
-    """Maximum distance in the image of an object from one that it covers, as a share of the
-    width."""
-    edge: float = setting(0.06, above=0, below=0.5)
-    """Distance from the image's edge, as a share of its width or height, below which an object has
-    reached the edge."""
-    # The paper's vocabulary has the same bounds: 12 and 40 pixels of an image of 336 pixels.
-    displaced: float = setting(12 / 336, above=0)
-    """Distance of an object in a candidate from its place at the target, as a share of the image,
-    from which it is "slightly off"."""
-    clearly: float = setting(40 / 336, above=0)
-    """Distance, as above, from which it is "clearly off"."""
-    far: float = setting(0.25, above=0, below=1)
-    """Distance, as above, from which it is "far off"."""
-
-    def find_problems(self, group: str) -> Iterator[str]:
-        if self.against >= self.near:
-            yield (
-                f"{group}against={self.against:g} and {group}near={self.near:g}: objects against "
-                "each other are nearer than near ones, so against must be less"
-            )
-        if not self.displaced < self.clearly < self.far:
-            yield (
-                f"{group}displaced={self.displaced:g}, {group}clearly={self.clearly:g} and "
-                f"{group}far={self.far:g}: each must be greater than the one before"
-            )
-
-
-@dataclass
 class TeacherConfig(ServersConfig):
     """The teacher: a model on servers or, without a server, the built-in narrator."""
 
@@ -165,8 +116,6 @@ class TeacherConfig(ServersConfig):
     """Facts of the rationales: those of the simulator; those of the same prefix with a future at
     constant velocity; or those of another scene. The answers are right in each case. Only the first
     are validated against the simulator's record."""
-    bounds: RelationBounds = field(default_factory=RelationBounds)
-    """Bounds of the words for relations."""
     sufficient: bool = False
     """Reject rationales whose prediction fits a distractor as well."""
     strict: bool = True

@@ -26,7 +26,6 @@ from pydantic import TypeAdapter
 
 from benchmarks.arguments import positive_int
 from dynapix.conf.failures import report_failures
-from dynapix.conf.schema import RelationBounds
 from dynapix.data.store import open_store
 from dynapix.teacher.narrator import write_rationale
 from dynapix.teacher.predicates.extraction import extract_predicates
@@ -49,8 +48,8 @@ def main() -> None:
     misses: dict[str, list[str]] = defaultdict(list)
     claims: Counter[tuple[str, str]] = Counter()
     rejected = 0
-    bounds = RelationBounds() if args.predicates == "relational" else None
-    for number, (item_id, text, predicates) in enumerate(read_rationales(args.source, bounds)):
+    relational = args.predicates == "relational"
+    for number, (item_id, text, predicates) in enumerate(read_rationales(args.source, relational)):
         if number == args.limit:
             break
         claims.update((claim.kind, claim.verdict) for claim in extract_claims(text, predicates))
@@ -80,10 +79,10 @@ def main() -> None:
 
 
 def read_rationales(
-    source: Path, bounds: RelationBounds | None = None
+    source: Path, relational: bool = False
 ) -> Iterator[tuple[str, str, Predicates]]:
-    """Yield the item id, text and predicates of each rationale. With `bounds`, the narrator of a
-    benchmark's rationales uses relations."""
+    """Yield the item id, text and predicates of each rationale. The narrator of a
+    benchmark's rationales uses relations if `relational` is true."""
     if source.is_file():
         for line in source.read_text().splitlines():
             record = json.loads(line)
@@ -91,9 +90,10 @@ def read_rationales(
         return
     store = open_store(source)
     for item in store.selection("train"):
-        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene, bounds)
+        predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
         if predicates is not None:
-            yield item.item_id, write_rationale(predicates, item, 0), predicates
+            found = predicates if relational else predicates.without_relations()
+            yield item.item_id, write_rationale(found, item, 0), found
 
 
 def is_contradicted(text: str, predicates: Predicates) -> bool:

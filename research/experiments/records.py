@@ -11,7 +11,6 @@ from typing import Any
 
 import pandas as pd
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.data.checks.intervals import Interval
 from dynapix.data.records import FAMILIES, SelectionItem
 from dynapix.data.store import Store
@@ -32,7 +31,7 @@ def count_claims(
     many of the claims about the prefix and the prediction are about objects out of view at the cut;
     none for an item without predicates."""
     scene = store.scene(item.scene_id)
-    predicates = extract_predicates(item, scene, store.scene, RelationBounds())
+    predicates = extract_predicates(item, scene, store.scene)
     if predicates is None:
         return
     reasons = read_response(response.text, response.letter, item.letter, predicates)

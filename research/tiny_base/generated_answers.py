@@ -28,7 +28,7 @@ from math import dist, inf
 
 from transformers import PreTrainedModel, ProcessorMixin
 
-from dynapix.conf.schema import RelationBounds, StudentConfig
+from dynapix.conf.schema import StudentConfig
 from dynapix.data.records import LETTERS, SelectionItem
 from dynapix.models.student.collator import Collator
 from dynapix.models.student.generation import generate
@@ -110,7 +110,7 @@ def _read(
 ) -> list[tuple[str, bool]]:
     """Return what an answer says, by the kind of word or claim, and whether it is right."""
     scene = sampler.frames.scene
-    predicates = extract_predicates(item, scene(item.scene_id), scene, RelationBounds())
+    predicates = extract_predicates(item, scene(item.scene_id), scene)
     claims = [c for c in extract_claims(text, predicates) if c.kind != "mention"]
     decided = [c for c in claims if c.verdict != "unknown"]
     read = [(claim.kind, claim.verdict == "supported") for claim in decided]

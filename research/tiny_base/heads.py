@@ -37,7 +37,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, smooth_l1_loss
 
-from dynapix.teacher.statement_choice import UNSEEN_DISTANCE
+from dynapix.teacher.predicates.statement_choice import UNSEEN_DISTANCE
 from research.tiny_base.oracle_targets import AHEAD, PICTURES, OracleTargets
 
 AHEADS = tuple(f"ahead_{frames}" for frames in AHEAD)
@@ -276,7 +276,7 @@ def regression_loss(predicted: Tensor, true: Tensor, scale: float) -> Tensor:
 
 def measure_separations(places: Tensor) -> Tensor:
     """Return the separation (M,) of the places of objects in the candidates (see
-    `teacher.statement_choice.measure_separation`); NaN if no candidate shows the object.
+    `teacher.predicates.statement_choice.measure_separation`); NaN if no candidate shows the object.
 
     Args:
         places: (M, 2 * PICTURES) places in the clip and in the candidates, NaN where the object is

@@ -18,7 +18,7 @@ from dynapix.data.records import COLORS, LETTERS, MATERIALS, SHAPES, Scene
 from dynapix.teacher.predicates.facts import COMPASS
 from dynapix.teacher.predicates.motion import motion_start
 from dynapix.teacher.predicates.relations import EXTENTS
-from dynapix.teacher.statement_choice import measure_separation
+from dynapix.teacher.predicates.statement_choice import measure_separation
 
 WORDS = {"color": COLORS, "material": MATERIALS, "shape": SHAPES}
 """The words of a noun phrase, in their order."""

@@ -29,7 +29,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.data.oracle.displacement import frame_displacements
 from dynapix.data.records import Candidate, Scene, SelectionItem
 from dynapix.models.student.prompts import build_response
@@ -43,7 +42,7 @@ from dynapix.teacher.predicates.relations import (
     flip_relation,
     normalize_relation,
 )
-from dynapix.teacher.statement_choice import Decision, choose_statements
+from dynapix.teacher.predicates.statement_choice import Decision, choose_statements
 from dynapix.teacher.writers.paper import Detail, join_sentences
 from dynapix.teacher.writers.relational import RelationalWriter, leave_out_unseen
 
@@ -234,13 +233,13 @@ def make_question(
         scene_of: Returns a scene by its id.
     """
     scene = scene_of(item.scene_id)
-    predicates = extract_predicates(item, scene, scene_of, RelationBounds())
+    predicates = extract_predicates(item, scene, scene_of)
     if kind != "explain":
         return ASK[kind](predicates, item, rng)
     other = replace_target(item, scene, rng)
     if other is None:
         return ask_first_steps(predicates, item, rng)
-    shown = extract_predicates(other, scene, scene_of, RelationBounds()).views
+    shown = extract_predicates(other, scene, scene_of).views
     question = ask_explain(predicates, shown, item, rng)
     return replace(question, instead=other.candidates[item.answer])
 

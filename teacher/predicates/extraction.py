@@ -8,7 +8,6 @@ from math import dist, hypot
 
 import numpy as np
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.data.oracle.contacts import collisions_in, next_collision
 from dynapix.data.oracle.displacement import MODEL_SIZE
 from dynapix.data.records import CONTACT, LETTERS, Candidate, Scene, SelectionItem
@@ -18,7 +17,6 @@ from dynapix.teacher.predicates.facts import (
     Difference,
     Facts,
     ObjectFacts,
-    Predicates,
     Relation,
     RelationalPredicates,
     View,
@@ -87,16 +85,12 @@ def extract_facts(
 
 
 def extract_predicates(
-    item: SelectionItem,
-    scene: Scene,
-    scene_of: Callable[[str], Scene],
-    bounds: RelationBounds | None = None,
-) -> Predicates | None:
+    item: SelectionItem, scene: Scene, scene_of: Callable[[str], Scene]
+) -> RelationalPredicates | None:
     """Return the predicates of an item; None if the prefix is too short (see `find_cut`).
 
     Args:
         scene_of: Returns a scene by its id; it is called for candidates from other scenes.
-        bounds: Bounds of relations; without them, the result is not `RelationalPredicates`.
     """
     facts = extract_facts(
         scene, item.prefix_start, item.prefix_stop, item.target_frame, name_moment(item)
@@ -117,10 +111,8 @@ def extract_predicates(
         else _candidate_facts(letter, scene, item.target_frame, candidate, scene_of)
         for letter, candidate in zip(LETTERS, item.candidates, strict=True)
     )
-    if bounds is None:
-        return Predicates(**vars(facts), candidates=candidates)
     cut = find_cut(scene, item.prefix_start, item.prefix_stop)
-    observed, paths, views = _describe_views(item, facts.objects, scene, scene_of, cut, bounds)
+    observed, paths, views = _describe_views(item, facts.objects, scene, scene_of, cut)
     order = np.argsort(scene.image_positions[cut, :, 0], kind="stable")
     return RelationalPredicates(
         **vars(facts),
@@ -129,7 +121,6 @@ def extract_predicates(
         paths=paths,
         observed=observed,
         views=views,
-        bounds=bounds,
     )
 
 
@@ -150,7 +141,6 @@ def _describe_views(
     scene: Scene,
     scene_of: Callable[[str], Scene],
     cut: int,
-    bounds: RelationBounds,
 ) -> tuple[tuple[Relation, ...], dict[str, float], tuple[View, ...]]:
     """Return the relations at the cut, the paths of the objects, and the views of the candidates.
 
@@ -168,14 +158,14 @@ def _describe_views(
         )
         later = Places.from_frame(other, candidate.frame)
         at_rest = {o.object for o in objects if o.extent == "stays"}
-        relations = find_relations(later, bounds)
-        relations |= find_changes(earlier, later, at_rest, bounds)
+        relations = find_relations(later)
+        relations |= find_changes(earlier, later, at_rest)
         close = close_pairs(other, candidate.frame)
         views.append(View(letter, objects, close, tuple(sorted(relations)), later))
     at_target = views[item.answer].places.image
     both = earlier.image.keys() & at_target.keys()
     paths = {name: dist(earlier.image[name], at_target[name]) for name in sorted(both)}
-    return tuple(sorted(find_relations(earlier, bounds))), paths, tuple(views)
+    return tuple(sorted(find_relations(earlier))), paths, tuple(views)
 
 
 def _cut_fields(scene: Scene, index: int, cut: int) -> dict[str, str | None]:
@@ -255,10 +245,10 @@ def _candidate_facts(
             if region != object_region(scene, target, i):
                 bound, difference = BORDER, Difference(name, "region", region=region)
             else:
-                extent = "clearly" if distance >= CLEARLY else "slightly"
+                extent = "clearly" if distance >= CLEARLY * MODEL_SIZE else "slightly"
                 heading = compass_direction(shift)
                 difference = Difference(name, "displaced", heading=heading, extent=extent)
-                bound = DISPLACED
+                bound = DISPLACED * MODEL_SIZE
             ranked.append(((visible and distance >= bound, visible, distance), difference))
     ranked.sort(key=lambda entry: entry[0], reverse=True)
     # If every difference is below its bound, name the largest: the candidate is not the target.

@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from dynapix.conf.schema import RelationBounds
     from dynapix.teacher.predicates.relations import Places
 
 SPEEDS = ("slowly", "steadily", "quickly")
@@ -196,14 +195,13 @@ class RelationalPredicates(Predicates):
     width at the cut, `observed` are the relations at the cut, and `views` are the candidates as a
     reader sees them. That of the answer is the view of the target. `paths` are the distances that
     objects move in the image from the cut to the target, in shares of its width and height; only
-    objects that are visible at both have one. `bounds` are those of the words for relations.
+    objects that are visible at both have one.
     """
 
     left_to_right: tuple[str, ...]
     paths: dict[str, float]
     observed: tuple[Relation, ...]
     views: tuple[View, ...]
-    bounds: RelationBounds
 
     @property
     def target(self) -> View:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from math import dist, inf
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.teacher.predicates.facts import REGIONS, Relation
 from dynapix.teacher.predicates.relations import (
+    AGAINST,
     EXTREMES,
+    LEVEL,
+    NEAR,
+    NEARER,
     VALUES,
     Places,
     between_margin,
@@ -21,7 +24,7 @@ REGION_INDICES = {value: (x, y) for y, row in enumerate(REGIONS) for x, value in
 """Column and row of each region."""
 
 
-def measure_margin(statement: Relation, places: Places, bounds: RelationBounds) -> float:
+def measure_margin(statement: Relation, places: Places) -> float:
     """Return the distance of what a statement describes from the bound of its words, as a share of
     the image's width or height: not negative if the statement is true of a frame, negative if it is
     false.
@@ -45,16 +48,16 @@ def measure_margin(statement: Relation, places: Places, bounds: RelationBounds) 
     if kind in ("side", "height"):
         axis = ("side", "height").index(kind)
         first, second = (places.image[name][axis] for name in objects)
-        return _order_margin(second - first, VALUES[kind].index(value), bounds.level)
+        return _order_margin(second - first, VALUES[kind].index(value))
     if kind == "extreme":
-        return _extreme_margin(objects[0], value, places, bounds)
+        return _extreme_margin(objects[0], value, places)
     if kind == "between":
-        return between_margin(*(places.image[name] for name in objects), bounds)
+        return between_margin(*(places.image[name] for name in objects))
     if kind == "gap":
-        return _gap_margin(*objects, value, places, bounds)
+        return _gap_margin(*objects, value, places)
     if kind == "nearer":
-        return _nearer_margin(*objects, value, places, bounds)
-    return _cover_margin(*objects, value, places, bounds)
+        return _nearer_margin(*objects, value, places)
+    return _cover_margin(*objects, value, places)
 
 
 def _region_margin(place: tuple[float, float], region: str) -> float:
@@ -68,26 +71,26 @@ def _region_margin(place: tuple[float, float], region: str) -> float:
     return min(distances)
 
 
-def _order_margin(difference: float, position: int, level: float) -> float:
+def _order_margin(difference: float, position: int) -> float:
     """Return the margin of a word for the order along an axis.
 
     Args:
         difference: Coordinate of the second object less that of the first.
         position: 0 if the first object comes first, 1 if the two are level, 2 if it comes last.
     """
-    return (difference - level, level - abs(difference), -difference - level)[position]
+    return (difference - LEVEL, LEVEL - abs(difference), -difference - LEVEL)[position]
 
 
-def _extreme_margin(name: str, value: str, places: Places, bounds: RelationBounds) -> float:
+def _extreme_margin(name: str, value: str, places: Places) -> float:
     axis, sign = EXTREMES[value]
     others = [sign * place[axis] for other, place in places.image.items() if other != name]
-    return min(others, default=-inf) - sign * places.image[name][axis] - bounds.level
+    return min(others, default=-inf) - sign * places.image[name][axis] - LEVEL
 
 
-def _gap_margin(a: str, b: str, value: str, places: Places, bounds: RelationBounds) -> float:
+def _gap_margin(a: str, b: str, value: str, places: Places) -> float:
     size = (places.scale[a] + places.scale[b]) / 2
     apart = dist(places.ground[a], places.ground[b])
-    against, near = (size * (1 + bound) for bound in (bounds.against, bounds.near))
+    against, near = (size * (1 + bound) for bound in (AGAINST, NEAR))
     margin = {
         "against": against - apart,
         "near": min(apart - against, near - apart),
@@ -96,20 +99,18 @@ def _gap_margin(a: str, b: str, value: str, places: Places, bounds: RelationBoun
     return margin * _image_scale(places, (a, b))
 
 
-def _nearer_margin(
-    a: str, b: str, c: str, value: str, places: Places, bounds: RelationBounds
-) -> float:
+def _nearer_margin(a: str, b: str, c: str, value: str, places: Places) -> float:
     one, other = (dist(places.ground[a], places.ground[name]) for name in (b, c))
     if value == "nearer to":
-        margin = other / bounds.nearer - one
+        margin = other / NEARER - one
     else:
-        margin = min(one - other / bounds.nearer, other - one / bounds.nearer)
-    return margin * _image_scale(places, (a, b), (a, c)) / (1 + 1 / bounds.nearer)
+        margin = min(one - other / NEARER, other - one / NEARER)
+    return margin * _image_scale(places, (a, b), (a, c)) / (1 + 1 / NEARER)
 
 
-def _cover_margin(a: str, b: str, value: str, places: Places, bounds: RelationBounds) -> float:
+def _cover_margin(a: str, b: str, value: str, places: Places) -> float:
     front = a if value == "in front of" else b
-    return FAINT if find_covering(places, a, b, bounds) == front else -FAINT
+    return FAINT if find_covering(places, a, b) == front else -FAINT
 
 
 def _image_scale(places: Places, *pairs: tuple[str, str]) -> float:

@@ -27,8 +27,8 @@ from itertools import combinations, permutations
 from math import hypot, inf
 from typing import NamedTuple
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.conf.schema.world import RADIUS
+from dynapix.data.oracle.displacement import MODEL_SIZE
 from dynapix.data.records import Scene
 from dynapix.teacher.predicates.facts import Relation
 from dynapix.teacher.predicates.places import object_sight
@@ -64,19 +64,39 @@ SYMMETRIC = {"side", "height", "gap", "cover"}
 """Kinds that are true of two objects in either order, with the opposite value."""
 EXTENTS = ("slightly", "clearly", "far")
 """How far off an object is in a candidate."""
-DISPLACED, CLEARLY = 12.0, 40.0
-"""Displacements (px of the square image) from which an object counts as displaced, and as displaced
-"clearly" rather than "slightly"."""
+LEVEL = 0.04
+"""Share of the image's width or height below which two objects are aligned or level, and by which
+the leftmost object must lie to the left of all others."""
+AGAINST, NEAR = 0.15, 1.0
+"""Gaps, as shares of an object's width, below which two objects are against and near each other."""
+BETWEEN_ENDS, BETWEEN_OFFSET = 0.2, 0.25
+"""An object between two others divides their distance, of which each part has at least the first
+share. The second is its largest distance from the line through them, as a share of theirs."""
+NEARER = 1.25
+"""a is nearer to b than to c if it is at least this many times as far from c as from b."""
+COVERED, COVER_DISTANCE = 0.9, 0.12
+"""An object is partly hidden if its visible fraction is below the first. An object that is lower in
+the image, and nearer than the second (share of the width), is then in front of it."""
+EDGE = 0.06
+"""Share of the image's width or height below which an object has reached the edge."""
+DISPLACED, CLEARLY, FAR = 12 / MODEL_SIZE, 40 / MODEL_SIZE, 0.25
+"""Distances of an object in a candidate from its place at the target, as shares of the image, from
+which it is slightly, clearly and far off."""
+BOUNDS = (
+    *(LEVEL, AGAINST, NEAR, BETWEEN_ENDS, BETWEEN_OFFSET, NEARER),
+    *(COVERED, COVER_DISTANCE, EDGE, DISPLACED, CLEARLY, FAR),
+)
+"""All of these, which the records of rationales name by a hash."""
 
 
-def describe_distance(distance: float, bounds: RelationBounds) -> str | None:
+def describe_distance(distance: float) -> str | None:
     """Return how far an object is off if its place is at a distance (share of the image's width)
     from the expected place: slightly, clearly or far; None if it counts as being there."""
-    if distance < bounds.displaced:
+    if distance < DISPLACED:
         return None
-    if distance >= bounds.far:
+    if distance >= FAR:
         return "far"
-    return "clearly" if distance >= bounds.clearly else "slightly"
+    return "clearly" if distance >= CLEARLY else "slightly"
 
 
 def flip_relation(relation: Relation) -> Relation:
@@ -149,46 +169,44 @@ class Places(NamedTuple):
         )
 
 
-def find_relations(places: Places, bounds: RelationBounds) -> set[Relation]:
+def find_relations(places: Places) -> set[Relation]:
     """Return the relations of the visible objects of a frame, normalized."""
     names = sorted(places.image)
     found: set[Relation] = set()
     distance: dict[tuple[str, str], float] = {}
     for a, b in combinations(names, 2):
         (ax, ay), (bx, by) = places.image[a], places.image[b]
-        side = _compare(ax, bx, bounds.level, VALUES["side"])
-        height = _compare(ay, by, bounds.level, VALUES["height"])
+        side = _compare(ax, bx, LEVEL, VALUES["side"])
+        height = _compare(ay, by, LEVEL, VALUES["height"])
         (gx, gy), (hx, hy) = places.ground[a], places.ground[b]
         apart = ((gx - hx) ** 2 + (gy - hy) ** 2) ** 0.5
         distance[a, b] = distance[b, a] = apart
         found |= {Relation("side", (a, b), side), Relation("height", (a, b), height)}
         if places.scale:
             gap = 2 * apart / (places.scale[a] + places.scale[b]) - 1
-            closeness = "against" if gap < bounds.against else "near"
-            found.add(Relation("gap", (a, b), closeness if gap < bounds.near else "apart from"))
-        if (covering := find_covering(places, a, b, bounds)) is not None:
+            closeness = "against" if gap < AGAINST else "near"
+            found.add(Relation("gap", (a, b), closeness if gap < NEAR else "apart from"))
+        if (covering := find_covering(places, a, b)) is not None:
             value = "in front of" if covering == a else "behind"
             found.add(Relation("cover", (a, b), value))
     for a in names:
         others = [name for name in names if name != a]
         for b, c in combinations(others, 2):
             ends = places.image[b], places.image[c]
-            if between_margin(places.image[a], *ends, bounds) >= 0:
+            if between_margin(places.image[a], *ends) >= 0:
                 found.add(Relation("between", (a, b, c), "between"))
             one, other = distance[a, b], distance[a, c]
-            if other >= bounds.nearer * one:
+            if other >= NEARER * one:
                 found.add(Relation("nearer", (a, b, c), "nearer to"))
-            elif one >= bounds.nearer * other:
+            elif one >= NEARER * other:
                 found.add(Relation("nearer", (a, c, b), "nearer to"))
             else:
                 found.add(Relation("nearer", (a, b, c), "as near to"))
-    found.update(_find_extremes(places.image, bounds))
+    found.update(_find_extremes(places.image))
     return found
 
 
-def find_changes(
-    earlier: Places, later: Places, at_rest: set[str], bounds: RelationBounds
-) -> set[Relation]:
+def find_changes(earlier: Places, later: Places, at_rest: set[str]) -> set[Relation]:
     """Return how the places of objects change that are visible at both of two frames, normalized.
 
     Args:
@@ -199,20 +217,20 @@ def find_changes(
     for a, b in permutations(both, 2):
         if a not in at_rest:
             before, after = (places.image[a][0] - places.image[b][0] for places in (earlier, later))
-            if min(before, after) <= -bounds.level and max(before, after) >= bounds.level:
-                value = _passing_side(earlier, later, a, b, bounds)
+            if min(before, after) <= -LEVEL and max(before, after) >= LEVEL:
+                value = _passing_side(earlier, later, a, b)
                 found.add(Relation("passing", (a, b), value))
     for a in both:
         if a in at_rest:
             continue
         for b, c in combinations([name for name in both if name != a], 2):
             was, comes = (
-                between_margin(*(places.image[name] for name in (a, b, c)), bounds) >= 0
+                between_margin(*(places.image[name] for name in (a, b, c))) >= 0
                 for places in (earlier, later)
             )
             if comes and not was:
                 found.add(Relation("arrival", (a, b, c), "comes between"))
-        reached = _edges(later.image[a], bounds) - _edges(earlier.image[a], bounds)
+        reached = _edges(later.image[a]) - _edges(earlier.image[a])
         found |= {Relation("edge", (a,), f"reaches the {edge} edge") for edge in reached}
     return found
 
@@ -224,22 +242,21 @@ def _compare(one: float, other: float, bound: float, words: tuple[str, str, str]
     return words[0] if one < other else words[2]
 
 
-def find_covering(places: Places, a: str, b: str, bounds: RelationBounds) -> str | None:
+def find_covering(places: Places, a: str, b: str) -> str | None:
     """Return which of two objects hides a part of the other; None if neither does.
 
     An object lower in the image is nearer to the camera.
     """
     (ax, ay), (bx, by) = places.image[a], places.image[b]
     front, back = (a, b) if ay > by else (b, a)
-    is_close = ((ax - bx) ** 2 + (ay - by) ** 2) ** 0.5 < bounds.cover_distance
-    return front if is_close and places.fraction[back] < bounds.covered else None
+    is_close = ((ax - bx) ** 2 + (ay - by) ** 2) ** 0.5 < COVER_DISTANCE
+    return front if is_close and places.fraction[back] < COVERED else None
 
 
 def between_margin(
     place: tuple[float, float],
     one: tuple[float, float],
     other: tuple[float, float],
-    bounds: RelationBounds,
 ) -> float:
     """Return the distance of a place from the bounds of "between" two others, as a share of the
     image; it is negative if the place is not between them."""
@@ -249,30 +266,28 @@ def between_margin(
     if length == 0:
         return -inf
     along, offset = (px * dx + py * dy) / length, abs(px * dy - py * dx) / length
-    ends = bounds.between_ends * length
-    return min(along - ends, length - ends - along, bounds.between_offset * length - offset)
+    ends = BETWEEN_ENDS * length
+    return min(along - ends, length - ends - along, BETWEEN_OFFSET * length - offset)
 
 
-def _find_extremes(
-    image: Mapping[str, tuple[float, float]], bounds: RelationBounds
-) -> Iterator[Relation]:
+def _find_extremes(image: Mapping[str, tuple[float, float]]) -> Iterator[Relation]:
     if len(image) < 2:
         return
     for value, (axis, sign) in EXTREMES.items():
         first, second, *_ = sorted((sign * place[axis], name) for name, place in image.items())
-        if second[0] - first[0] >= bounds.level:
+        if second[0] - first[0] >= LEVEL:
             yield Relation("extreme", (first[1],), value)
 
 
-def _passing_side(earlier: Places, later: Places, a: str, b: str, bounds: RelationBounds) -> str:
+def _passing_side(earlier: Places, later: Places, a: str, b: str) -> str:
     """Return "crosses in front of" if object a is lower in the image than b at both frames."""
     lower = [places.image[a][1] - places.image[b][1] for places in (earlier, later)]
-    if min(lower) >= bounds.level:
+    if min(lower) >= LEVEL:
         return "crosses in front of"
-    return "crosses behind" if max(lower) <= -bounds.level else "passes"
+    return "crosses behind" if max(lower) <= -LEVEL else "passes"
 
 
-def _edges(place: tuple[float, float], bounds: RelationBounds) -> set[str]:
+def _edges(place: tuple[float, float]) -> set[str]:
     x, y = place
     distances = zip(EDGES, (x, 1 - x, y, 1 - y), strict=True)
-    return {edge for edge, distance in distances if distance < bounds.edge}
+    return {edge for edge, distance in distances if distance < EDGE}

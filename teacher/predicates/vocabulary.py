@@ -42,7 +42,7 @@ def describe_item(
     scene_of = scene_of or store.scene
     # The scene of the target is the one whose future the item asks for.
     scene = scene_of(item.target.scene_id)
-    predicates = extract_predicates(item, scene, scene_of, cfg.bounds)
+    predicates = extract_predicates(item, scene, scene_of)
     collision = next_collision(scene, item.prefix_stop)
     if predicates is None or item.distractors != CONTACT or collision is None:
         return predicates

@@ -6,8 +6,8 @@ The steps are text -> tags -> claims -> verdicts. For "The red cube is near the 
 1. `tagging` splits the text into tags, pieces with a category: "The red cube" (object), "is" (be),
    "near the left" (region), "." (stop). phrases.yaml describes the categories of most tags.
 2. A reader goes through the tags of a sentence and calls its method `on_<tag>` for each, such as
-   `on_region`. `SceneReader` reads about the scene, `CandidateReader` about the candidates; their
-   base is in `reader`.
+   `on_region`. `SceneReader` reads about the scene, `CandidateReader` about the candidates. Their
+   bases are in `reader` and, for the clauses of a sentence, in `clauses`.
 3. The methods record claims. Here, the kind is "region", the subject "red metal cube" (if only
    one object is a red cube), and the value "near the left".
 4. `claims` compares a claim with the predicates at the moment that the clause is about: the

@@ -13,16 +13,7 @@ from dynapix.teacher.reading.scenes import SceneReader
 from dynapix.teacher.reading.tagging import RelationPhrase, Tag
 
 CHOOSING = {
-    "agree",
-    "be",
-    "visible",
-    "which",
-    "with",
-    "expected",
-    "future",
-    "show",
-    "break",
-    "comma",
+    *("agree", "be", "visible", "which", "with", "expected", "future", "show", "break", "comma"),
 }
 """Tags between "this layout" or "the answer" and the candidate."""
 TOUCHING = {"touching", "touches", "touch", "in contact"}

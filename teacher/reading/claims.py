@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Iterable
 from itertools import product
 from typing import NamedTuple
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.teacher.predicates.facts import (
     COMPASS,
     OUT_OF_VIEW,
@@ -89,11 +88,9 @@ class IndexedPredicates:
         self.observed: frozenset[Relation] | None = None
         """Relations at the cut; None if the predicates have no relations."""
         self.views: dict[str, View] = {}
-        self.bounds: RelationBounds | None = None
         if isinstance(predicates, RelationalPredicates):
             self.observed = frozenset(predicates.observed)
             self.views = {view.letter: view for view in predicates.views}
-            self.bounds = predicates.bounds
         self.answer = predicates.answer
         self.extras = {
             name
@@ -178,7 +175,7 @@ class IndexedPredicates:
             agrees = self.candidates[letter].agrees
             # A wrong candidate may show the object of the claim as close to its place.
             distance = self._find_distance(letter, *claim.subjects[:1])
-            is_close = distance is not None and describe_distance(distance, self.bounds) is None
+            is_close = distance is not None and describe_distance(distance) is None
             return None if is_close and not agrees else agrees
         if claim.kind == "other objects":
             return self.candidates[letter].other_objects
@@ -201,7 +198,7 @@ class IndexedPredicates:
         if it shows the object there, or if the predicates do not tell."""
         distance = self._find_distance(letter, name)
         if distance is not None:
-            extent = describe_distance(distance, self.bounds)
+            extent = describe_distance(distance)
             if extent is not None:
                 return extent
         # The largest difference of a candidate has an extent even if it is small.

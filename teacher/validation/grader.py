@@ -5,20 +5,21 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from dataclasses import astuple, replace
+from dataclasses import replace
 
-from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.conf.schema import TeacherConfig
 from dynapix.data.records import Rationale, SelectionItem
 from dynapix.teacher.cited_rationales import CITED_VERSION
 from dynapix.teacher.narrator import NARRATOR_VERSION
 from dynapix.teacher.predicates.facts import RelationalPredicates
+from dynapix.teacher.predicates.relations import BOUNDS
+from dynapix.teacher.predicates.statement_choice import choose_statements
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary, name_vocabulary
 from dynapix.teacher.prompts import PROMPT_VERSION
 from dynapix.teacher.reading.claims import VERDICTS
 from dynapix.teacher.sections import GRAMMAR_VERSION
 from dynapix.teacher.servers.responses import Response
-from dynapix.teacher.statement_choice import choose_statements
-from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.validation.sufficiency import measure_sufficiency
 from dynapix.teacher.validation.validator import VALIDATOR_VERSION, Validation, validate_rationale
 
 MAX_CHARACTERS = 20_000
@@ -110,8 +111,8 @@ class RationaleGrader:
         """Return a short hash of the settings that affect a response or its validation."""
         cfg = self.cfg
         settings = [cfg.min_words, cfg.max_words]
-        if cfg.predicates == "relational" or cfg.sufficient or cfg.bounds != RelationBounds():
-            settings += [cfg.sufficient, *astuple(cfg.bounds)]
+        if cfg.predicates == "relational" or cfg.sufficient:
+            settings += [cfg.sufficient, *BOUNDS]
         if not cfg.strict:
             settings.append("lenient")
         if cfg.url is not None:

@@ -145,9 +145,23 @@ FALSE_EXTENTS = {
 }
 
 
-def replace_extremes(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    for match in re.finditer(rf"(?<!not )\b(?:{'|'.join(EXTREMES)})\b", text):
-        yield replace_match(text, match, EXTREMES[match[0]])
+def replace_by(
+    words: Mapping[str, str | Sequence[str]], before: str = "", after: str = ""
+) -> Callable[[str, Predicates, Random], Iterator[Mutation]]:
+    """Return a mutation that replaces each of `words` by its false word, or by one of several.
+
+    Args:
+        before: Regular expression of what precedes the word, such as `(?<!not )`.
+        after: The same for what follows it.
+    """
+    pattern = rf"{before}\b(?:{'|'.join(words)})\b{after}"
+
+    def mutate(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+        for match in re.finditer(pattern, text):
+            false = words[match[0]]
+            yield replace_match(text, match, false if isinstance(false, str) else rng.choice(false))
+
+    return mutate
 
 
 def swap_subjects(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
@@ -171,11 +185,6 @@ def unbalance_distances(text: str, predicates: Predicates, rng: Random) -> Itera
         yield replace_match(text, match, f"nearer to {match[1]} than to {match[2]}")
 
 
-def replace_edges(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    for match in re.finditer(rf"(?<=reaches the )({'|'.join(OPPOSITE_EDGES)})(?= edge)", text):
-        yield replace_match(text, match, OPPOSITE_EDGES[match[0]])
-
-
 def replace_passed(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
     """In "a passes b" or "a crosses behind b", replace b by an object that a does not pass."""
     if not isinstance(predicates, RelationalPredicates):
@@ -189,24 +198,6 @@ def replace_passed(text: str, predicates: Predicates, rng: Random) -> Iterator[M
             start, stop = match.span(2)
             name = f"the {rng.choice(free)}"
             yield text[:start] + name + text[stop:], (start, start + len(name))
-
-
-def replace_times(text: str, rng: Random) -> Iterator[Mutation]:
-    """Replace a word for the time of a contact by one that is false."""
-    for match in re.finditer(rf"\b(?:{'|'.join(FALSE_TIMES)})\b(?!-)", text):
-        yield replace_match(text, match, rng.choice(FALSE_TIMES[match[0]]))
-
-
-def replace_extents(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """Replace "slightly", "clearly" or "far" before "off" by a word that is false."""
-    for match in re.finditer(rf"\b(?:{'|'.join(FALSE_EXTENTS)})(?= off\b)", text):
-        yield replace_match(text, match, rng.choice(FALSE_EXTENTS[match[0]]))
-
-
-def show_unseen(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """Give an object that is out of sight a place."""
-    for match in re.finditer(r"(?<!not )\bout of sight\b", text):
-        yield replace_match(text, match, rng.choice(ALL_REGIONS))
 
 
 def replace_answer(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
@@ -230,7 +221,7 @@ MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = 
     "direction": lambda text, p, rng: replace_words(text, COMPASS, rng, p),
     "region": lambda text, p, rng: replace_words(text, ALL_REGIONS, rng),
     "speed": lambda text, p, rng: replace_words(text, MOVING, rng, p),
-    "time": lambda text, p, rng: replace_times(text, rng),
+    "time": replace_by(FALSE_TIMES, after="(?!-)"),
     "color": replace_colors,
     "pair": replace_partners,
     "answer": replace_answer,
@@ -245,10 +236,10 @@ RELATION_MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutat
     "between": swap_subjects,
     "nearer": swap_distances,
     "as near": unbalance_distances,
-    "extreme": replace_extremes,
-    "edge": replace_edges,
+    "extreme": replace_by(EXTREMES, before="(?<!not )"),
+    "edge": replace_by(OPPOSITE_EDGES, before="(?<=reaches the )", after="(?= edge)"),
     "passing": replace_passed,
-    "distance": replace_extents,
-    "sight": show_unseen,
+    "distance": replace_by(FALSE_EXTENTS, after=r"(?= off\b)"),
+    "sight": replace_by({"out of sight": ALL_REGIONS}, before="(?<!not )"),
 }
 """The same for words of relations, which only relational rationales have."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from dynapix.teacher.predicates.facts import RelationalPredicates
 from dynapix.teacher.reading.claims import Claim
 from dynapix.teacher.sections import split_sections
-from dynapix.teacher.sufficiency import measure_sufficiency
 from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.sufficiency import measure_sufficiency
 
 PARTS = ("prefix", "prediction", "candidates")
 """What claims are about: the observed prefix, what follows it, or the candidates."""
@@ -28,7 +28,7 @@ class ResponseReasons:
             as a contradicted claim.
         follows: Whether the text says of the chosen candidate, and of no other, that it agrees.
         sufficiency: Probability that a reader who knows only the prediction picks the target (see
-            `teacher.sufficiency`).
+            `teacher.validation.sufficiency`).
         true: Whether the answer is right for true reasons: it is the target, it follows, the oracle
             supports a claim of the prediction, and it contradicts no claim about what follows or
             about the candidates.

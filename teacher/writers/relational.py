@@ -19,12 +19,13 @@ from dynapix.teacher.predicates.facts import (
 )
 from dynapix.teacher.predicates.relations import (
     CHANGES,
+    DISPLACED,
     SYMMETRIC,
     find_topic,
     flip_relation,
     normalize_relation,
 )
-from dynapix.teacher.statement_choice import Decision
+from dynapix.teacher.predicates.statement_choice import Decision
 from dynapix.teacher.writers.paper import Detail, Writer
 
 PHRASES = yaml.safe_load((files("dynapix.teacher") / "templates" / "relations.yaml").read_text())
@@ -63,9 +64,9 @@ class RelationalWriter(Writer):
     """Writes the sections of a rationale from relational predicates.
 
     The prediction begins with the statements that decide the item (see
-    `teacher.statement_choice`). The candidate analysis describes each candidate by the topics of
-    these statements only. The outcome names the candidate that shows the object of the first
-    statement closest to its place.
+    `teacher.predicates.statement_choice`). The candidate analysis describes each candidate by the
+    topics of these statements only. The outcome names the candidate that shows the object of the
+    first statement closest to its place.
     Other objects that are out of view at the cut are left out.
     """
 
@@ -191,7 +192,7 @@ class RelationalWriter(Writer):
         shown = {v.letter: v.places.image[name] for v in views if name in v.places.image}
         distances = sorted((math.dist(place, target), letter) for letter, place in shown.items())
         (nearest, letter), *others = distances or [(math.inf, None)]
-        if any(d - nearest < self.facts.bounds.displaced for d, _ in others):
+        if any(d - nearest < DISPLACED for d, _ in others):
             return None
         return letter
 

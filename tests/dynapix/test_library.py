@@ -274,14 +274,13 @@ def test_a_rationale_is_scored_by_the_oracle(micro_store) -> None:
 
 
 def test_sufficiency_of_a_rationale_is_that_of_its_prediction(micro_store) -> None:
-    from dynapix.conf.schema import RelationBounds
     from dynapix.teacher.narrator import write_rationale
     from dynapix.teacher.predicates.extraction import extract_predicates
 
     found = []
     for item in dynapix.load(micro_store.folder, split="test").selection[:20]:
         scene = micro_store.scene(item.scene_id)
-        predicates = extract_predicates(item.record, scene, micro_store.scene, RelationBounds())
+        predicates = extract_predicates(item.record, scene, micro_store.scene)
         if predicates is not None:
             text = write_rationale(predicates, item.record, 0)
             found.append(dynapix.sufficiency(item, text))

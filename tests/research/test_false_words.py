@@ -6,7 +6,6 @@ from collections import Counter
 
 import numpy as np
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.teacher.narrator import write_rationale
 from dynapix.teacher.validation.claim_extraction import extract_claims
 from research.tiny_base.false_words import (
@@ -22,7 +21,7 @@ def test_words_are_replaced_by_others_of_their_kind() -> None:
     """Nothing else changes, and the spans contain each false word and one more character."""
     replaced = kept = 0
     rng = np.random.default_rng(1)
-    for item, predicates in random_cases(40, RelationBounds()):
+    for item, predicates in random_cases(40, relational=True):
         true = write_rationale(predicates, item, 0)
         assert falsify_words(true, 0.0, rng) == (true, ())
         text, spans = falsify_words(true, 0.5, rng)
@@ -43,7 +42,7 @@ def test_replaced_words_are_false() -> None:
     """Apart from extremes: an object can be both leftmost and topmost."""
     verdicts = Counter()
     rng = np.random.default_rng(0)
-    for item, predicates in random_cases(60, RelationBounds()):
+    for item, predicates in random_cases(60, relational=True):
         text, spans = falsify_words(write_rationale(predicates, item, 0), 0.5, rng)
         claims = [c for c in extract_claims(text, predicates) if c.kind != "extreme"]
         for start, stop in spans:

@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import one_hot
 
 from dynapix.data.records import LETTERS
-from dynapix.teacher.statement_choice import measure_separation
+from dynapix.teacher.predicates.statement_choice import measure_separation
 from research.tiny_base.heads import (
     SCALES,
     OracleHeads,

@@ -10,14 +10,13 @@ from math import dist
 import numpy as np
 import pytest
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.data.records import LETTERS, SelectionItem
 from dynapix.data.store import Store
 from dynapix.models.student.collator import IGNORED, encode
 from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.facts import RelationalPredicates, View
 from dynapix.teacher.predicates.relations import normalize_relation
-from dynapix.teacher.statement_choice import choose_statements
+from dynapix.teacher.predicates.statement_choice import choose_statements
 from dynapix.teacher.validation.claim_extraction import extract_claims
 from research.tiny_base.questions import (
     ASK,
@@ -38,10 +37,7 @@ Described = list[tuple[SelectionItem, RelationalPredicates]]
 def described(micro_store: Store) -> Described:
     """The training items that have predicates, and these."""
     items = micro_store.selection("train")
-    facts = [
-        extract_predicates(i, micro_store.scene(i.scene_id), micro_store.scene, RelationBounds())
-        for i in items
-    ]
+    facts = [extract_predicates(i, micro_store.scene(i.scene_id), micro_store.scene) for i in items]
     return [(item, p) for item, p in zip(items, facts, strict=True) if p is not None]
 
 
@@ -129,7 +125,7 @@ def test_explained_candidates_do_not_include_the_target(
         candidates[item.answer] = question.instead
         other = replace(item, candidates=tuple(candidates), target_frame=question.instead.frame)
         scene = micro_store.scene(item.scene_id)
-        shown = extract_predicates(other, scene, micro_store.scene, RelationBounds())
+        shown = extract_predicates(other, scene, micro_store.scene)
         claims = extract_claims(before, shown)
         claims = [c for c in claims if c.kind not in RELATIVE and c.candidate is not None]
         assert [c for c in claims if c.verdict == "contradicted"] == []

@@ -13,7 +13,7 @@ from transformers import AutoTokenizer
 from dynapix.data.records import LETTERS, sample_prefix_frames
 from dynapix.data.store import Store
 from dynapix.teacher.predicates.motion import find_cut, motion_start
-from dynapix.teacher.statement_choice import UNSEEN_DISTANCE
+from dynapix.teacher.predicates.statement_choice import UNSEEN_DISTANCE
 from research.tiny_base.collator import object_token_ids, spatial_token_ids
 from research.tiny_base.located_mentions import described_state, measure_error
 from research.tiny_base.mentions import TokenizedText

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.teacher.faulty_server import FaultyServer
-from tests.teacher.memory_store import MemoryStore, make_store
+from tests.teacher.memory_store import MemoryStore, make_store, prompts_and_rationales
+from tests.teacher.tiny_qwen3 import save_tiny_qwen3
 
 
 @pytest.fixture
@@ -34,3 +35,11 @@ def start_server(
     yield start
     for server in servers:
         server.stop()
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny random language model that real servers serve."""
+    folder = tmp_path_factory.mktemp("qwen3")
+    texts = prompts_and_rationales(make_store(folder, 60))
+    return save_tiny_qwen3(folder, [part for item in texts for part in item])

@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.data.records import Scene, SelectionItem
 from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.facts import RelationalPredicates
@@ -50,9 +49,7 @@ def marked_items() -> Iterator[tuple[SelectionItem, RelationalPredicates]]:
                 framing=(None, "future", "contact")[k],
             )
             scene = marked_scene(index)
-            predicates = extract_predicates(
-                item, scene, lambda _, scene=scene: scene, RelationBounds()
-            )
+            predicates = extract_predicates(item, scene, lambda _, scene=scene: scene)
             if predicates is not None:
                 yield item, predicates
 

@@ -64,7 +64,8 @@ def prompts_and_rationales(store: MemoryStore) -> list[tuple[str, str, str]]:
     for item in store.selection():
         predicates = extract_predicates(item, store.scene(item.scene_id), store.scene)
         if predicates:
-            system, user = build_messages(predicates, item, TeacherConfig(name="template"))
-            rationale = write_rationale(predicates, item, 0)
+            paper = predicates.without_relations()
+            system, user = build_messages(paper, item, TeacherConfig(name="template"))
+            rationale = write_rationale(paper, item, 0)
             texts.append((system["content"], user["content"], rationale))
     return texts

@@ -21,11 +21,11 @@ from random import Random
 
 import pytest
 
-from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.conf.schema import TeacherConfig
 from dynapix.teacher.narrator import write_rationale
 from dynapix.teacher.predicates.extraction import EVENT_MOMENTS
 from dynapix.teacher.predicates.facts import REGIONS
-from dynapix.teacher.predicates.relations import describe_distance
+from dynapix.teacher.predicates.relations import DISPLACED, describe_distance
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary
 from dynapix.teacher.reading.phrases import PHRASES_BY_FIRST_WORD
 from dynapix.teacher.sections import SECTIONS
@@ -174,7 +174,7 @@ def rationales(benchmark_store):
     folder = benchmark_store.folder
     return {
         "narrator": list(read_rationales(folder)),
-        "relational": list(read_rationales(folder, RelationBounds())),
+        "relational": list(read_rationales(folder, relational=True)),
         "prose": PROSE,
     }
 
@@ -249,11 +249,7 @@ def add_rare_statements(text, predicates):
         f" Candidate {view.letter} has the {name} {extent} off."
         for view in predicates.views
         for name in target.keys() & view.places.image.keys()
-        if (
-            extent := describe_distance(
-                dist(view.places.image[name], target[name]), RelationBounds()
-            )
-        )
+        if (extent := describe_distance(dist(view.places.image[name], target[name])))
     ]
     text = text.replace("\nOutcome:", f"{''.join(sorted(off))}\nOutcome:")
     text = text.replace("\nPrediction:", f"{''.join(edges + passed)}\nPrediction:")
@@ -323,7 +319,7 @@ def verdicts_of(section: str, text: str, predicates, kind: str) -> set[str]:
 def test_what_holds_more_strictly_or_later_is_not_contradicted() -> None:
     """A reader of 600 contradicted claims found that such ones were true."""
     found = Counter()
-    for _, predicates in random_cases(400, RelationBounds()):
+    for _, predicates in random_cases(400, relational=True):
         for kind, names, value in predicates.target.statements:
             if kind == "gap" and value == "against":
                 for words, verdict in NEARNESS.items():
@@ -346,7 +342,7 @@ def test_what_holds_more_strictly_or_later_is_not_contradicted() -> None:
             for view in predicates.views:
                 text = f"The {name} is closest to its expected place in candidate {view.letter}."
                 distance = dist(view.places.image.get(name, (9, 9)), place)
-                is_close = distance < predicates.bounds.displaced
+                is_close = distance < DISPLACED
                 is_right = view.letter == predicates.answer
                 verdict = "supported" if is_right else "unknown" if is_close else "contradicted"
                 assert verdicts_of("O", text, predicates, "agrees") == {verdict}

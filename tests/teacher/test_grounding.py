@@ -45,10 +45,9 @@ def test_a_scene_at_constant_velocity_is_its_own_extrapolation(seed: int) -> Non
         (c.frame, c.objects) for c in scene.collisions
     ]
     item = synthetic.item((60, 70, 90, 110), answer=2)
-    bounds = TeacherConfig().bounds
-    expected = extract_predicates(item, scene, store.scene, bounds)
+    expected = extract_predicates(item, scene, store.scene)
     guessed, scene_of = extrapolate_target(item, store)
-    found = extract_predicates(guessed, scene_of(guessed.target.scene_id), scene_of, bounds)
+    found = extract_predicates(guessed, scene_of(guessed.target.scene_id), scene_of)
     if expected is None:
         assert found is None
     else:

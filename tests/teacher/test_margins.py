@@ -8,8 +8,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from dynapix.conf.schema import RelationBounds
-from dynapix.teacher import statement_choice
+from dynapix.teacher.predicates import statement_choice
 from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.facts import REGIONS, Relation, RelationalPredicates
 from dynapix.teacher.predicates.margins import measure_margin
@@ -20,13 +19,12 @@ from dynapix.teacher.predicates.relations import (
     find_relations,
     normalize_relation,
 )
+from dynapix.teacher.predicates.statement_choice import choose_statements
 from dynapix.teacher.prompts import format_facts
-from dynapix.teacher.statement_choice import choose_statements
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
 from tests.teacher.test_relations import A, B, C, places, random_places
 
-BOUNDS = RelationBounds()
 IN_THE_IMAGE = ("region", "side", "height", "between", "extreme")
 """Kinds of statements whose margins are exact. Gaps and distances are measured on the ground."""
 
@@ -50,7 +48,7 @@ def true_statements(where: Places) -> set[Relation]:
         Relation("region", (name,), REGIONS[min(int(3 * y), 2)][min(int(3 * x), 2)])
         for name, (x, y) in where.image.items()
     }
-    return find_relations(where, BOUNDS) | regions
+    return find_relations(where) | regions
 
 
 def move(where: Places, name: str, step: np.ndarray) -> Places:
@@ -65,7 +63,7 @@ def test_margins_are_positive_exactly_for_true_statements(seed: int) -> None:
     where = random_places(seed)
     true = true_statements(where)
     for statement in all_statements(where):
-        margin = measure_margin(statement, where, BOUNDS)
+        margin = measure_margin(statement, where)
         assert (margin >= 0) == (normalize_relation(statement) in true), statement
 
 
@@ -76,7 +74,7 @@ def test_statements_keep_their_truth_if_an_object_moves_by_less_than_the_margin(
     for statement in all_statements(where):
         if statement.kind not in IN_THE_IMAGE:
             continue
-        margin = measure_margin(statement, where, BOUNDS)
+        margin = measure_margin(statement, where)
         angle = rng.uniform(0, 2 * np.pi)
         step = 0.99 * min(abs(margin), 0.5) * np.array([np.cos(angle), np.sin(angle)])
         if statement.kind == "between":
@@ -84,7 +82,7 @@ def test_statements_keep_their_truth_if_an_object_moves_by_less_than_the_margin(
             name = statement.objects[0]
         else:
             name = statement.objects[rng.integers(len(statement.objects))]
-        moved = measure_margin(statement, move(where, name, step), BOUNDS)
+        moved = measure_margin(statement, move(where, name, step))
         assert (moved >= 0) == (margin >= 0), statement
 
 
@@ -102,16 +100,16 @@ def test_margins_have_a_closed_form() -> None:
         Relation("extreme", (B,), "leftmost"): -0.20 - 0.04,
     }
     for statement, expected in margins.items():
-        assert measure_margin(statement, where, BOUNDS) == pytest.approx(expected)
+        assert measure_margin(statement, where) == pytest.approx(expected)
 
 
 def test_margins_of_gaps_are_distances_in_the_image() -> None:
     """With ten units of the ground per width of the image, objects of width one at a distance of
     one and a half are half a width apart, and 0.05 of the image's width from not being near."""
     where = places(a=(0.3, 0.5), b=(0.45, 0.5))
-    near = measure_margin(Relation("gap", (A, B), "near"), where, BOUNDS)
+    near = measure_margin(Relation("gap", (A, B), "near"), where)
     assert near == pytest.approx((1.5 - 1.15) / 10)
-    apart = measure_margin(Relation("gap", (A, B), "apart from"), where, BOUNDS)
+    apart = measure_margin(Relation("gap", (A, B), "apart from"), where)
     assert apart == pytest.approx((1.5 - 2) / 10)
 
 
@@ -121,9 +119,9 @@ def test_statements_about_unseen_objects_are_hardly_clear() -> None:
         Relation("region", (B,), "near the left"),
         Relation("side", (A, B), "left of"),
     ):
-        assert -0.02 < measure_margin(statement, where, BOUNDS) < 0
-    assert 0 < measure_margin(Relation("sight", (B,), "unseen"), where, BOUNDS) < 0.02
-    assert -0.02 < measure_margin(Relation("sight", (A,), "unseen"), where, BOUNDS) < 0
+        assert -0.02 < measure_margin(statement, where) < 0
+    assert 0 < measure_margin(Relation("sight", (B,), "unseen"), where) < 0.02
+    assert -0.02 < measure_margin(Relation("sight", (A,), "unseen"), where) < 0
 
 
 def choose_with_margins(
@@ -131,8 +129,8 @@ def choose_with_margins(
 ) -> tuple[Relation, ...]:
     """Choose with the margins of a statement, and those of all others, multiplied."""
 
-    def measure_scaled(s: Relation, where: Places, bounds: RelationBounds) -> float:
-        return measure_margin(s, where, bounds) * (factor if s == statement else others)
+    def measure_scaled(s: Relation, where: Places) -> float:
+        return measure_margin(s, where) * (factor if s == statement else others)
 
     with patch.object(statement_choice, "measure_margin", measure_scaled):
         return choose_statements(predicates).statements
@@ -142,7 +140,7 @@ def test_clear_statements_are_chosen() -> None:
     """A statement that excludes what the place does not exclude is chosen if it is clear and the
     others are not, and is replaced by another one if its own margins shrink."""
     tried = 0
-    for _, predicates in random_cases(150, BOUNDS):
+    for _, predicates in random_cases(150, relational=True):
         place, *chosen = choose_statements(predicates).statements
         left = [
             v for v in predicates.views if v.letter != predicates.answer and place in v.statements
@@ -167,7 +165,7 @@ def test_clear_statements_are_chosen() -> None:
 def test_objects_with_short_paths_are_preferred() -> None:
     """If the path of one object grows, fewer of the statements after the place are about it."""
     before = after = 0
-    for _, predicates in random_cases(150, BOUNDS):
+    for _, predicates in random_cases(150, relational=True):
         name = predicates.objects[0].object
         longer = replace(predicates, paths={**predicates.paths, name: 5.0})
         before += any(name in s.objects for s in choose_statements(predicates).statements[1:])
@@ -179,14 +177,14 @@ def test_item_whose_objects_all_look_alike_has_no_statements() -> None:
     scene = synthetic.random_scene(np.random.default_rng(3))
     twins = replace(scene, objects=(scene.objects[0],) * len(scene.objects))
     item = synthetic.item((45, 60, 75, 90))
-    predicates = extract_predicates(item, twins, {}.__getitem__, BOUNDS)
+    predicates = extract_predicates(item, twins, {}.__getitem__)
     decision = choose_statements(predicates)
     assert decision.statements == ()
     assert decision.rivals == ("B", "C", "D")
 
 
 def test_prompts_have_the_deciding_statements_and_their_truth_in_each_candidate() -> None:
-    for item, predicates in random_cases(30, BOUNDS):
+    for item, predicates in random_cases(30, relational=True):
         stated = format_facts(predicates)["deciding"]
         for statement, fact in zip(choose_statements(predicates).statements, stated, strict=True):
             assert all(name in fact["statement"] for name in statement.objects)

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.conf.schema import TeacherConfig
 from dynapix.data.records import Rationale
 from dynapix.teacher.journal import Journal, read_rationales
 from dynapix.teacher.narrate import ensure_rationales, narrate_store
@@ -327,17 +327,6 @@ def test_rationales_of_another_vocabulary_are_named_and_not_used(tmp_path, caplo
     with caplog.at_level("INFO"):
         assert narrate_store(store, relational).rationales == second.rationales
     assert "1 responses of the vocabulary relational 0" in caplog.text
-
-
-def test_bounds_of_relations_belong_to_the_settings_of_a_rationale(tmp_path):
-    store = make_store(tmp_path, 3)
-    relational = replace(TEMPLATE, predicates="relational")
-    wide = replace(relational, bounds=RelationBounds(level=0.3))
-    first = narrate_store(store, relational).rationales
-    assert narrate_store(store, relational).rationales == first
-    assert {r.settings for r in narrate_store(store, wide).rationales} != {
-        r.settings for r in first
-    }
 
 
 @pytest.mark.parametrize("served", [False, True])

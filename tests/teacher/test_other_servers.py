@@ -18,18 +18,10 @@ from dynapix.teacher.server_narrator import request_fields
 from dynapix.teacher.servers.capabilities import UNLIKELY, UNLIKELY_SCHEMA
 from dynapix.teacher.servers.pool import NoResponseError, ServerPool
 from tests.teacher.llama import CONTEXT
-from tests.teacher.memory_store import make_store, prompts_and_rationales
+from tests.teacher.memory_store import make_store
 from tests.teacher.server_process import ServerProcess, llama_server, transformers_server
-from tests.teacher.tiny_qwen3 import save_tiny_qwen3
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("qwen3")
-    texts = prompts_and_rationales(make_store(folder, 60))
-    return save_tiny_qwen3(folder, [part for item in texts for part in item])
 
 
 @pytest.fixture(scope="module")

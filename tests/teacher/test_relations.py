@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations, permutations
+from itertools import combinations
 
 import numpy as np
 import pytest
 
-from dynapix.conf.schema import RelationBounds, TeacherConfig
-from dynapix.data.oracle.displacement import MODEL_SIZE
+from dynapix.conf.schema import TeacherConfig
 from dynapix.teacher.predicates.facts import Relation
 from dynapix.teacher.predicates.relations import (
-    CLEARLY,
-    DISPLACED,
     KINDS,
     OPPOSITES,
     SYMMETRIC,
@@ -26,7 +23,6 @@ from dynapix.teacher.predicates.relations import (
 )
 from tests.teacher import synthetic
 
-BOUNDS = RelationBounds()
 A, B, C = "blue metal cube", "green metal sphere", "red rubber cylinder"
 
 
@@ -48,11 +44,11 @@ def values(found: set[Relation], kind: str) -> set[tuple[tuple[str, ...], str]]:
     [(-0.041, "right of"), (-0.039, "aligned with"), (0.039, "aligned with"), (0.041, "left of")],
 )
 def test_sides_and_heights_follow_their_bound(dx: float, side: str) -> None:
-    along = find_relations(places(a=(0.5, 0.5), b=(0.5 + dx, 0.5)), BOUNDS)
+    along = find_relations(places(a=(0.5, 0.5), b=(0.5 + dx, 0.5)))
     assert values(along, "side") == {((A, B), side)}
     assert values(along, "height") == {((A, B), "level with")}
     height = {"left of": "above", "right of": "below", "aligned with": "level with"}[side]
-    down = find_relations(places(a=(0.5, 0.5), b=(0.5, 0.5 + dx)), BOUNDS)
+    down = find_relations(places(a=(0.5, 0.5), b=(0.5, 0.5 + dx)))
     assert values(down, "height") == {((A, B), height)}
 
 
@@ -65,7 +61,7 @@ def test_sides_and_heights_follow_their_bound(dx: float, side: str) -> None:
 )  # fmt: skip
 def test_gaps_are_measured_in_widths_of_the_objects(width: float, scale: float, value: str) -> None:
     found = replace_places(places(a=(0.1, 0.1), b=(0.1, 0.1 + width / 10)), scale=scale)
-    assert values(find_relations(found, BOUNDS), "gap") == {((A, B), value)}
+    assert values(find_relations(found), "gap") == {((A, B), value)}
 
 
 def replace_places(old: Places, scale: float) -> Places:
@@ -84,44 +80,34 @@ def replace_places(old: Places, scale: float) -> Places:
 )
 def test_between_follows_its_bounds(share: float, offset: float, between: bool) -> None:
     found = find_relations(
-        places(a=(0.2 + 0.5 * share, 0.3 + 0.5 * offset), b=(0.2, 0.3), c=(0.7, 0.3)), BOUNDS
+        places(a=(0.2 + 0.5 * share, 0.3 + 0.5 * offset), b=(0.2, 0.3), c=(0.7, 0.3))
     )
     assert (((A, B, C), "between") in values(found, "between")) == between
 
 
-def test_nearer_and_extremes_follow_their_bounds() -> None:
-    found = find_relations(places(a=(0.3, 0.3), b=(0.2, 0.3), c=(0.43, 0.3)), BOUNDS)
+def test_nearer_follows_its_bound() -> None:
+    found = find_relations(places(a=(0.3, 0.3), b=(0.2, 0.3), c=(0.43, 0.3)))
     assert ((A, B, C), "nearer to") in values(found, "nearer")
-    assert values(found, "extreme") == {((B,), "leftmost"), ((C,), "rightmost")}
-    found = find_relations(places(a=(0.3, 0.3), b=(0.2, 0.3), c=(0.42, 0.3)), BOUNDS)
+    found = find_relations(places(a=(0.3, 0.3), b=(0.2, 0.3), c=(0.42, 0.3)))
     assert [v for o, v in values(found, "nearer") if o[0] == A] == ["as near to"]
-    level = find_relations(places(a=(0.3, 0.3), b=(0.33, 0.3), c=(0.8, 0.5)), BOUNDS)
-    assert ((A,), "leftmost") not in values(level, "extreme")
-
-
-def test_lower_object_covers_one_that_is_partly_hidden() -> None:
-    seen = places(a=(0.5, 0.5), b=(0.52, 0.45))
-    hidden = seen._replace(fraction={A: 1.0, B: 0.6})
-    assert values(find_relations(seen, BOUNDS), "cover") == set()
-    assert values(find_relations(hidden, BOUNDS), "cover") == {((A, B), "in front of")}
-    unknown = seen._replace(fraction={A: float("nan"), B: float("nan")})
-    assert values(find_relations(unknown, BOUNDS), "cover") == set()
 
 
 @pytest.mark.parametrize(
     ("fraction", "distance", "covers"),
-    [(0.89, 0.11, True), (0.91, 0.11, False), (0.89, 0.13, False)],
+    [(0.89, 0.11, True), (0.91, 0.11, False), (0.89, 0.13, False), (float("nan"), 0.11, False)],
 )
-def test_covering_follows_its_bounds(fraction: float, distance: float, covers: bool) -> None:
+def test_lower_object_covers_a_near_one_that_is_partly_hidden(
+    fraction: float, distance: float, covers: bool
+) -> None:
     where = places(a=(0.5, 0.5), b=(0.5, 0.5 - distance))
     hidden = where._replace(fraction={A: 1.0, B: fraction})
-    found = values(find_relations(hidden, BOUNDS), "cover")
+    found = values(find_relations(hidden), "cover")
     assert found == ({((A, B), "in front of")} if covers else set())
 
 
 @pytest.mark.parametrize(("lead", "is_leftmost"), [(0.041, True), (0.039, False)])
 def test_extremes_follow_their_bound(lead: float, is_leftmost: bool) -> None:
-    found = find_relations(places(a=(0.5 - lead, 0.2), b=(0.5, 0.5), c=(0.8, 0.8)), BOUNDS)
+    found = find_relations(places(a=(0.5 - lead, 0.2), b=(0.5, 0.5), c=(0.8, 0.8)))
     assert (((A,), "leftmost") in values(found, "extreme")) == is_leftmost
 
 
@@ -134,7 +120,7 @@ def test_extremes_follow_their_bound(lead: float, is_leftmost: bool) -> None:
     ],
 )  # fmt: skip
 def test_edges_follow_their_bound(place: tuple[float, float], edges: set[str]) -> None:
-    found = find_changes(places(a=(0.5, 0.5)), places(a=place), set(), BOUNDS)
+    found = find_changes(places(a=(0.5, 0.5)), places(a=place), set())
     assert values(found, "edge") == {((A,), f"reaches the {edge} edge") for edge in edges}
 
 
@@ -147,14 +133,12 @@ def test_changes_of_an_object_that_passes_another() -> None:
     ):
         before = places(a=(0.2, height), b=(0.5, 0.5), c=(0.9, 0.5))
         after = places(a=(0.7, height), b=(0.5, 0.5), c=(0.9, 0.5))
-        found = find_changes(before, after, {B, C}, BOUNDS)
+        found = find_changes(before, after, {B, C})
         assert values(found, "passing") == {((A, B), value)}
     later = places(a=(0.7, 0.5), b=(0.5, 0.5), c=(0.9, 0.5))
-    assert values(find_changes(earlier, later, {B, C}, BOUNDS), "arrival") == {
-        ((A, B, C), "comes between")
-    }
-    assert find_changes(earlier, later, {A, B, C}, BOUNDS) == set()
-    leaving = find_changes(earlier, places(a=(0.03, 0.5), b=(0.5, 0.5)), {B}, BOUNDS)
+    assert values(find_changes(earlier, later, {B, C}), "arrival") == {((A, B, C), "comes between")}
+    assert find_changes(earlier, later, {A, B, C}) == set()
+    leaving = find_changes(earlier, places(a=(0.03, 0.5), b=(0.5, 0.5)), {B})
     assert values(leaving, "edge") == {((A,), "reaches the left edge")}
 
 
@@ -173,14 +157,14 @@ def test_mirroring_the_image_swaps_left_and_right_only(seed: int) -> None:
         "leftmost": "rightmost",
         "rightmost": "leftmost",
     }
-    expected = {Relation(k, o, swap.get(v, v)) for k, o, v in find_relations(found, BOUNDS)}
-    assert find_relations(mirrored, BOUNDS) == expected
+    expected = {Relation(k, o, swap.get(v, v)) for k, o, v in find_relations(found)}
+    assert find_relations(mirrored) == expected
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_relations_are_normalized_and_orders_are_total(seed: int) -> None:
     found = random_places(seed)
-    relations = find_relations(found, BOUNDS)
+    relations = find_relations(found)
     assert {normalize_relation(r) for r in relations} == relations
     assert all(normalize_relation(flip_relation(r)) == r for r in relations if r.kind in SYMMETRIC)
     assert all(KINDS[r.value] == r.kind for r in relations)
@@ -195,35 +179,6 @@ def test_objects_that_look_alike_have_no_relations() -> None:
     twins = replace(scene, objects=(scene.objects[0], scene.objects[0], scene.objects[2]))
     assert len(Places.from_frame(scene, 0).image) == 3
     assert list(Places.from_frame(twins, 0).image) == [scene.objects[2].noun_phrase]
-
-
-def test_bounds_of_words_are_settings() -> None:
-    wide = replace(BOUNDS, level=0.2)
-    near = places(a=(0.4, 0.5), b=(0.5, 0.5))
-    assert values(find_relations(near, BOUNDS), "side") == {((A, B), "left of")}
-    assert values(find_relations(near, wide), "side") == {((A, B), "aligned with")}
-
-
-@pytest.mark.parametrize("order", list(permutations(range(2))))
-def test_interchangeable_objects_state_the_same(order: tuple[int, int]) -> None:
-    found = places(a=(0.3, 0.5), b=(0.6, 0.5))
-    relations = find_relations(found, BOUNDS)
-    names = [(A, B)[k] for k in order]
-    value = "left of" if order == (0, 1) else "right of"
-    assert normalize_relation(Relation("side", tuple(names), value)) in relations
-
-
-def test_bounds_of_displacements_are_those_of_the_paper_by_default() -> None:
-    """The schema cannot import the teacher, so that it repeats two bounds."""
-    default = RelationBounds()
-    assert (default.displaced, default.clearly) == (DISPLACED / MODEL_SIZE, CLEARLY / MODEL_SIZE)
-
-
-def test_invalid_bounds_are_named() -> None:
-    [problem] = TeacherConfig(name="t", bounds=RelationBounds(against=2.0)).check("teacher.")
-    assert "teacher.bounds.against=2" in problem
-    [problem] = TeacherConfig(name="t", bounds=RelationBounds(clearly=0.3)).check("teacher.")
-    assert "teacher.bounds.clearly=0.3 and teacher.bounds.far=0.25" in problem
 
 
 @pytest.mark.parametrize("words", [{"min_words": 100}, {"max_words": 200}])
@@ -242,10 +197,4 @@ def test_narrator_refuses_limits_that_its_rationales_exceed(words: dict[str, int
     ],
 )  # fmt: skip
 def test_distances_have_the_words_of_their_bounds(distance: float, extent: str | None) -> None:
-    assert describe_distance(distance, BOUNDS) == extent
-
-
-def test_bounds_of_distances_are_settings() -> None:
-    near = replace(BOUNDS, displaced=0.01, clearly=0.02, far=0.03)
-    words = [describe_distance(distance, near) for distance in (0.005, 0.015, 0.025, 0.035)]
-    assert words == [None, "slightly", "clearly", "far"]
+    assert describe_distance(distance) == extent

@@ -61,9 +61,6 @@ def test_figures_equal_counts_by_hand():
     assert figures["rejected"] == {"number": 2, "too short": 1, "wrong answer": 1}
     assert figures["examples"]["number"] == [("item-1", "'two'"), ("item-2", "'six'")]
     assert figures["lengths"] == [11, 11, 11]
-    assert figures["distinct_words"] == 9
-    assert list(figures["words"].items())[:2] == [("the", 6), ("cube", 6)]
-    assert (figures["same_text"], figures["same_but_names"]) == (1, 2)
     assert figures["requests"] == 0
 
 

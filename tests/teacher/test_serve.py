@@ -22,9 +22,8 @@ from dynapix.teacher.narrate import narrate_store
 from dynapix.teacher.sections import GRAMMAR_VERSION
 from dynapix.teacher.server_narrator import request_fields
 from dynapix.teacher.servers.pool import ServerPool
-from tests.teacher.memory_store import make_store, prompts_and_rationales
+from tests.teacher.memory_store import make_store
 from tests.teacher.server_process import ROOT, vllm_server
-from tests.teacher.tiny_qwen3 import save_tiny_qwen3
 from tests.user_errors import raises_user_error
 
 URL = "http://127.0.0.1:8000/v1"
@@ -39,13 +38,6 @@ def command(url=URL, **settings):
 def flags(available, **settings):
     """Return the arguments of vLLM on a machine with `available` GPUs."""
     return serve.vllm_arguments(command(**settings), "/weights", "127.0.0.1", 8000, available)
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("qwen3")
-    texts = prompts_and_rationales(make_store(folder, 60))
-    return save_tiny_qwen3(folder, [part for item in texts for part in item])
 
 
 @pytest.fixture(scope="module")

@@ -158,13 +158,6 @@ def test_refused_fields_are_left_out_and_named(store, start_server, caplog, stat
     assert "takes chat_template_kwargs; refuses top_k, which requests leave out" in caplog.text
 
 
-def test_refusal_of_every_request_shows_its_body(store, start_server):
-    server = start_server()
-    server.refused = {"temperature": 422}
-    with raises_user_error("server-refuses", contains=(server.url, "422", "unexpected: temp")):
-        narrate_store(store, teacher_at(server))
-
-
 @pytest.mark.parametrize("refused", [{}, {"structured_outputs": 422}, {"response_format": 500}])
 @pytest.mark.parametrize("form", ["free", "cited"])
 def test_constraint_that_is_not_applied_is_named_and_not_recorded(

@@ -9,24 +9,28 @@ from math import dist, hypot
 import numpy as np
 import pytest
 
-from dynapix.conf.schema import RelationBounds, TeacherConfig
+from dynapix.conf.schema import TeacherConfig
 from dynapix.teacher.narrator import FULL, write_match_lines, write_rationale
 from dynapix.teacher.predicates.facts import Relation
 from dynapix.teacher.predicates.relations import (
     CHANGES,
+    DISPLACED,
     KINDS,
     VALUES,
     describe_distance,
     normalize_relation,
 )
-from dynapix.teacher.statement_choice import UNSEEN_DISTANCE, choose_statements, measure_separation
-from dynapix.teacher.sufficiency import measure_sufficiency
+from dynapix.teacher.predicates.statement_choice import (
+    UNSEEN_DISTANCE,
+    choose_statements,
+    measure_separation,
+)
 from dynapix.teacher.validation.claim_extraction import extract_claims
+from dynapix.teacher.validation.sufficiency import measure_sufficiency
 from dynapix.teacher.validation.validator import validate_rationale
 from dynapix.teacher.writers.relational import RelationalWriter
 from tests.teacher.test_predicates import random_cases
 
-BOUNDS = RelationBounds()
 CFG = TeacherConfig(name="template")
 
 
@@ -34,7 +38,7 @@ def test_deciding_statements_are_a_place_and_a_smallest_set() -> None:
     """No smaller set of statements excludes what the place does not exclude, by exhaustive
     search."""
     sizes = []
-    for _, predicates in random_cases(60, BOUNDS):
+    for _, predicates in random_cases(60, relational=True):
         decision = choose_statements(predicates)
         wrong = [v for v in predicates.views if v.letter != predicates.answer]
         by_statement = {
@@ -65,7 +69,7 @@ def test_deciding_statements_are_a_place_and_a_smallest_set() -> None:
 
 def test_the_place_is_that_of_an_object_seen_at_the_cut() -> None:
     decides = set()
-    for _, predicates in random_cases(60, BOUNDS):
+    for _, predicates in random_cases(60, relational=True):
         place = choose_statements(predicates).place
         seen = {o.object for o in predicates.objects if o.sight != "out of view"}
         places = {
@@ -82,7 +86,7 @@ def test_the_place_is_that_of_an_object_seen_at_the_cut() -> None:
 def test_the_object_does_not_depend_on_which_candidate_is_the_target() -> None:
     """So a student, which sees the candidates only, can learn to choose it."""
     compared = 0
-    for _, predicates in random_cases(60, BOUNDS):
+    for _, predicates in random_cases(60, relational=True):
         names = {o.object for o in predicates.objects if o.sight == "shown"}
         everywhere = [names <= v.places.image.keys() for v in predicates.views]
         if not all(everywhere):
@@ -112,7 +116,7 @@ def test_separation() -> None:
 
 def test_outcomes_name_the_closest_candidate() -> None:
     named = 0
-    for item, predicates in random_cases(250, BOUNDS):
+    for item, predicates in random_cases(250, relational=True):
         text = write_rationale(predicates, item, 0).partition("Outcome: ")[2]
         outcome, *rest = text.partition(".\nAnswer: ")[0].split(". ")
         decision = choose_statements(predicates)
@@ -132,13 +136,13 @@ def test_outcomes_name_the_closest_candidate() -> None:
             verdicts = {c.verdict for c in extract_claims(text, predicates) if c.candidate}
             right = letter == predicates.answer
             assert verdicts == {"supported" if right else "contradicted"}
-            assert right or dist(there, target) >= BOUNDS.displaced
+            assert right or dist(there, target) >= DISPLACED
     assert named > 40
 
 
 def test_every_relational_rationale_is_accepted_and_sufficient() -> None:
     lengths = {"paper": [], "relational": []}
-    for item, predicates in random_cases(250, BOUNDS):
+    for item, predicates in random_cases(250, relational=True):
         text = write_rationale(predicates, item, seed=3)
         validation = validate_rationale(text, predicates, item, CFG)
         assert validation.reasons == (), text
@@ -153,7 +157,7 @@ def test_every_relational_rationale_is_accepted_and_sufficient() -> None:
 @pytest.mark.parametrize("value", [value for kind in CHANGES for value in VALUES[kind]])
 def test_a_change_decides_what_no_state_decides(value: str) -> None:
     item, predicates = next(
-        case for case in random_cases(60, BOUNDS) if len(case[1].target.places.image) > 2
+        case for case in random_cases(60, relational=True) if len(case[1].target.places.image) > 2
     )
     target = predicates.target
     names = sorted(target.places.image)
@@ -185,7 +189,7 @@ def test_a_change_decides_what_no_state_decides(value: str) -> None:
 
 def test_motion_analyses_mention_the_deciding_objects_that_stay() -> None:
     mentioned = 0
-    for item, predicates in random_cases(120, BOUNDS):
+    for item, predicates in random_cases(120, relational=True):
         text = write_rationale(predicates, item, seed=0)
         motion = text.partition("Motion analysis: ")[2].partition("\nPrediction")[0]
         if "The objects hardly move" in motion:
@@ -200,7 +204,7 @@ def test_motion_analyses_mention_the_deciding_objects_that_stay() -> None:
 
 
 def test_wrong_candidates_are_compared_with_the_chosen_statements_only() -> None:
-    for item, predicates in random_cases(60, BOUNDS):
+    for item, predicates in random_cases(60, relational=True):
         text = write_rationale(predicates, item, seed=0)
         decision = choose_statements(predicates)
         compared = {(s.kind, *sorted(s.objects)) for s in decision.statements}
@@ -218,7 +222,7 @@ def test_wrong_candidates_are_compared_with_the_chosen_statements_only() -> None
 
 def test_objects_out_of_view_at_the_cut_are_named_only_if_they_decide() -> None:
     unseen = 0
-    for item, predicates in random_cases(250, BOUNDS):
+    for item, predicates in random_cases(250, relational=True):
         decision = choose_statements(predicates)
         deciding = {name for s in decision.statements for name in s.objects}
         names = {o.object for o in predicates.objects if o.sight == "out of view"} - deciding
@@ -234,7 +238,7 @@ def test_objects_out_of_view_at_the_cut_are_named_only_if_they_decide() -> None:
 
 def test_scene_parses_name_objects_from_left_to_right() -> None:
     counts = []
-    for item, predicates in random_cases(60, BOUNDS):
+    for item, predicates in random_cases(60, relational=True):
         parse = write_rationale(predicates, item, 0).split("Motion analysis:")[0]
         named = [[n for n in predicates.left_to_right if n in s] for s in parse.split(". ")]
         # Sentences about two objects name the more relevant one first.
@@ -245,7 +249,7 @@ def test_scene_parses_name_objects_from_left_to_right() -> None:
 
 
 def test_match_lines_give_the_verdict_only() -> None:
-    for item, predicates in random_cases(20, BOUNDS):
+    for item, predicates in random_cases(20, relational=True):
         lines = write_match_lines(predicates, item)
         for line, view in zip(lines, predicates.views, strict=True):
             verb = "matches" if view.letter == predicates.answer else "does not match"
@@ -255,7 +259,7 @@ def test_match_lines_give_the_verdict_only() -> None:
 def test_analyses_describe_all_candidates_in_the_same_respects() -> None:
     """So neither the length of a description nor its last statement tells the target."""
     alike = denied = 0
-    for item, predicates in random_cases(60, BOUNDS):
+    for item, predicates in random_cases(60, relational=True):
         writer = RelationalWriter(predicates, choose_statements(predicates), FULL, item.item_id)
         if not writer.statements:
             continue
@@ -286,7 +290,7 @@ def test_analyses_describe_all_candidates_in_the_same_respects() -> None:
 def test_the_oracle_checks_how_far_off_an_object_is() -> None:
     extents = ("slightly", "clearly", "far")
     checked = set()
-    for _, predicates in random_cases(30, BOUNDS):
+    for _, predicates in random_cases(30, relational=True):
         target = predicates.target.places.image
         for view in predicates.views:
             if view.letter == predicates.answer:
@@ -294,7 +298,7 @@ def test_the_oracle_checks_how_far_off_an_object_is() -> None:
             for s in (s for s in predicates.target.statements if s.kind == "region"):
                 (name,) = s.objects
                 shown = view.places.image.get(name)
-                actual = shown and describe_distance(dist(shown, target[name]), BOUNDS)
+                actual = shown and describe_distance(dist(shown, target[name]))
                 region = f"Candidate {view.letter} shows the {name} {s.value}"
                 for extent in extents if actual else ():
                     text = f"Candidate analysis: {region}, {extent} off."

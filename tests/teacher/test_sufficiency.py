@@ -7,19 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynapix.conf.schema import RelationBounds, TeacherConfig
-from dynapix.data.records import Scene
+from dynapix.conf.schema import TeacherConfig
 from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary
 from dynapix.teacher.servers.responses import Response
-from dynapix.teacher.sufficiency import find_predicted, measure_sufficiency
 from dynapix.teacher.validation.claim_extraction import extract_claims
 from dynapix.teacher.validation.grader import RationaleGrader
+from dynapix.teacher.validation.sufficiency import find_predicted, measure_sufficiency
 from tests.teacher import synthetic
 from tests.teacher.test_predicates import random_cases
-
-BOUNDS = RelationBounds()
-SUFFICIENT = "Prediction: At the target moment, the {a} will be {place}."
 
 
 def sufficiency_of(prediction: str, pixels: list[tuple[float, float]]) -> float:
@@ -31,14 +28,7 @@ def sufficiency_of(prediction: str, pixels: list[tuple[float, float]]) -> float:
     for frame, pixel in zip((60, 70, 80, 90), pixels, strict=True):
         positions[frame, 1, :2], image[frame, 1] = synthetic.on_ground(pixel)[:2], pixel
     scene = replace(still, positions=positions, image_positions=image, collisions=())
-    return _sufficiency(prediction, scene)
-
-
-def _sufficiency(prediction: str, scene: Scene) -> float:
-    from dynapix.teacher.predicates.extraction import extract_predicates
-
-    item = synthetic.item((60, 70, 80, 90))
-    predicates = extract_predicates(item, scene, None, BOUNDS)
+    predicates = extract_predicates(synthetic.item((60, 70, 80, 90)), scene, None)
     first, second = (o.noun_phrase for o in scene.objects)
     text = f"Prediction: {prediction.format(b=first, a=second)}\nOutcome: none."
     return measure_sufficiency(text, extract_claims(text, predicates), predicates)
@@ -67,7 +57,7 @@ def test_sufficiency_is_the_chance_of_a_reader_who_knows_only_the_prediction(
 
 
 def test_only_the_prediction_counts() -> None:
-    for item, predicates in random_cases(20, BOUNDS):
+    for item, predicates in random_cases(20, relational=True):
         text = write_rationale(predicates, item, 0)
         claims = extract_claims(text, predicates)
         without = "\n".join(x for x in text.splitlines() if not x.startswith("Prediction"))
@@ -78,7 +68,7 @@ def test_only_the_prediction_counts() -> None:
 def test_a_rationale_that_does_not_decide_a_decidable_item_is_insufficient() -> None:
     """The paper's words decide fewer items than relations."""
     reasons = {"paper": set(), "relational": set()}
-    for item, predicates in random_cases(60, BOUNDS):
+    for item, predicates in random_cases(60, relational=True):
         for vocabulary, found in reasons.items():
             cfg = TeacherConfig(name="t", predicates=vocabulary, sufficient=True)
             text = write_rationale(choose_vocabulary(predicates, cfg), item, 0)

@@ -382,9 +382,7 @@ def test_nothing_is_said_of_contacts(tmp_path: Path) -> None:
     touching = replace(scene, records_contacts=True)
     assert extract_facts(touching, 0, 25, 39).courses
     assert close_pairs(touching, 39)
-    kinds = {
-        r.kind for r in find_relations(Places.from_frame(scene, 20), TeacherConfig(name="t").bounds)
-    }
+    kinds = {r.kind for r in find_relations(Places.from_frame(scene, 20))}
     assert "side" in kinds
     assert "gap" not in kinds
 

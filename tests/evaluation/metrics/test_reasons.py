@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.data.checks.intervals import SceneBootstrap
 from dynapix.data.records import LETTERS, SelectionItem
 from dynapix.data.store import Store
@@ -27,7 +26,7 @@ def rationales(micro_store: Store) -> list[tuple[SelectionItem, str]]:
     found = []
     for item in micro_store.selection("test"):
         scene = micro_store.scene(item.scene_id)
-        predicates = extract_predicates(item, scene, micro_store.scene, RelationBounds())
+        predicates = extract_predicates(item, scene, micro_store.scene)
         if predicates is not None:
             text = write_rationale(predicates, item, 0)
             body, answer = text.rsplit("\n", 1)

@@ -10,7 +10,6 @@ from math import dist, erf, hypot, sqrt
 
 import numpy as np
 
-from dynapix.conf.schema import RelationBounds
 from dynapix.teacher.predicates.facts import OUT_OF_VIEW, Relation, RelationalPredicates, View
 from dynapix.teacher.predicates.margins import measure_margin
 from dynapix.teacher.predicates.relations import CHANGES
@@ -89,10 +88,7 @@ def choose_statements(
         if s.kind not in CHANGES and not all(s in view.statements for view in wrong)
     ]
     holds = np.array([_probability_of_truth(s, predicates) for s in statements])
-    bounds = predicates.bounds
-    excludes = np.array(
-        [[_probability_of_falsity(s, v, bounds) for v in wrong] for s in statements]
-    )
+    excludes = np.array([[_probability_of_falsity(s, v) for v in wrong] for s in statements])
     excludes = excludes.reshape(len(statements), len(wrong))
     possible = excludes.any(axis=0)
     place = _choose_place(predicates, shown)
@@ -175,27 +171,27 @@ def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:
     return tuple(int(k) for k in (holds[:, None] * excludes).argmax(axis=0))
 
 
-def _probability_of_falsity(statement: Relation, view: View, bounds: RelationBounds) -> float:
+def _probability_of_falsity(statement: Relation, view: View) -> float:
     """Return the probability that a reader finds a statement false of a candidate; 0 if it is
     true."""
-    return 0.0 if statement in view.statements else _probability_of_sight(statement, view, bounds)
+    return 0.0 if statement in view.statements else _probability_of_sight(statement, view)
 
 
-def _probability_of_sight(statement: Relation, view: View, bounds: RelationBounds) -> float:
+def _probability_of_sight(statement: Relation, view: View) -> float:
     """Return the probability that a reader finds a statement true of a candidate if it is true, or
     false if it is false."""
-    margin = abs(measure_margin(statement, view.places, bounds))
+    margin = abs(measure_margin(statement, view.places))
     return _normal_cdf(margin / _error(statement, [SEEN_ERROR] * len(_involved(statement, view))))
 
 
 def _probability_of_truth(statement: Relation, predicates: RelationalPredicates) -> float:
     """Return the probability that a reader finds a true statement true, both of the state that it
     predicts and of the target."""
-    target, bounds = predicates.target, predicates.bounds
+    target = predicates.target
     paths = [predicates.paths.get(name, UNKNOWN_PATH) for name in _involved(statement, target)]
     error = _error(statement, [SEEN_ERROR + PREDICTED_ERROR * path for path in paths])
-    predicted = _normal_cdf(measure_margin(statement, target.places, bounds) / error)
-    return predicted * _probability_of_sight(statement, target, bounds)
+    predicted = _normal_cdf(measure_margin(statement, target.places) / error)
+    return predicted * _probability_of_sight(statement, target)
 
 
 def _error(statement: Relation, errors: Sequence[float]) -> float:
