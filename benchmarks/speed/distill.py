@@ -63,7 +63,6 @@ def main() -> None:
             comparison.run_in_process(write_base, overrides, args.preset, Path(folder))
             overrides.append(f"student.model={folder}")
         comparison.compare(
-            "distill",
             lambda name: comparison.run_in_process(measure, name, overrides, args.steps),
             args.only or [SFT, DISTILL, SAMPLING],
             SFT,
