@@ -41,7 +41,7 @@ def run_sweep(command: str, schema: type, overrides: list[str]) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if sweep.is_search:
         search: Search = instantiate(sweep.hydra.sweeper)
-        search.run(command, sweep.overrides, sweep.folder, sweep.run_jobs)
+        search.run(sweep.overrides, sweep.folder, sweep.run_jobs)
     else:
         sweep.run_jobs(sweep.jobs)
     if jobs := read_jobs(sweep.folder):
