@@ -22,7 +22,7 @@ PY := $(BIN)/python -m
 # Every process imports torch and transformers, which takes three times as long without bytecode files.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: help setup docs vllm-env run paper-tiny paper experiments releases hours test test-integrations check lint format base constraints clean
+.PHONY: help setup docs vllm-env run paper-tiny paper experiments releases test test-integrations check lint format base constraints clean
 
 help: ## Print this help
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -96,7 +96,7 @@ paper: FOLDER = benchmark.folder=$(RELEASES)/$$s
 # The paper measures bases in record mode. Reasoning and answer mode compare them with the students.
 paper: ZERO_SHOT := modes=[record,constrained,reasoning,answer]
 paper: MATCHER := matcher=$(RETRIEVER)
-paper: releases hours experiments ## Run every experiment at the paper's scale; variables: STUDENT, RETRIEVER, TEACHER, STUDIES, RELEASES=FOLDER
+paper: releases experiments ## Run every experiment at the paper's scale; variables: STUDENT, RETRIEVER, TEACHER, STUDIES, RELEASES=FOLDER
 
 experiments: setup
 	for b in $(BASES); do $(PY) evaluation.select $(BENCHMARK) student=$$b $(ZERO_SHOT) || exit; done
@@ -127,9 +127,6 @@ experiments: setup
 releases:
 	@test -d "$(RELEASES)/movi_a" && test -d "$(RELEASES)/physion" || { echo "error: make paper needs the releases \
 	$(RELEASES)/movi_a and $(RELEASES)/physion: give their parent folder as RELEASES=FOLDER"; exit 1; }
-
-hours: setup ## Estimate the GPU hours of the training runs of make paper
-	@$(PY) benchmarks.speed.hours --student $(STUDENT) --retriever $(RETRIEVER)
 
 # One thread per process, because the tests run in several processes and start others.
 test: setup vllm-env ## Run all tests

@@ -10,10 +10,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from difflib import SequenceMatcher
 from importlib.resources import files
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 import yaml
 from hydra import compose as hydra_compose
@@ -30,7 +30,7 @@ from omegaconf.errors import OmegaConfBaseException
 from dynapix.conf.errors import SettingsError
 from dynapix.conf.files import expand_path, refuse_broken_link
 from dynapix.conf.runs import flatten, resolve_run_name, run_name, runs_folder
-from dynapix.conf.typed_text import quote_texts, register_presets
+from dynapix.conf.typed_text import adapt_override
 
 for resolver in (expand_path, run_name, resolve_run_name, runs_folder):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
@@ -44,7 +44,6 @@ added with `+`, as in `+exp=cot`, whereas a preset replaces another one, as in `
 
 def register(command: str, schema: type) -> None:
     """Store `schema` under the name by which the defaults of `conf/<name>.yaml` refer to it."""
-    register_presets()
     ConfigStore.instance().store(name=f"{config_name(command)}_schema", node=schema)
 
 
@@ -94,20 +93,6 @@ def refuse_empty_dicts(overrides: list[str]) -> None:
                 f"{override.input_line}: an empty dict changes nothing, because the entries of the "
                 "preset stay: set each entry that should change, as in KEY.NAME=VALUE"
             )
-
-
-def adapt_override(override: str, schema: type) -> str:
-    """Return an override that Hydra reads as the schema means it: a text is quoted if it looks like
-    a number."""
-    key, equals, value = override.partition("=")
-    hint: Any = schema
-    for name in key.lstrip("+").split("."):
-        if get_origin(hint) is dict:
-            hint = get_args(hint)[1]
-        else:
-            groups = [t for t in (hint, *get_args(hint)) if is_dataclass(t)]
-            hint = get_type_hints(groups[0]).get(name) if groups else None
-    return f"{key}{equals}{quote_texts(value, hint)}"
 
 
 def list_presets(command: str, schema: type) -> dict[str, list[str]]:
@@ -170,26 +155,17 @@ def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.R
 
     Raises:
         SettingsError: The value of a group of presets is not a name, or a key is inside a group
-            that is null. Hydra's errors for these two cases name no key.
+            that is null. Hydra's own errors in these two cases explain nothing.
     """
     hydra = GlobalHydra.instance().hydra
     try:
         return hydra.compose_config(config_name(command), overrides, mode, from_shell=False)
     except UnicodeDecodeError as error:
         raise SettingsError(f"a file of settings is no UTF-8 text: {error}") from error
-    except ValueError as error:
-        parts = {o: o.lstrip("+").partition("=") for o in overrides}
-        unnamed = " ".join(
-            override
-            for override, (key, _, value) in parts.items()
-            if hydra.config_loader.get_group_options(key)
-            and not isinstance(yaml.safe_load(value), str)
-        )
-        raise SettingsError(f"{unnamed}: give the name of a preset") from error
-    except (AssertionError, AttributeError) as error:
-        nested = " ".join(o for o in overrides if "." in o.partition("=")[0])
+    except (ValueError, AssertionError, AttributeError) as error:
         raise SettingsError(
-            f"{nested}: the group above one of these keys is null; choose a preset that sets it"
+            f"{' '.join(overrides)}: give a group of presets the name of one, and set no key "
+            "inside a group that is null"
         ) from error
 
 
@@ -231,7 +207,7 @@ def _unknown_key(command: str, key: str) -> str:
     if key.partition(".")[0] == "world":
         return (
             f"{command} has no key {key}: give benchmark.{key}, or begin your file in conf/world/ "
-            "with the line # @package benchmark.world"
+            "with the line # @package benchmark.world, without a byte-order mark before it"
         )
     if key.startswith("hydra."):
         return f"Hydra has no key {key}"

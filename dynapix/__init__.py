@@ -23,13 +23,12 @@ if TYPE_CHECKING:
     from dynapix.observers import Observers, observer
     from dynapix.rationales import RationaleScore, score_rationale, sufficiency
     from dynapix.retrieval import RetrievalScores, evaluate_retrieval
-    from dynapix.selection import Comparison, Failure, Outcome, Result, evaluate
+    from dynapix.selection import Comparison, Outcome, Result, evaluate
     from dynapix.teacher.numbers.detection import find_numbers
 
 _HOMES = {
     "Benchmark": "dynapix.benchmark",
     "Comparison": "dynapix.selection",
-    "Failure": "dynapix.selection",
     "Frame": "dynapix.benchmark",
     "Item": "dynapix.benchmark",
     "Observers": "dynapix.observers",
@@ -55,7 +54,6 @@ _HOMES = {
 __all__ = [
     "Benchmark",
     "Comparison",
-    "Failure",
     "Frame",
     "Item",
     "Observers",

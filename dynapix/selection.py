@@ -31,7 +31,7 @@ from dynapix.evaluation.metrics.selection import (
 )
 from dynapix.evaluation.metrics.significance import PairedComparison, compare_runs
 from dynapix.evaluation.reporting.run_responses import nearest_candidates
-from dynapix.integrations.logs import Log, read_inspect, read_lmms_eval
+from dynapix.integrations.logs import Log, name_damage, read_inspect, read_lmms_eval
 from dynapix.models.student.answer_parser import parse_choice
 from dynapix.saved_runs import saved_run
 
@@ -39,14 +39,6 @@ TEXT = "text"
 """Mode of results whose predictions are letters or texts."""
 MIN_FAILURES_TO_STOP = 8
 """An evaluation stops if at least this many items, and all items so far, have failed."""
-
-
-@dataclass(frozen=True)
-class Failure:
-    """An item for which `predict` gave no usable prediction. The item counts as wrong."""
-
-    item_id: str
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -238,9 +230,10 @@ class Result:
         return not any(outcome.scores for outcome in self.outcomes)
 
     @cached_property
-    def failures(self) -> list[Failure]:
-        """The items without a usable prediction, and why."""
-        return [Failure(o.item_id, o.reason or "") for o in self.outcomes if o.failed]
+    def failures(self) -> list[Outcome]:
+        """The outcomes of the items without a usable prediction, each with its `reason`. These
+        items count as wrong."""
+        return [outcome for outcome in self.outcomes if outcome.failed]
 
     @cached_property
     def report(self) -> SelectionReport:
@@ -323,7 +316,8 @@ class Result:
                 scored = [(o.item_id, o.scores) for o in self.outcomes]
                 rows = [{"by": self.name, "item_id": i, "scores": scores} for i, scores in scored]
                 write_json_lines(folder / "scores.jsonl", rows)
-            write_json_lines(folder / "failures.jsonl", map(asdict, self.failures))
+            failed = [{"item_id": o.item_id, "reason": o.reason} for o in self.failures]
+            write_json_lines(folder / "failures.jsonl", failed)
             write_json(folder / "report.json", asdict(self.report))
             write_text(folder / "report.txt", f"{self}\n")
         return folder
@@ -339,7 +333,7 @@ class Result:
             UserError: The folder has no saved result, or its items are not those of `benchmark`.
         """
         folder = Path(expand_path(str(folder)))
-        try:
+        with name_damage(folder, "a saved result"):
             record = json.loads((folder / "run.json").read_text())
             report = json.loads((folder / "report.json").read_text())
             kind, name, seed = record["kind"], record["name"], record["seed"]
@@ -351,10 +345,6 @@ class Result:
             lines = (folder / "failures.jsonl").read_text().splitlines()
             failed = {row["item_id"]: row["reason"] for row in map(json.loads, lines)}
             build = report["build"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UserError(
-                f"{folder} is not a saved result, or it is damaged: {error}", code="damaged-file"
-            ) from error
         if build != benchmark.store.identity:
             raise UserError(
                 f"{folder} is a result on another benchmark or build than {benchmark.store.folder}",

@@ -16,7 +16,7 @@ import dynapix
 from dynapix.conf.compose import compose, config_name
 from dynapix.conf.multirun.sweep import Sweep
 from dynapix.conf.runs import TRAINER_FOLDERS, run_name
-from tests.conf.test_presets import SCHEMAS
+from tests.conf.schemas import SCHEMAS
 from tests.evaluation.chat_server import ChatServer
 
 ROOT = Path(__file__).parents[1]

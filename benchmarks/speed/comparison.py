@@ -6,12 +6,9 @@ import argparse
 import ctypes
 import json
 import os
-import resource
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from multiprocessing import get_context
@@ -33,7 +30,6 @@ from transformers import (
 )
 
 from benchmarks.arguments import positive_int
-from benchmarks.speed import hours
 from dynapix.conf.errors import SettingsError, UserError
 from dynapix.conf.runs import Run
 from dynapix.conf.schema import TrainConfig
@@ -159,7 +155,6 @@ def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
 
 def compare(
-    benchmark: str,
     measure: Callable[[str], Measurements],
     names: Sequence[str],
     reference: str,
@@ -170,11 +165,9 @@ def compare(
 
     The ratios to a reference variant of the same round are printed too: their median and, for
     rates, the lowest and the highest. A variant that runs out of memory or cannot be trained with
-    its settings is left out. On a GPU, the rate of our trainer with a released preset is appended
-    to `hours.RATES`.
+    its settings is left out.
 
     Args:
-        benchmark: Module of `benchmarks.speed` that measures.
         measure: Measures a variant by its name.
         reference: Name of the reference variant.
         unit: What a rate counts, such as samples.
@@ -207,9 +200,6 @@ def compare(
         spread = of_variants[rate].agg(["min", "max"]).add_prefix(f"{rate}, ratio, ")
         medians = medians.join(spread)
     print(medians.to_string(float_format="{:.3f}".format), flush=True)
-    if OURS in medians.index and args.preset != "tiny" and torch.cuda.is_available():
-        card, measured = torch.cuda.get_device_name(), medians.loc[OURS, rate]
-        hours.add_rate(benchmark, args.preset, args.quantization, measured, card)
 
 
 def write_random_base(preset: str, texts: list[str], image_size: int, folder: Path) -> None:
@@ -234,18 +224,14 @@ def reset_peak_memory() -> None:
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
         return
-    with suppress(OSError, AttributeError):
-        # Memory that was freed but not returned to the system would hide later allocations.
-        ctypes.CDLL(None).malloc_trim(0)
-        Path("/proc/self/clear_refs").write_text("5")
+    # Memory that was freed but not returned to the system would hide later allocations.
+    ctypes.CDLL(None).malloc_trim(0)
+    Path("/proc/self/clear_refs").write_text("5")
 
 
 def peak_memory() -> int:
-    """Return the peak memory (bytes) since `reset_peak_memory`, or since the process started if the
-    system cannot reset it."""
+    """Return the peak memory (bytes) since `reset_peak_memory`."""
     if torch.cuda.is_available():
         return torch.cuda.max_memory_allocated()
-    if sys.platform.startswith("linux"):
-        status = Path("/proc/self/status").read_text()
-        return int(status.partition("VmHWM:")[2].split()[0]) << 10
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    status = Path("/proc/self/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) << 10

@@ -5,9 +5,8 @@
     python -m benchmarks.speed.contrastive qwen3_vl_emb_8b      # a released size, on a GPU
 
 Every variant trains on the same batches of queries, in a process of its own. The script prints
-medians over the rounds and the ratios to our trainer with the preset's settings, whose rate on a
-GPU is recorded for benchmarks.speed.hours. A released size has random weights, so that nothing is
-downloaded.
+medians over the rounds and the ratios to our trainer with the preset's settings. A released size
+has random weights, so that nothing is downloaded.
 
 Plain sentence-transformers uses the library's trainer, collator and losses: by default its cached
 loss with mini-batches of 32, which embeds a batch twice. Like our trainer, it reads the pixels of
@@ -108,7 +107,6 @@ def main() -> None:
             print(f"\nbatches of {batch or 'the preset'}")
             settings = [*overrides, *([f"train.batch={batch}"] if batch else [])]
             comparison.compare(
-                "contrastive",
                 lambda name, settings=settings: measure_in_process(
                     settings, VARIANTS[name], args.steps
                 ),

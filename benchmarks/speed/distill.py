@@ -6,9 +6,8 @@
 Every variant trains on items of the tiny benchmark, in a process of its own. "train.sft" trains on
 its usual samples, half of which are answers without a rationale. "train.distill" samples a response
 to each item and trains on it, with a teacher of the same size that reads the facts. Both have the
-batch, the micro-batch and the memory settings of the student's preset. "sampling" is the part of
-the steps of train.distill in which the responses are sampled. The script prints medians over the
-rounds and the ratios to train.sft.
+batch, the micro-batch and the memory settings of the student's preset. The script prints medians
+over the rounds and the ratios to train.sft.
 
 A released size has random weights, so that nothing is downloaded. Its responses do not end, so they
 have the full length of --tokens.
@@ -18,13 +17,10 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
-from torch import nn
 from transformers import set_seed
 
 from benchmarks.arguments import positive_int
@@ -47,7 +43,7 @@ from dynapix.train.on_policy.continuation import inherit_settings
 from dynapix.train.on_policy.paired_prompts import load_datasets
 from dynapix.train.on_policy.teachers import LocalTeacher
 
-SFT, DISTILL, SAMPLING = "train.sft", "train.distill", "sampling"
+VARIANTS = SFT, DISTILL = "train.sft", "train.distill"
 
 
 def main() -> None:
@@ -55,7 +51,7 @@ def main() -> None:
     parser.add_argument(
         "--tokens", type=positive_int, default=200, help="maximum length of a response"
     )
-    comparison.add_arguments(parser, steps=3, variants=[SFT, DISTILL, SAMPLING])
+    comparison.add_arguments(parser, steps=3, variants=VARIANTS)
     args = comparison.parse_arguments(parser)
     overrides = [*list_overrides(args), f"student.max_new_tokens={args.tokens}"]
     with tempfile.TemporaryDirectory() as folder:
@@ -63,9 +59,8 @@ def main() -> None:
             comparison.run_in_process(write_base, overrides, args.preset, Path(folder))
             overrides.append(f"student.model={folder}")
         comparison.compare(
-            "distill",
             lambda name: comparison.run_in_process(measure, name, overrides, args.steps),
-            args.only or [SFT, DISTILL, SAMPLING],
+            args.only or VARIANTS,
             SFT,
             "samples",
             args,
@@ -73,7 +68,7 @@ def main() -> None:
 
 
 def measure(name: str, overrides: list[str], steps: int) -> Measurements:
-    """Train a variant in this process for `steps` steps after the first one, or sample only."""
+    """Train a variant in this process for `steps` steps after the first one."""
     if name == SFT:
         return measure_sft(overrides, SFT_VARIANTS[comparison.OURS], steps, False)
     trained = compose("train.sft", SftCommand, overrides)
@@ -92,14 +87,6 @@ def measure(name: str, overrides: list[str], steps: int) -> Measurements:
     # The responses of a model with random weights contain no answer.
     unlimited = patch.object(sampling.ResponseSampler, "check_parsed", lambda *_: None)
     with tempfile.TemporaryDirectory() as folder, unlimited:
-        if name == SAMPLING:
-            student.to(rank_device())
-            pairs = [training[k] for k in range((steps + 1) * train.batch)]
-            length = trained.student.max_length
-            prompts = [sampling.encode_prompt(p.student, processor, length) for p in pairs]
-            sampler = sampling.ResponseSampler(processor, trained.student, train)
-            seeds = [p.seed for p in pairs]
-            return measure_sampling(sampler, student, prompts, seeds, train.batch)
         model, _ = loading.load_student(trained.student, train.precision, list)
         model.eval().to(rank_device())
         teacher = LocalTeacher(model, processor, train.beta, train.precision == "bf16")
@@ -108,25 +95,6 @@ def measure(name: str, overrides: list[str], steps: int) -> Measurements:
             cfg, trained, run, student, teacher, processor, training, validation, None
         )
         return comparison.train(trainer, train.batch)
-
-
-def measure_sampling(
-    sampler: sampling.ResponseSampler,
-    student: nn.Module,
-    prompts: Sequence[sampling.EncodedPrompt],
-    seeds: Sequence[int],
-    batch: int,
-) -> Measurements:
-    """Sample a response to each prompt, in batches of which the first one is not timed."""
-    comparison.reset_peak_memory()
-    for start in range(0, len(prompts), batch):
-        if start == batch:
-            began, cpu = time.perf_counter(), time.process_time()
-        part = slice(start, start + batch)
-        sampler.sample(student, prompts[part], seeds[part])
-    count, seconds = len(prompts) - batch, time.perf_counter() - began
-    cpu, peak = time.process_time() - cpu, comparison.peak_memory() / 2**30
-    return Measurements(count / seconds, cpu / count, peak, [float("nan")])
 
 
 if __name__ == "__main__":

@@ -179,7 +179,7 @@ def rank(frames: int, args: argparse.Namespace) -> Seconds:
     """Rank frames with random embeddings for 500 queries at seven widths."""
     seconds: Seconds = {}
     database = retrieval.embed_frames(range(frames))
-    queries, targets = retrieval.embed_queries(argparse.Namespace(frames=frames, queries=500))
+    queries, targets = retrieval.embed_queries(frames, 500)
     with timed(seconds, "ranks"):
         retrieval.exact_ranks(queries, database[targets], [database], retrieval.WIDTHS)
     return seconds

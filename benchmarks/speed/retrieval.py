@@ -1,15 +1,11 @@
-"""Measures the time and memory of ranking the frames of a database for queries.
+"""Measures the time and memory of ranking the frames of a large database for queries.
 
-    python -m benchmarks.speed.retrieval ranks
-    python -m benchmarks.speed.retrieval large
+    python -m benchmarks.speed.retrieval
 
-`ranks` computes the exact ranks of 2,002 queries over 10,000 frames at all seven widths up to
-4,096. Each round also times one fp32 matrix product of the same queries and frames. The script
-prints medians over the rounds.
-
-`large` ranks 256 queries over 1,000,000 frames. It first writes their embeddings to cache files
-(16 GiB), which it deletes at the end. The script prints seconds and peak memory. Time is linear in
-the number of queries; memory grows by 100 KiB per query.
+Computes the exact ranks of 256 queries over 1,000,000 frames at all seven widths up to 4,096. The
+script first writes the embeddings of the frames to cache files (16 GiB), which it deletes at the
+end. It prints seconds and peak memory. Time is linear in the number of queries; memory grows by 100
+KiB per query. `benchmarks.speed.growth rank` ranks smaller databases, in memory.
 
 Embeddings are random but clustered: those of the 128 frames of a scene lie around one point, and
 that of a query lies near its target. OMP_NUM_THREADS=1 restricts the script to one thread.
@@ -21,7 +17,6 @@ import argparse
 import os
 import resource
 import shutil
-import statistics
 import tempfile
 import time
 from collections.abc import Callable
@@ -41,42 +36,14 @@ WIDTHS = (4096, 2048, 1024, 512, 256, 128, 64)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    commands = parser.add_subparsers(required=True)
-    for name, queries, frames, measure in (
-        ("ranks", 2_002, 10_000, measure_ranks),
-        ("large", 256, 1_000_000, measure_large),
-    ):
-        command = commands.add_parser(name)
-        command.add_argument("--queries", type=positive_int, default=queries)
-        command.add_argument("--frames", type=positive_int, default=frames)
-        command.set_defaults(measure=measure)
-        if measure is measure_ranks:
-            command.add_argument("--rounds", type=positive_int, default=3)
-        else:
-            command.add_argument("--folder", help="where to write the cache files, by default /tmp")
+    parser.add_argument("--queries", type=positive_int, default=256)
+    parser.add_argument("--frames", type=positive_int, default=1_000_000)
+    parser.add_argument("--folder", help="where to write the cache files, by default /tmp")
     args = parser.parse_args()
     cores = len(os.sched_getaffinity(0))
     print(f"{cores} core(s), OMP_NUM_THREADS={os.environ.get('OMP_NUM_THREADS', 'unset')}")
     print(f"{args.queries:,} queries, {args.frames:,} frames, widths {WIDTHS}")
-    args.measure(args)
-
-
-def measure_ranks(args: argparse.Namespace) -> None:
-    database = embed_frames(range(args.frames))
-    queries, targets = embed_queries(args)
-    rounds = []
-    for _ in range(args.rounds + 1):
-        product, _ = timed(lambda: queries @ database.T)
-        ranking, ranks = timed(lambda: exact_ranks(queries, database[targets], [database], WIDTHS))
-        rounds.append((product, ranking, ranking / product))
-    # The first round, which fills the processor's caches, is not counted.
-    product, ranking, ratio = map(statistics.median, zip(*rounds[1:], strict=True))
-    print(f"one fp32 product {product:.2f} s, ranks {ranking:.2f} s, ratio {ratio:.2f}")
-    print_ranks(ranks)
-
-
-def measure_large(args: argparse.Namespace) -> None:
-    queries, targets = embed_queries(args)
+    queries, targets = embed_queries(args.frames, args.queries)
     names = [f"{frame // SCENE:06d}/{frame % SCENE}" for frame in range(args.frames)]
     with tempfile.TemporaryDirectory(prefix="retrieval-", dir=args.folder) as folder:
         needed, free = 4.2 * args.frames * WIDTHS[0], shutil.disk_usage(folder).free
@@ -110,10 +77,11 @@ def random_vector(*seed: int) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal(WIDTHS[0], np.float32)
 
 
-def embed_queries(args: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
-    """Return the embeddings of queries, and the indices of their target frames."""
+def embed_queries(frames: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the embeddings of `count` queries, and the indices of their targets among `frames`
+    frames."""
     rng = np.random.default_rng(2)
-    targets = np.sort(rng.choice(args.frames, args.queries, replace=args.queries > args.frames))
+    targets = np.sort(rng.choice(frames, count, replace=count > frames))
     rows = embed_frames(targets.tolist())
     return rows + 2 * rng.standard_normal(rows.shape, np.float32), targets
 

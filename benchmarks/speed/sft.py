@@ -6,10 +6,9 @@
 
 Every variant trains on the same samples of the tiny benchmark in each step, with the same base and
 hyperparameters, in a process of its own. The samples of TRL's steps are sorted by length. The
-script prints medians over the rounds and the ratios to our trainer with the preset's settings,
-whose rate on a GPU is recorded for benchmarks.speed.hours. A released size has random weights, so
-that nothing is downloaded. Losses of our trainer and of TRL are not comparable here, because each
-uses its own convention.
+script prints medians over the rounds and the ratios to our trainer with the preset's settings. A
+released size has random weights, so that nothing is downloaded. Losses of our trainer and of TRL
+are not comparable here, because each uses its own convention.
 
 TRL runs with its default settings, and with each setting that could make it faster. Among these are
 the MALLOC_* environment variables, which have the effect of our trainer's calls of mallopt. TRL
@@ -114,7 +113,6 @@ def main() -> None:
         else:
             names = [name for name, variant in VARIANTS.items() if has_trl or not variant.trl]
             comparison.compare(
-                "sft",
                 lambda name: measure_in_process(overrides, VARIANTS[name], args.steps),
                 args.only or names,
                 OURS,

@@ -17,13 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.types import Override, RangeSweep
 
-from dynapix.conf.compose import compose
 from dynapix.conf.errors import SettingsError, UserError, import_extra
 from dynapix.conf.files import read_json, write_json
 from dynapix.conf.gpus import visible_gpus
 from dynapix.conf.multirun.table import is_lower_better
 from dynapix.conf.runs import compare_settings, other_settings_error
-from dynapix.conf.schema import SftCommand
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -34,13 +32,6 @@ log = logging.getLogger(__name__)
 RunJobs = Callable[[list[list[str]], int], list[dict[str, Any]]]
 """`Sweep.run_jobs`: runs jobs, given their overrides and the first one's number."""
 STUDY_FILE = "study.json"
-METRICS = {
-    "train.sft": "reasoning_generated_accuracy",
-    "train.distill": "reasoning_generated_accuracy",
-    "train.reinforce": "reward",
-    "train.contrastive": "mrr",
-}
-"""Default of hydra.sweeper.metric for each command, unless `default_metric` chooses another."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +46,7 @@ class Search:
     """The sweeps of a sweep preset by key. `Sweep` adds them to its overrides; the field exists so
     that Hydra accepts the key."""
 
-    def run(
-        self, command: str, overrides: dict[str, Override], folder: Path, run_jobs: RunJobs
-    ) -> None:
+    def run(self, overrides: dict[str, Override], folder: Path, run_jobs: RunJobs) -> None:
         """Run trials in the sweep's folder until the study has `n_trials`.
 
         `overrides` contains the swept and the fixed overrides by key.
@@ -68,11 +57,11 @@ class Search:
             value = getattr(self, key)
             if value is not None and not (isinstance(value, int) and value > 0):
                 raise SettingsError(f"hydra.sweeper.{key}={value}: give 1 or more")
-        metric = self.metric or default_metric(command, fixed)
+        metric = self.metric
         if metric is None:
             raise SettingsError(
-                f"{command} has no default metric to optimise: give hydra.sweeper.metric=NAME, the "
-                "name of a metric in the metrics.json of a run",
+                "the search has nothing to optimise: give hydra.sweeper.metric=NAME, the name of a "
+                "metric in the metrics.json of a run, such as reasoning_generated_accuracy",
                 code="missing-metric",
             )
         if not swept:
@@ -107,17 +96,6 @@ class Search:
             best = study.best_trial
             params = " ".join(f"{key.lstrip('+')}={value}" for key, value in best.params.items())
             log.info("best: #%d %s, %s %.4g", best.number, params, metric, best.value)
-
-
-def default_metric(command: str, fixed: list[str]) -> str | None:
-    """Return the metric that a search optimises by default, or None if a command has none.
-
-    Args:
-        fixed: The overrides that all jobs share.
-    """
-    if command == "train.sft" and compose(command, SftCommand, fixed).train.regime == "answer_only":
-        return "answer_letter_accuracy"
-    return METRICS.get(command)
 
 
 def _run_trials(study: Study, first: int, fixed: list[str], metric: str, run_jobs: RunJobs) -> None:

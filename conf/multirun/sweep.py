@@ -17,13 +17,14 @@ from hydra.core.utils import configure_log
 from hydra.types import RunMode
 from hydra.utils import instantiate
 
-from dynapix.conf.compose import adapt_override, compose, compose_config, open_hydra
+from dynapix.conf.compose import compose, compose_config, open_hydra
 from dynapix.conf.errors import SettingsError
 from dynapix.conf.files import refuse_broken_link, write_json
 from dynapix.conf.multirun.launchers import Job
 from dynapix.conf.multirun.search import Search
 from dynapix.conf.multirun.table import JOB_FILE, read_job, read_jobs, write_sweep_table
 from dynapix.conf.runs import changed_settings, run_name
+from dynapix.conf.typed_text import adapt_override
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +41,7 @@ def run_sweep(command: str, schema: type, overrides: list[str]) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if sweep.is_search:
         search: Search = instantiate(sweep.hydra.sweeper)
-        search.run(command, sweep.overrides, sweep.folder, sweep.run_jobs)
+        search.run(sweep.overrides, sweep.folder, sweep.run_jobs)
     else:
         sweep.run_jobs(sweep.jobs)
     if jobs := read_jobs(sweep.folder):

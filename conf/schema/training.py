@@ -134,26 +134,34 @@ class SftTrainConfig(StudentTrainConfig):
 
 
 @dataclass
-class DistillTrainConfig(StudentTrainConfig):
-    LR_SHARE: ClassVar[float] = 0.5
+class OnPolicyTrainConfig(TrainConfig):
+    """Training settings that `train.distill` and `train.reinforce` share."""
+
+    LR_SHARE: ClassVar[float]
     """Share of the peak learning rate of the student's training that `lr` is by default."""
     lr: float | None = setting(None, above=0)
-    """Peak learning rate. null takes half of that of the student's training."""
-    micro_batch: int | None = setting(None, least=1)
-    """Number of samples per forward pass on each rank; changes memory and speed, not the result.
-    null takes that of the student's training."""
+    """Peak learning rate. null takes a share of that of the student's training: 0.5 in
+    train.distill, and 0.15 in train.reinforce."""
     gradient_checkpointing: bool | None = None
     """Recompute activations in the backward pass; null does as the student's training did."""
-    permute_candidates: bool | None = None
-    """Shuffle the order of each item's candidates in every epoch; null does as the student's
-    training did."""
     epochs: float = 1.0
-    """Number of passes over the training items. Each pass samples one response to each item."""
+    """Number of passes over the training items."""
     temperature: float = setting(1.0, above=0)
     """Temperature at which responses are sampled."""
     sampling_batch: int | None = setting(None, least=1)
     """Number of responses that a rank samples at once; changes memory and speed, and probabilities
     by rounding. null samples all responses of a step."""
+
+
+@dataclass
+class DistillTrainConfig(OnPolicyTrainConfig, StudentTrainConfig):
+    LR_SHARE: ClassVar[float] = 0.5
+    micro_batch: int | None = setting(None, least=1)
+    """Number of samples per forward pass on each rank; changes memory and speed, not the result.
+    null takes that of the student's training."""
+    permute_candidates: bool | None = None
+    """Shuffle the order of each item's candidates in every epoch; null does as the student's
+    training did."""
     beta: float = setting(1.0, least=0, most=1)
     """Divergence of the student from the teacher: 1 is the reverse Kullback-Leibler divergence, 0
     the forward one, and between them the generalised Jensen-Shannon divergence with this weight of
@@ -182,16 +190,9 @@ class RewardWeights(Settings):
 
 
 @dataclass
-class ReinforceTrainConfig(TrainConfig):
+class ReinforceTrainConfig(OnPolicyTrainConfig):
     # With half of it, the rewards of a tiny student fell by 40% in 15 steps.
     LR_SHARE: ClassVar[float] = 0.15
-    """Share of the peak learning rate of the student's training that `lr` is by default."""
-    lr: float | None = setting(None, above=0)
-    """Peak learning rate. null takes 0.15 times that of the student's training."""
-    gradient_checkpointing: bool | None = None
-    """Recompute activations in the backward pass; null does as the student's training did."""
-    epochs: float = 1.0
-    """Number of passes over the training items."""
     batch: int = setting(8, least=1)
     """Number of items per optimizer step, over all ranks."""
     responses: int = setting(8, least=2)
@@ -200,11 +201,6 @@ class ReinforceTrainConfig(TrainConfig):
     micro_batch: int = setting(8, least=1)
     """Number of responses per forward pass on each rank; changes memory and speed, not the
     result."""
-    temperature: float = setting(1.0, above=0)
-    """Temperature at which responses are sampled."""
-    sampling_batch: int | None = setting(None, least=1)
-    """Number of responses that a rank samples at once; changes memory and speed, and probabilities
-    by rounding. null samples all responses of a step."""
     validation_items: int = setting(16, least=1)
     """Number of items of held-out training scenes on which the rewards are measured."""
     rewards: RewardWeights = field(default_factory=RewardWeights)

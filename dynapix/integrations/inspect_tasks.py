@@ -54,17 +54,15 @@ def selection(
         interventions: Whether to ask the pairs about what comes and what would have come.
         max_tokens: Maximum number of tokens of a response; None takes that of the mode.
     """
-    if mode not in TOKENS:
-        raise PrerequisiteError(f"mode={mode}: choose {' or '.join(TOKENS)}")
+    # Many items show the same frame, whose text is kept once.
+    texts: dict[str, str] = {}
     try:
         bench = load(benchmark, split, store=store, frames=frames, image_size=image_size)
+        items = bench.interventions if interventions else bench.selection
+        samples = [to_sample(item, mode, texts) for item in items]
     except UserError as error:
         # Inspect prints it without a traceback.
         raise PrerequisiteError(str(error)) from error
-    items = bench.interventions if interventions else bench.selection
-    # Many items show the same frame, whose text is kept once.
-    texts: dict[str, str] = {}
-    samples = [to_sample(item, mode, texts) for item in items]
     return Task(
         dataset=MemoryDataset(samples, name=bench.name),
         solver=generate(),

@@ -6,9 +6,12 @@ import json
 import os
 import struct
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import pyarrow as pa
 
@@ -34,6 +37,24 @@ class Log:
     responses: dict[str, LoggedResponse]
 
 
+@contextmanager
+def name_damage(path: Path, kind: str) -> Iterator[None]:
+    """Name a file or a folder that the block cannot read.
+
+    Args:
+        kind: What should be there, such as "a log of inspect eval".
+
+    Raises:
+        UserError: It is missing, something else, or damaged.
+    """
+    try:
+        yield
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, BadZipFile) as error:
+        raise UserError(
+            f"{path} is not {kind}, or it is damaged: {error}", code="damaged-file"
+        ) from error
+
+
 def read_inspect(path: Path) -> Log:
     """Read a log of `inspect eval`, a file *.eval or *.json.
 
@@ -41,7 +62,7 @@ def read_inspect(path: Path) -> Log:
         UserError: The file is not such a log, its evaluation did not finish, or it asked items
             several times.
     """
-    try:
+    with name_damage(path, "a log of inspect eval"):
         if zipfile.is_zipfile(path):
             header, samples = _read_archive(path)
         else:
@@ -50,10 +71,6 @@ def read_inspect(path: Path) -> Log:
         status, model = header["status"], header["eval"]["model"]
         rows = [(s["id"], s["epoch"], s["output"]) for s in samples]
         responses = {name: _read_output(output) for name, _, output in rows}
-    except (OSError, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile) as error:
-        raise UserError(
-            f"{path} is not a log of inspect eval, or it is damaged: {error}", code="damaged-file"
-        ) from error
     if status != "success":
         raise UserError(
             f"{path}: the evaluation has the status {status}: finish it with inspect eval-retry",
@@ -99,17 +116,12 @@ def read_lmms_eval(path: Path) -> Log:
         UserError: The file is not such a log.
     """
     responses = {}
-    try:
+    with name_damage(path, "a log of lmms-eval's samples"):
         for line in path.read_text().splitlines():
             row = json.loads(line)
             # The task writes the id before the question.
             item_id, text = row["input"].partition(": ")[0], row["filtered_resps"]
             responses[item_id] = LoggedResponse(text if isinstance(text, str) else text[0], False)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-        raise UserError(
-            f"{path} is not a log of lmms-eval's samples, or it is damaged: {error}",
-            code="damaged-file",
-        ) from error
     return Log(path.parent.name, responses)
 
 
@@ -120,14 +132,9 @@ def read_mteb(path: Path) -> tuple[str, dict[str, dict[str, float]]]:
     Raises:
         UserError: The file does not contain such predictions.
     """
-    try:
+    with name_damage(path, "a file of MTEB's predictions"):
         log = json.loads(path.read_text())
         [scores] = log["default"].values()
         for frames in scores.values():
             frames.items()
         return str(log["mteb_model_meta"]["model_name"]), scores
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{path} does not contain predictions of MTEB, or it is damaged: {error}",
-            code="damaged-file",
-        ) from error

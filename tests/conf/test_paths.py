@@ -5,16 +5,19 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from dynapix.conf.compose import adapt_override, compose
+from dynapix.conf.compose import compose
 from dynapix.conf.schema import BuildCommand, ExportStudyCommand, SelectCommand
-from tests.conf.schemas import COMMANDS, path_settings
+from dynapix.conf.typed_text import adapt_override
+from tests.conf.schemas import SCHEMAS, walk_settings
 from tests.user_errors import raises_user_error
 
-PATHS = [
-    pytest.param(schema, key, id=f"{schema.__name__}-{key}")
-    for schema in COMMANDS
-    for key in path_settings(schema)
-]
+PATHS = {
+    key: schema
+    for schema in SCHEMAS.values()
+    for key, field, _ in walk_settings(schema)
+    if field.metadata.get("is_path")
+}
+"""The settings that name a file or a folder, each with a command that has it."""
 
 
 @pytest.fixture
@@ -34,7 +37,7 @@ def settings_with(schema: type, key: str, value: str):
     return OmegaConf.to_object(merged)
 
 
-@pytest.mark.parametrize(("schema", "key"), PATHS)
+@pytest.mark.parametrize(("key", "schema"), PATHS.items())
 def test_every_path_expands_the_home_folder(schema, key, home):
     group, _, name = key.rpartition(".")
     for typed, expected in (("~/a", str(home / "a")), ("./~/a", "./~/a"), ("a~", "a~")):
@@ -45,7 +48,7 @@ def test_every_path_expands_the_home_folder(schema, key, home):
     assert adapt_override(f"{key}=~/a", schema) == f"{key}='~/a'"
 
 
-@pytest.mark.parametrize(("schema", "key"), PATHS)
+@pytest.mark.parametrize(("key", "schema"), PATHS.items())
 def test_every_path_through_a_broken_link_is_named(schema, key, home):
     Path("link").symlink_to("nowhere")
     for path in ("link", "link/below"):

@@ -1,11 +1,9 @@
 """Every YAML file of conf/ composes with the command in its first comment; values of presets."""
 
 import shlex
-from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 import pytest
 
@@ -14,29 +12,9 @@ from dynapix.conf.compose import compose, config_name, list_presets
 from dynapix.conf.errors import SettingsError
 from dynapix.conf.help import COMMON, TRAINING, description
 from dynapix.data.items.recipes import WINDOW_CELLS
+from tests.conf.schemas import SCHEMAS, walk_settings
 
 CONF = Path(str(files("dynapix.conf")))
-SCHEMAS = {
-    "data.build": schema.BuildCommand,
-    "data.statistics": schema.StatisticsCommand,
-    "data.export": schema.ExportCommand,
-    "data.gallery": schema.GalleryCommand,
-    "teacher.narrate": schema.NarrateCommand,
-    "teacher.claims_benchmark": schema.ClaimsCommand,
-    "teacher.serve": schema.ServeCommand,
-    "train.sft": schema.SftCommand,
-    "train.distill": schema.DistillCommand,
-    "train.reinforce": schema.ReinforceCommand,
-    "train.contrastive": schema.ContrastiveCommand,
-    "train.export": schema.ExportModelCommand,
-    "evaluation.select": schema.SelectCommand,
-    "evaluation.retrieve": schema.RetrieveCommand,
-    "evaluation.similarity": schema.SimilarityCommand,
-    "evaluation.two_stage": schema.TwoStageCommand,
-    "evaluation.report": schema.ReportCommand,
-    "evaluation.study": schema.StudyCommand,
-    "evaluation.study.export": schema.ExportStudyCommand,
-}
 
 
 def compose_line(line: str):
@@ -90,15 +68,15 @@ def test_help_describes_every_setting(command):
     assert list(undescribed(compose(command, SCHEMAS[command], []))) == []
 
 
-def test_student_preset_sets_its_training_recipe():
-    tiny = compose_line("python -m train.sft")
-    paper = compose_line("python -m train.sft student=qwen3_vl_8b")
-    assert (tiny.train.lr, tiny.train.batch, tiny.train.regime) == (2e-3, 16, "cot")
-    train, student = paper.train, paper.student
-    assert (train.lr, train.epochs, train.precision) == (2e-5, 3, "bf16")
-    assert train.batch == 16
-    assert (student.lora.rank, student.lora.alpha) == (16, 32)
-    assert (student.frames, student.image_size, student.max_length) == (12, 336, 3072)
+def test_presets_set_the_papers_recipes():
+    student = compose_line("python -m train.sft student=qwen3_vl_8b")
+    train, model = student.train, student.student
+    assert (train.lr, train.epochs, train.batch, train.precision) == (2e-5, 3, 16, "bf16")
+    assert (model.lora.rank, model.lora.alpha) == (16, 32)
+    assert (model.frames, model.image_size, model.max_length) == (12, 336, 3072)
+    retriever = compose_line("python -m train.contrastive retriever=qwen3_vl_emb_8b").train
+    assert (retriever.batch, retriever.mini_batch, retriever.lr) == (512, 8, 2e-5)
+    assert compose_line("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
 
 
 def test_teacher_takes_one_server_or_several():
@@ -108,21 +86,6 @@ def test_teacher_takes_one_server_or_several():
     assert one.urls == ["http://127.0.0.1:8000/v1"]
     assert several.urls == ["http://a:8000/v1", "https://b/v1"]
     assert compose_line("python -m teacher.narrate").teacher.urls == []
-
-
-def test_overrides_and_overlays_replace_the_recipe():
-    assert compose_line("python -m train.sft student=qwen3_vl_8b train.lr=3e-4").train.lr == 3e-4
-
-
-def test_retriever_preset_sets_its_training_recipe():
-    tiny = compose_line("python -m train.contrastive")
-    scratch = compose_line("python -m train.contrastive retriever=tiny_scratch")
-    paper = compose_line("python -m train.contrastive retriever=qwen3_vl_emb_8b")
-    assert (tiny.train.batch, tiny.train.lr, tiny.retriever.widths[0]) == (64, 2e-3, 192)
-    assert (tiny.retriever.model, tiny.retriever.architecture) == ("checkpoints/bases/tiny", None)
-    assert (scratch.train.batch, scratch.train.lr, scratch.retriever.widths[0]) == (64, 1.5e-3, 128)
-    assert scratch.retriever.architecture.vocabulary == 1024
-    assert (paper.train.batch, paper.train.mini_batch, paper.train.lr) == (512, 8, 2e-5)
 
 
 def test_a_window_group_quota_is_divided_among_its_cells():
@@ -170,16 +133,5 @@ def test_quotas_add_up_to_the_papers_totals():
 
 
 def test_every_common_setting_exists_in_a_command() -> None:
-    keys = {key for schema in SCHEMAS.values() for key in schema_keys(schema)}
+    keys = {key for command in SCHEMAS.values() for key, _, _ in walk_settings(command)}
     assert {*COMMON, *TRAINING} <= keys
-
-
-def schema_keys(schema: type, group: str = "") -> Iterator[str]:
-    """Yield the keys of the settings of a command."""
-    types = get_type_hints(schema)
-    for field in fields(schema):
-        nested = [t for t in (types[field.name], *get_args(types[field.name])) if is_dataclass(t)]
-        if nested:
-            yield from schema_keys(nested[0], f"{group}{field.name}.")
-        else:
-            yield f"{group}{field.name}"

@@ -6,13 +6,11 @@ import base64
 import json
 import pickle
 import shutil
-import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from io import BytesIO
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,6 +29,7 @@ from dynapix.evaluation.metrics.selection import Choices, build_selection_report
 from dynapix.evaluation.reporting.tables import selection_table
 from dynapix.selection import MIN_FAILURES_TO_STOP
 from dynapix.teacher.journal import save_accepted
+from tests.children import run_child
 from tests.dynapix.models import always_a, nearest
 from tests.test_house import COMMANDS as ALL_COMMANDS
 from tests.user_errors import raises_user_error
@@ -39,52 +38,41 @@ READING = {"numpy", "pyarrow", "PIL"}
 """The packages that reading a benchmark may import."""
 PRESETS = ["tiny_balanced", "tiny_balanced-above", "small", "small-clevrer"]
 """Names that open the folders tiny_balanced-above and small."""
-OWN = {"dynapix"}
 
 
-def imported_packages(code: str, folder: Path) -> set[str]:
-    """Return the packages outside the standard library that a process imports."""
-    report = (
-        "\nimport json, sys\n"
-        "roots = {name.split('.')[0] for name in sys.modules} - set(sys.stdlib_module_names)\n"
-        "print(json.dumps(sorted(roots)))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code + report],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    roots = set(json.loads(done.stdout.splitlines()[-1]))
-    return {r for r in roots if not r.startswith("_")} - OWN - {"cython_runtime", "cloudpickle"}
-
-
-def test_importing_the_library_imports_no_other_package() -> None:
-    assert imported_packages("import dynapix; dir(dynapix)", Path.cwd()) == set()
-
-
-def test_reading_a_benchmark_needs_three_packages(micro_store) -> None:
-    code = (
-        f"import dynapix; bench = dynapix.load({str(micro_store.folder)!r})\n"
+IMPORTS = {
+    "import": ("import dynapix; dir(dynapix)", set()),
+    "read": (
         "item = bench.selection[0]; item.prefix, item.times, item.candidates\n"
-        "bench.retrieval[0].target.image, bench.database[0].image"
-    )
-    assert imported_packages(code, Path.cwd()) == READING
-
-
-def test_evaluating_and_scoring_need_no_extra(micro_store) -> None:
-    code = (
-        f"import dynapix; bench = dynapix.load({str(micro_store.folder)!r})\n"
+        "bench.retrieval[0].target.image, bench.database[0].image",
+        READING,
+    ),
+    "evaluate": (
         "items = bench.selection[:8]; results = [\n"
         "    dynapix.evaluate(items, lambda item, letter=letter: letter, progress=False)\n"
         "    for letter in 'AB'\n"
         "]\n"
         "str(results[0]), str(results[0].compare(results[1])), items[0].messages()\n"
-        "dynapix.score_rationale(items[0], 'Prediction: the cube stops.')"
+        "dynapix.score_rationale(items[0], 'Prediction: the cube stops.')",
+        READING | {"yaml", "tqdm"},
+    ),
+}
+"""Code by its work, and the packages that it may import."""
+
+
+@pytest.mark.parametrize("work", IMPORTS)
+def test_the_library_imports_only_what_its_work_needs(micro_store, work) -> None:
+    code, allowed = IMPORTS[work]
+    load = f"import dynapix; bench = dynapix.load({str(micro_store.folder)!r})\n"
+    report = (
+        "\nimport json, sys\n"
+        "roots = {name.split('.')[0] for name in sys.modules} - set(sys.stdlib_module_names)\n"
+        "print(json.dumps(sorted(roots)))"
     )
-    imported = imported_packages(code, Path.cwd())
-    assert READING <= imported <= READING | {"yaml", "tqdm"}
+    script = (load if allowed else "") + code + report
+    done = run_child([sys.executable, "-c", script], check=True)
+    roots = {r for r in json.loads(done.stdout.splitlines()[-1]) if not r.startswith("_")}
+    assert roots - {"dynapix", "cython_runtime", "cloudpickle"} <= allowed
 
 
 def test_a_built_preset_opens_without_the_extra_that_builds(micro_store, tmp_path) -> None:
@@ -96,7 +84,7 @@ def test_a_built_preset_opens_without_the_extra_that_builds(micro_store, tmp_pat
         f"import dynapix; names = {PRESETS}\n"
         f"print([len(dynapix.load(name, store={str(tmp_path)!r}).selection) for name in names])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = run_child([sys.executable, "-c", code], check=True)
     items = len(micro_store.selection("test"))
     assert json.loads(done.stdout) == [items] * len(PRESETS)
 

@@ -35,20 +35,6 @@ def test_a_saved_result_is_read_back(bench, tmp_path, predict) -> None:
         result.save(tmp_path / "other")
 
 
-def test_the_report_shows_a_saved_result_beside_the_baselines(bench, tmp_path) -> None:
-    for name, predict in (("letters", always_a), ("scores", nearest)):
-        dynapix.evaluate(bench.selection, predict, name=name, progress=False).save(
-            tmp_path / "runs" / name
-        )
-    folder = run_report(tmp_path, bench.store.folder.parent, items=3, saved=str(tmp_path / "runs"))
-    table = (folder / "tables" / "selection-micro.md").read_text()
-    assert "letters (text)" in table
-    assert "scores (similarity)" in table
-    assert "nearest to the last observed frame" in table
-    page = (folder / "report.html").read_text()
-    assert "letters (text)" in page
-
-
 def test_damaged_results_and_results_on_other_builds_are_refused(bench, tmp_path) -> None:
     folder = dynapix.evaluate(bench.selection, always_a, progress=False).save(tmp_path / "mine")
     report = json.loads((folder / "report.json").read_text())
@@ -87,7 +73,7 @@ def test_embeddings_that_find_every_target_have_full_recall(bench, as_mapping) -
     assert constant.metrics["recall@1"] == pytest.approx(1 / len(names))
 
 
-def test_a_retriever_of_counterfactual_frames_ranks_no_factual_twin_above(bench, tmp_path) -> None:
+def test_a_retriever_of_counterfactual_frames_ranks_no_factual_twin_above(bench) -> None:
     bench = dynapix.load(bench.store.folder, pool="counterfactual")
     frames = np.eye(len(bench.database), dtype=np.float32)
     rows = dict(zip((frame.name for frame in bench.database), frames, strict=True))
@@ -98,12 +84,38 @@ def test_a_retriever_of_counterfactual_frames_ranks_no_factual_twin_above(bench,
         scores = dynapix.evaluate_retrieval(bench.retrieval, queries, rows)
         assert scores.metrics["twin_above"] == share
         assert (scores.metrics["recall@1"] == 1) == (share == 0)
-    folder = scores.save(tmp_path / "runs" / "mine")
-    assert json.loads((folder / "metrics.json").read_text()) == scores.metrics
-    folder = run_report(tmp_path, bench.store.folder.parent, items=0, saved=str(tmp_path / "runs"))
-    table = (folder / "tables" / "retrieval-micro-counterfactual-queries.md").read_text()
-    assert "Twin" in table
-    assert "50.0" in table
+
+
+def test_the_report_shows_saved_results(bench, tmp_path) -> None:
+    runs, rng = tmp_path / "runs", np.random.default_rng(0)
+    for name, predict in (("letters", always_a), ("scores", nearest)):
+        dynapix.evaluate(bench.selection, predict, name=name, progress=False).save(runs / name)
+    saved = {}
+    for pool in ("future", "counterfactual"):
+        of_pool = dynapix.load(bench.store.folder, pool=pool)
+        rows = [rng.normal(size=(len(r), 8)) for r in (of_pool.retrieval, of_pool.database)]
+        widths = [4, 8] if pool == "future" else None
+        scores = dynapix.evaluate_retrieval(of_pool.retrieval, *rows, widths=widths, name=pool)
+        folder = scores.save(runs / pool)
+        assert json.loads((folder / "metrics.json").read_text()) == scores.metrics
+        assert (folder / "report.txt").read_text() == f"{scores}\n"
+        assert len((folder / "ranks.jsonl").read_text().splitlines()) == len(of_pool.retrieval)
+        saved[pool] = scores
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "file").touch()
+    with raises_user_error("other-files", contains=str(tmp_path / "other")):
+        scores.save(tmp_path / "other")
+
+    folder = run_report(tmp_path, bench.store.folder.parent, items=3, saved=str(runs))
+    tables = {path.stem: path.read_text() for path in (folder / "tables").glob("*.md")}
+    selection = tables["selection-micro"]
+    for row in ("letters (text)", "scores (similarity)", "nearest to the last observed frame"):
+        assert row in selection
+    assert "letters (text)" in (folder / "report.html").read_text()
+    future, twins = tables["retrieval-micro"], tables["retrieval-micro-counterfactual-queries"]
+    assert f"{100 * saved['future'].metrics['recall@10']:.1f}" in future
+    assert "Twin" in twins
+    assert f"{100 * saved['counterfactual'].metrics['twin_above']:.1f}" in twins
 
 
 def test_observers_state_accuracies_as_errors(bench, monkeypatch) -> None:
@@ -129,28 +141,6 @@ def test_observers_state_accuracies_as_errors(bench, monkeypatch) -> None:
     other = dynapix.evaluate(train.selection[:9], lambda item: "A", progress=False)
     with raises_user_error("different-builds", contains="train"):
         observers.error_of(other)
-
-
-def test_saved_retrieval_results_are_in_the_report(bench, tmp_path) -> None:
-    rng = np.random.default_rng(0)
-    queries, frames = (rng.normal(size=(len(r), 8)) for r in (bench.retrieval, bench.database))
-    scores = dynapix.evaluate_retrieval(
-        bench.retrieval, queries, frames, widths=[4, 8], name="mine"
-    )
-    saved = scores.save(tmp_path / "runs" / "mine")
-    assert (saved / "report.txt").read_text() == f"{scores}\n"
-    assert len((saved / "ranks.jsonl").read_text().splitlines()) == len(bench.retrieval)
-    record = json.loads((saved / "run.json").read_text())
-    assert record["command"] == "dynapix.evaluate_retrieval"
-    folder = run_report(tmp_path, bench.store.folder.parent, items=0, saved=str(tmp_path / "runs"))
-    table = (folder / "tables" / "retrieval-micro.md").read_text()
-    recall = 100 * scores.metrics["recall@10"]
-    [row] = [line for line in table.splitlines() if "mine" in line]
-    assert f"{recall:.1f}" in row
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "file").touch()
-    with raises_user_error("other-files", contains=str(tmp_path / "other")):
-        scores.save(tmp_path / "other")
 
 
 def test_embeddings_of_another_shape_or_database_are_refused(bench) -> None:

@@ -24,7 +24,6 @@ from dynapix.conf.schema import BuildCommand, TeacherConfig
 from dynapix.conf.schema.training import RewardWeights
 from dynapix.data.build import ensure_benchmark
 from dynapix.data.store import Store
-from dynapix.integrations import TOKENS
 from dynapix.teacher.predicates.facts import RelationalPredicates
 from dynapix.teacher.predicates.vocabulary import describe_item
 from dynapix.train.rewards import REWARDS, JudgedResponse, judge_response
@@ -92,8 +91,6 @@ class SelectionTaskset(vf.Taskset[SelectionTask, SelectionConfig]):
 
     def __init__(self, config: SelectionConfig) -> None:
         super().__init__(config)
-        if config.mode not in TOKENS:
-            raise SystemExit(f"error: mode={config.mode}: choose {' or '.join(TOKENS)}")
         self.INFINITE = config.seed is not None
 
     def load(self) -> Iterator[SelectionTask]:
