@@ -308,9 +308,6 @@ class ExportModelCommand(CommandConfig):
     format: str = setting("bf16", ("bf16", "fp32", "adapter"))
     """bf16 and fp32 merge the adapters into the dequantised base and write the weights in that
     precision; adapter writes only the adapters."""
-    verify: bool = True
-    """Compare the outputs of the merged model with those of the trained model on held-out items of
-    the run's benchmark. false skips the comparison and needs no benchmark."""
 
     def find_run_problems(self) -> list[str]:
         for other in TRAINER_FOLDERS:

@@ -40,7 +40,7 @@ def write_run_card(
     product = "student" if isinstance(settings, SftCommand) else "retriever"
     format = "adapter" if getattr(settings, product).lora.rank else "whole"
     folder = run.folder / product
-    card = build_model_card(run.name, settings, run.folder, folder, format, {}, metrics)
+    card = build_model_card(run.name, settings, run.folder, folder, format, metrics)
     card.save(folder / CARD)
 
 
@@ -50,7 +50,6 @@ def build_model_card(
     run: Path,
     location: Path,
     format: str,
-    measured: dict[str, float],
     metrics: dict[str, float],
 ) -> ModelCard:
     """Return the card of a trained student or retriever.
@@ -61,8 +60,6 @@ def build_model_card(
         run: Folder of the training run, with its student or retriever.
         location: Folder from which the card's code loads the model.
         format: bf16, fp32, adapter, or whole for a model all of whose weights were trained.
-        measured: What `train.common.output_comparison.compare_outputs` returned; empty without a
-            comparison.
         metrics: Metrics of the run.
     """
     student = isinstance(settings, SftCommand)
@@ -125,7 +122,6 @@ def build_model_card(
         best_metric=train.best_metric,
         metrics=metrics,
         at_start=AT_START_SUFFIX,
-        measured=measured,
     )
 
 
