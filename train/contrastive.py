@@ -75,9 +75,9 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     trainer = build_trainer(cfg, run, store, model, training, validation, rank_batch, checkpoint)
     lower = "lower train.mini_batch, set train.reuse_features=false"
     shrink = "retriever.image_size or retriever.frames"
-    best_step = run_training(trainer, run, checkpoint, lower, shrink)
+    run_training(trainer, run, checkpoint, lower, shrink)
 
-    metrics = run_metrics(run.folder, best_step)
+    metrics = run_metrics(run.folder)
     if rank() == 0:
         model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
         write_run_card(run, cfg, metrics)

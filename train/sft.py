@@ -73,10 +73,10 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     trainer = build_trainer(cfg, run, model, processor, training, validation, checkpoint)
     lower = "lower train.micro_batch, set train.reuse_features=false"
     shrink = "student.image_size or student.frames"
-    best_step = training_loop.run_training(trainer, run, checkpoint, lower, shrink)
+    training_loop.run_training(trainer, run, checkpoint, lower, shrink)
 
     weights = training_loop.gather_weights(trainer)
-    metrics = run_metrics(run.folder, best_step)
+    metrics = run_metrics(run.folder)
     if rank() == 0:
         loading.save_student(model, processor, run.folder / "student", precision, weights)
         write_run_card(run, cfg, metrics)

@@ -31,10 +31,7 @@ def common_arguments(
         checkpoint: The checkpoint that the run resumes from, or None.
     """
     if checkpoint is None:
-        # The best checkpoint must have an evaluation.
-        checkpoints = train.evaluations
-        if train.best_metric is None:
-            checkpoints = max(checkpoints, MIN_CHECKPOINTS)
+        checkpoints = max(train.evaluations, MIN_CHECKPOINTS)
         # The trainer reads a value below 1 as a share of all steps, but 1 as every step.
         steps = {
             "eval_steps": min(1 / train.evaluations, 0.9999),
@@ -69,9 +66,6 @@ def common_arguments(
         "dataloader_num_workers": train.workers,
         "dataloader_pin_memory": torch.cuda.is_available(),
         "remove_unused_columns": False,
-        # With this, `save_total_limit` never deletes the best checkpoint.
-        "load_best_model_at_end": train.best_metric is not None,
-        "metric_for_best_model": train.best_metric,
         "report_to": list(train.report_to) or "none",
         "run_name": run.name,
         "project": PROJECT,

@@ -56,18 +56,6 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return None
 
 
-def check_best_checkpoint(checkpoint: Path, best_step: int | None) -> None:
-    """Raise UserError if the best checkpoint of a run that resumes from `checkpoint` is missing or
-    incomplete. The library would silently keep the last weights instead, or fail at the end."""
-    best = checkpoint.with_name(f"checkpoint-{best_step}")
-    if best_step and (problem := find_damage(best)):
-        raise UserError(
-            f"{best}, the best checkpoint so far, is missing or incomplete ({problem}): restore "
-            f"it, or delete {checkpoint.parent} and train again",
-            code="damaged-file",
-        )
-
-
 def find_damage(checkpoint: Path) -> str | None:
     """Return a phrase that says what is missing or incomplete in a checkpoint, or None.
 

@@ -19,7 +19,6 @@ from dynapix.models.resolved_settings import read_resolved
 from dynapix.models.student.chat_format import TIMED_PROCESSORS
 from dynapix.models.student.prompts import choose_instruction, write_time
 from dynapix.models.trained_runs import modes_of_regime
-from dynapix.train.common.journal import BEST_STEP
 
 CARD = "README.md"
 TIMES = {
@@ -118,8 +117,6 @@ def build_model_card(
         record=record,
         settings=yaml.safe_dump({product: asdict(preset), "train": asdict(train)}, sort_keys=False),
         items="items" if student else "queries",
-        best_step=metrics.get(BEST_STEP),
-        best_metric=train.best_metric,
         metrics=metrics,
         at_start=AT_START_SUFFIX,
     )

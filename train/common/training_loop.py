@@ -19,8 +19,8 @@ from dynapix.conf.runs import Run, rank, run_id
 from dynapix.models.distributed import is_sharded
 from dynapix.models.memory import explain_out_of_memory
 from dynapix.train.common.arguments import PROJECT
-from dynapix.train.common.callbacks import BestCheckpointCallback, JournalCallback, MetricsBar
-from dynapix.train.common.checkpoints import STATE, check_best_checkpoint
+from dynapix.train.common.callbacks import JournalCallback, MetricsBar
+from dynapix.train.common.checkpoints import STATE
 
 log = logging.getLogger(__name__)
 
@@ -30,20 +30,15 @@ MESSAGE_PREFIX = f"{UserError.__module__}.{UserError.__qualname__}: "
 
 def run_training(
     trainer: Trainer, run: Run, checkpoint: Path | None, lower: str, shrink: str
-) -> int | None:
+) -> None:
     """Train from the start or a checkpoint, and keep the journal and the curves.
 
     Args:
         lower: What to do if memory runs out, without changing the result of the run.
         shrink: Settings that also save memory if they are lowered, but change the result.
 
-    Returns:
-        If train.best_metric is set, the step of the best checkpoint, whose weights the trainer's
-        model then has. Otherwise None, and the model has the weights of the last step.
-
     Raises:
-        UserError: memory runs out, the evaluations do not measure train.best_metric, or a worker
-            process or another rank raises a UserError.
+        UserError: memory runs out, or a worker process or another rank raises a UserError.
     """
     add_callbacks(trainer, run)
     check_fsdp(trainer, checkpoint)
@@ -54,21 +49,15 @@ def run_training(
     )
     with explain_errors("while training", advice):
         train_to_last_step(trainer, checkpoint)
-    best_step = trainer.state.best_global_step
-    if best_step:
-        measure = f"{trainer.args.metric_for_best_model} = {trainer.state.best_metric:.4g}"
-        log.info("keeping the checkpoint of step %d, the best by %s", best_step, measure)
-    return best_step
 
 
 def add_callbacks(trainer: Trainer, run: Run) -> None:
-    """Add the progress bar, the journal and the check of train.best_metric, and set up W&B."""
+    """Add the progress bar and the journal, and set up W&B."""
     trainer.remove_callback(ProgressCallback)
     trainer.remove_callback(PrinterCallback)
     trainer.add_callback(MetricsBar())
     if rank() == 0:
         trainer.add_callback(JournalCallback(run.folder))
-    trainer.add_callback(BestCheckpointCallback())
     if "wandb" in trainer.args.report_to:
         # Keep W&B's files in the run's folder; a resumed run continues the same run at W&B.
         wandb = {"DIR": run.folder, "PROJECT": PROJECT, "RUN_ID": run_id(run), "RESUME": "allow"}
@@ -78,16 +67,14 @@ def add_callbacks(trainer: Trainer, run: Run) -> None:
 
 def train_to_last_step(trainer: Trainer, checkpoint: Path | None) -> None:
     """Train from the start or from a checkpoint. If the checkpoint is that of the last step, only
-    load the final weights: those of the best checkpoint, if there is one."""
+    load its weights."""
     if checkpoint is not None:
         log.info("resuming from %s", checkpoint)
         state = TrainerState.load_from_json(str(checkpoint / STATE))
-        check_best_checkpoint(checkpoint, state.best_global_step)
         if state.global_step >= state.max_steps:
             # The trainer would train for one more step.
             trainer.state = state
-            best = state.best_global_step or state.global_step
-            load_weights(trainer, checkpoint.with_name(f"checkpoint-{best}"))
+            load_weights(trainer, checkpoint)
             return
     # Log lines are printed above the progress bar.
     with logging_redirect_tqdm():

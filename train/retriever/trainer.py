@@ -77,11 +77,6 @@ class IndexBatchTrainer:
         else:
             super()._load_from_checkpoint(checkpoint_path)
 
-    def _load_best_model(self) -> None:
-        """Load the best weights, or raise an error. The library would only log the error and keep
-        the last weights."""
-        self._load_from_checkpoint(self.state.best_model_checkpoint)
-
 
 class RetrieverTrainer(IndexBatchTrainer, SentenceTransformerTrainer):
     """Trains a retriever with one vector per input."""

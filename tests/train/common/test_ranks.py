@@ -175,8 +175,7 @@ def test_two_ranks_train_what_one_trains(
     one = train_alone(settings, runs / "one")
     # Unlike 4-bit weights, those of an unquantised base are sharded too.
     unquantised = replace(settings.student, quantization="none")
-    best = replace(settings.train, best_metric="eval_answer_loss")
-    plain = replace(settings, student=unquantised, train=best)
+    plain = replace(settings, student=unquantised)
     train_alone(plain, runs / "plain")
     train = contrastive_settings.train
     many = replace(contrastive_settings.retriever, late=LateConfig(width=24))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,6 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
-from sentence_transformers import SentenceTransformerTrainer
 
 from dynapix.conf.entry import Run
 from dynapix.conf.schema import LateConfig, LoraConfig, SftCommand
@@ -192,51 +190,18 @@ def test_a_checkpoint_that_cannot_be_read_stops_the_run(tmp_path, monkeypatch) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one vector", "many"])
-@pytest.mark.parametrize("adapters", [False, True], ids=["whole", "adapters"])
-def test_a_retriever_resumes_and_keeps_its_best_checkpoint(
-    contrastive_settings, saved_base, tmp_path, late, adapters
+def test_a_retriever_resumes_within_its_second_epoch(
+    contrastive_settings, saved_base, tmp_path, late
 ) -> None:
-    """It resumes within its second epoch."""
-    changes = {"max_steps": 8, "evaluations": 4, "keep_checkpoints": 4, "best_metric": "mrr"}
+    changes = {"max_steps": 8, "evaluations": 4, "keep_checkpoints": 4}
     settings = replace(contrastive_settings.train, **changes)
     base = {"architecture": None, "model": saved_base, "quantization": "nf4", "lora": DROPOUT}
-    cfg = replace(contrastive_settings.retriever, late=late, **(base if adapters else {}))
+    # All weights are trained with one vector, adapters with many.
+    cfg = replace(contrastive_settings.retriever, late=late, **(base if late else {}))
     settings = replace(contrastive_settings, retriever=cfg, train=settings)
     whole, resumed = train_twice(contrastive.main, settings, tmp_path, step=6)
-    journal = read_journal(whole)
-    assert 1 < next(r["epoch"] for r in journal if r["step"] == 6) < 2
-    measured = {r["step"]: r["eval_mrr"] for r in journal if "eval_mrr" in r}
-    best = whole / f"checkpoint-{max((2, 4, 6, 8), key=measured.get)}"
-    weights = "adapter_model" if adapters else "model"
-    for name in (f"{weights}.safetensors", *(["1_Dense/model.safetensors"] if late else [])):
-        check_same_weights(best / name, whole / "retriever" / name)
-        check_same_weights(whole / "retriever" / name, resumed / "retriever" / name)
-
-
-@pytest.mark.slow
-def test_a_missing_best_checkpoint_is_reported(contrastive_settings, tmp_path) -> None:
-    settings = replace(contrastive_settings.train, best_metric="mrr")
-    settings = replace(contrastive_settings, train=settings)
-    whole = train(contrastive.main, settings, tmp_path / "whole")
-    last = shutil.copytree(whole / "checkpoint-4", tmp_path / "resumed" / "checkpoint-4")
-    state = json.loads((last / "trainer_state.json").read_text())
-    state["best_global_step"] = 2
-    (last / "trainer_state.json").write_text(json.dumps(state))
-    with raises_user_error("damaged-file", contains="checkpoint-2"):
-        train(contrastive.main, settings, tmp_path / "resumed")
-
-
-@pytest.mark.slow
-def test_an_unreadable_best_checkpoint_stops_the_run(
-    contrastive_settings, tmp_path, monkeypatch
-) -> None:
-    """The weights of the last step are not silently saved instead."""
-
-    def damaged(*_: object) -> None:
-        raise RuntimeError("damaged")
-
-    monkeypatch.setattr(SentenceTransformerTrainer, "_load_from_checkpoint", damaged)
-    settings = replace(contrastive_settings.train, best_metric="mrr")
-    with pytest.raises(RuntimeError, match="damaged"):
-        train(contrastive.main, replace(contrastive_settings, train=settings), tmp_path)
-    assert not (tmp_path / "retriever").exists()
+    assert 1 < next(r["epoch"] for r in read_journal(whole) if r["step"] == 6) < 2
+    weights = ["adapter_model", "1_Dense/model"] if late else ["model"]
+    for name in weights:
+        path = f"retriever/{name}.safetensors"
+        check_same_weights(whole / path, resumed / path)
