@@ -38,7 +38,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from dynapix.train.common.model_card import write_run_card
     from dynapix.train.common.training_loop import explain_load_errors, run_training
     from dynapix.train.retriever.batches import read_pools, split_queries
-    from dynapix.train.retriever.trainer_setup import build_trainer
+    from dynapix.train.retriever.trainer import build_trainer
 
     keep_freed_memory()
     if is_sharded():

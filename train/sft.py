@@ -36,7 +36,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from dynapix.train.common.journal import run_metrics
     from dynapix.train.common.model_card import write_run_card
     from dynapix.train.student.dataset import load_datasets, tokenizer_corpus
-    from dynapix.train.student.trainer_setup import build_trainer
+    from dynapix.train.student.trainer import build_trainer
 
     compat.keep_freed_memory()
     # Check the batch and the base now, because building the benchmark may take long.

@@ -52,8 +52,7 @@ from dynapix.models.layers.fast_layers import use_fast_layers
 from dynapix.models.retriever import embedder
 from dynapix.models.retriever.inputs import Retriever, frame_input, query_input
 from dynapix.train.retriever.batches import QueryBatchSampler
-from dynapix.train.retriever.trainer import NUMBER, numbered_rows
-from dynapix.train.retriever.trainer_setup import build_trainer
+from dynapix.train.retriever.trainer import NUMBER, build_trainer, numbered_rows
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,15 @@
-"""Run a trainer to its last step, and turn errors of the libraries into advice for the user."""
+"""Run a trainer to its last step: its arguments, and advice for the user instead of errors of the
+libraries."""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
@@ -16,16 +19,75 @@ from transformers.trainer_callback import TrainerState
 
 from dynapix.conf.errors import UserError
 from dynapix.conf.runs import Run, rank, run_id
+from dynapix.conf.schema import TrainConfig
+from dynapix.models.compat import checkpointing_arguments
 from dynapix.models.distributed import is_sharded
 from dynapix.models.memory import explain_out_of_memory
-from dynapix.train.common.arguments import PROJECT
 from dynapix.train.common.callbacks import JournalCallback, MetricsBar
 from dynapix.train.common.checkpoints import STATE
 
 log = logging.getLogger(__name__)
 
+PROJECT = "dynapix"
+"""Name of the project in experiment trackers."""
+SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
+"""The name in transformers of each value of train.schedule."""
 MESSAGE_PREFIX = f"{UserError.__module__}.{UserError.__qualname__}: "
 """The text before the message of a UserError in the traceback of another process."""
+MIN_CHECKPOINTS = 2
+"""Minimum number of checkpoints of a run, so that a killed run loses at most half of it."""
+
+
+def common_arguments(
+    train: TrainConfig, run: Run, seed: int, checkpoint: Path | None
+) -> dict[str, Any]:
+    """Return the `TrainingArguments` that students and retrievers have in common.
+
+    Args:
+        train: The settings; `precision` is bf16 or fp32, not auto.
+        checkpoint: The checkpoint that the run resumes from, or None.
+    """
+    if checkpoint is None:
+        checkpoints = max(train.evaluations, MIN_CHECKPOINTS)
+        # The trainer reads a value below 1 as a share of all steps, but 1 as every step.
+        steps = {
+            "eval_steps": min(1 / train.evaluations, 0.9999),
+            "save_steps": min(1 / checkpoints, 0.9999),
+        }
+    else:
+        # The numbers of steps that the trainer computed from the shares when the run started.
+        state = json.loads((checkpoint / STATE).read_text())
+        steps = {name: state[name] for name in ("eval_steps", "save_steps")}
+    return {
+        "output_dir": str(run.folder),
+        "seed": seed,
+        "data_seed": seed,
+        "learning_rate": train.lr,
+        "lr_scheduler_type": SCHEDULES[train.schedule],
+        "warmup_steps": train.warmup,
+        "weight_decay": train.weight_decay,
+        "adam_beta2": train.adam_beta2,
+        "max_grad_norm": train.max_grad_norm,
+        "num_train_epochs": train.epochs,
+        "max_steps": train.max_steps,
+        "bf16": train.precision == "bf16",
+        "use_cpu": not torch.cuda.is_available(),
+        **checkpointing_arguments(train.gradient_checkpointing),
+        "eval_strategy": "steps",
+        "save_strategy": "steps",
+        **steps,
+        # A resumed run already has the initial evaluation in its metrics.jsonl.
+        "eval_on_start": checkpoint is None,
+        "save_total_limit": train.keep_checkpoints,
+        "logging_steps": 1,
+        "dataloader_num_workers": train.workers,
+        "dataloader_pin_memory": torch.cuda.is_available(),
+        "remove_unused_columns": False,
+        "report_to": list(train.report_to) or "none",
+        "run_name": run.name,
+        "project": PROJECT,
+        "disable_tqdm": False,
+    }
 
 
 def run_training(

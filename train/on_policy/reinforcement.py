@@ -39,9 +39,9 @@ from dynapix.models.student.collator import pad
 from dynapix.models.student.prompts import Sample, selection_sample
 from dynapix.teacher.predicates.facts import RelationalPredicates
 from dynapix.teacher.predicates.vocabulary import describe_item
-from dynapix.train.common.arguments import common_arguments
 from dynapix.train.common.callbacks import EpochCallback
 from dynapix.train.common.held_out import check_not_empty
+from dynapix.train.common.training_loop import common_arguments
 from dynapix.train.on_policy.claim_credit import credit_tokens
 from dynapix.train.on_policy.mismatch import Mismatch
 from dynapix.train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt

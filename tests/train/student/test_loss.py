@@ -17,8 +17,7 @@ from dynapix.models.student.collator import IGNORED, Collator, Encoded, encode, 
 from dynapix.models.student.prompts import Sample, selection_sample
 from dynapix.train.student.lazy_samples import LazySample, StudentDataset
 from dynapix.train.student.length_sampler import LengthSampler
-from dynapix.train.student.metrics import LetterAccuracy
-from dynapix.train.student.trainer import sample_mean, token_mean
+from dynapix.train.student.trainer import LetterAccuracy, sample_mean, token_mean
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 
