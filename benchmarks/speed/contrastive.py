@@ -186,7 +186,7 @@ def build_plain_trainer(
             batch_sampler=lambda *_, **__: sampler,
         ),
         train_dataset=numbered_rows(len(queries)),
-        loss=MatryoshkaLoss(model, ranking, list(cfg.retriever.widths), cfg.train.width_weights),
+        loss=MatryoshkaLoss(model, ranking, list(cfg.retriever.widths)),
         data_collator=collator,
     )
 

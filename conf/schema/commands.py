@@ -276,19 +276,6 @@ class ContrastiveCommand(CommandConfig):
                 "retriever.encoder=sentence_transformers, or choose another retriever, such as "
                 "retriever=qwen3_vl_emb_8b"
             )
-        weights, widths = self.train.width_weights, self.retriever.widths
-        if weights is not None and (
-            len(weights) != len(widths) or min(weights) < 0 or max(weights) == 0
-        ):
-            yield (
-                f"train.width_weights={weights}: give each of the {len(widths)} widths in "
-                f"retriever.widths={list(widths)} a weight of 0 or more, at least one above 0"
-            )
-        if weights is not None and self.retriever.late is not None:
-            yield (
-                "train.width_weights with retriever.late: a late-interaction retriever has one "
-                "width; leave train.width_weights=null"
-            )
         if self.train.reuse_features and not self.retriever.lora.rank:
             yield (
                 "train.reuse_features=true with retriever.lora.rank=0: without adapters, training "

@@ -241,8 +241,6 @@ class ContrastiveTrainConfig(TrainConfig):
     """Keep the frozen vision tower's features between the two forward passes of a step, which does
     not change the gradient. With an 8B model, the features of a query take about 30 MB. No effect
     if a batch is embedded once."""
-    width_weights: list[float] | None = None
-    """Weight of the loss at each width of retriever.widths; null weights all widths equally."""
     validation_queries: int = setting(128, least=1)
     """Number of validation queries, from scenes of the training split that are not trained on."""
 

@@ -172,7 +172,6 @@ def build_loss(
         model,
         RetrieverInputs(model, frames, retriever, bf16, train.reuse_features),
         widths=retriever.widths if retriever.late is None else [retriever.late.width],
-        weights=train.width_weights,
         scale=train.scale,
         mini_batch=train.mini_batch,
         prefetch=train.workers,
