@@ -37,7 +37,6 @@ from dynapix.train.on_policy.teachers import ServerTeacher
 from tests.local import JsonHandler, LocalServer
 from tests.teacher.server_process import ServerProcess, vllm_server
 from tests.tiny_models import randomize_adapters
-from tests.train.on_policy.test_distillation import finish_run
 from tests.user_errors import raises_user_error
 
 pytestmark = pytest.mark.slow
@@ -65,11 +64,6 @@ def vllm(saved_base: str, tmp_path_factory) -> Iterator[ServerProcess]:
     server = start(saved_base, folder, "frames=true", "adapter_rank=4")
     yield server
     server.stop()
-
-
-@pytest.fixture(scope="module")
-def student(few_steps, tmp_path_factory) -> Path:
-    return finish_run(few_steps(max_steps=1), tmp_path_factory.mktemp("student"))
 
 
 @pytest.fixture
