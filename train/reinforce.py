@@ -35,7 +35,8 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
         resolve_continuation,
         train_and_save,
     )
-    from dynapix.train.on_policy.reinforcement import build_trainer, load_items
+    from dynapix.train.on_policy.judged_items import load_items
+    from dynapix.train.on_policy.reinforcement import build_trainer
 
     compat.keep_freed_memory()
     source, trained = read_source_settings(cfg.model)

@@ -22,7 +22,7 @@ from dynapix.data.store import Store
 from dynapix.models.student.collator import Collator
 from dynapix.train import reinforce
 from dynapix.train.common.journal import read_journal
-from dynapix.train.on_policy import reinforcement, sampling
+from dynapix.train.on_policy import judged_items, reinforcement, sampling
 from dynapix.train.student.trainer import token_losses
 from tests.train.on_policy.test_distillation import LESS_MEMORY
 from tests.user_errors import raises_user_error
@@ -135,7 +135,7 @@ def test_a_step_encodes_each_prompt_once(settings, tmp_path, monkeypatch, short_
 @pytest.mark.parametrize("rank", [0, 1])
 def test_each_rank_reads_the_prompts_of_a_step_once(rank) -> None:
     """Two ranks with two micro-batches of two responses, four to each of two items a step."""
-    sampler = reinforcement.EpochSampler(
+    sampler = judged_items.EpochSampler(
         range(4), mini_repeat_count=4, batch_size=2, repeat_count=2, seed=0
     )
     batches = BatchSamplerShard(BatchSampler(sampler, 4, False), 2, rank)
@@ -294,7 +294,7 @@ def test_a_run_resumes_in_its_second_epoch(settings, tmp_path, monkeypatch, shor
     """Each epoch has its own order of the items."""
     seen: dict[str, list[list[str]]] = {"whole": [], "resumed": []}
     respond = reinforcement.MediaGRPOTrainer._respond
-    load = reinforcement.load_items
+    load = judged_items.load_items
 
     def recorded(self, prompts, trainer):
         if self.model.training:
@@ -306,7 +306,7 @@ def test_a_run_resumes_in_its_second_epoch(settings, tmp_path, monkeypatch, shor
         return training[:4], validation
 
     monkeypatch.setattr(reinforcement.MediaGRPOTrainer, "_respond", recorded)
-    monkeypatch.setattr(reinforcement, "load_items", four_items)
+    monkeypatch.setattr(judged_items, "load_items", four_items)
     train = replace(settings.train, max_steps=6, evaluations=2)
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
     current = "whole"
