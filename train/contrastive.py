@@ -33,10 +33,13 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from dynapix.models.layers.fast_layers import use_fast_layers
     from dynapix.models.resolved_settings import data_digest, resolve_run
     from dynapix.models.retriever.embedder import load_retriever, tokenizer_texts
-    from dynapix.train.common.checkpoints import newest_checkpoint
     from dynapix.train.common.journal import run_metrics
     from dynapix.train.common.model_card import write_run_card
-    from dynapix.train.common.training_loop import explain_load_errors, run_training
+    from dynapix.train.common.training_loop import (
+        explain_load_errors,
+        newest_checkpoint,
+        run_training,
+    )
     from dynapix.train.retriever.batches import read_pools, split_queries
     from dynapix.train.retriever.trainer import build_trainer
 

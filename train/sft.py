@@ -32,7 +32,6 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from dynapix.models.resolved_settings import data_digest, resolve_run
     from dynapix.teacher.narrate import ensure_rationales
     from dynapix.train.common import training_loop
-    from dynapix.train.common.checkpoints import newest_checkpoint
     from dynapix.train.common.journal import run_metrics
     from dynapix.train.common.model_card import write_run_card
     from dynapix.train.student.dataset import load_datasets, tokenizer_corpus
@@ -46,7 +45,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.
     with distributed.main_first():
-        checkpoint = newest_checkpoint(run.folder)
+        checkpoint = training_loop.newest_checkpoint(run.folder)
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
         rationales = (
             [] if cfg.train.regime == "answer_only" else ensure_rationales(store, cfg.teacher)

@@ -51,7 +51,7 @@ from dynapix.models.student.collator import Collator, encode, pad
 from dynapix.models.student.prompts import Sample
 from dynapix.teacher.narrate import ensure_rationales
 from dynapix.train.student.dataset import load_datasets, tokenizer_corpus
-from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.samples import LengthSampler
 from dynapix.train.student.trainer import build_trainer, token_mean
 
 

@@ -38,8 +38,7 @@ from dynapix.train.on_policy.sampling import EncodedPrompt, ResponseSampler, enc
 from dynapix.train.on_policy.served_sampling import build_sampler
 from dynapix.train.on_policy.teachers import Teacher
 from dynapix.train.student.held_out_answers import HeldOutAnswers
-from dynapix.train.student.lazy_samples import StudentDataset
-from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.samples import LengthSampler, StudentDataset
 from dynapix.train.student.trainer import (
     LetterAccuracy,
     StudentTrainer,

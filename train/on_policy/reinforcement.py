@@ -39,7 +39,7 @@ from dynapix.train.on_policy.mismatch import Mismatch
 from dynapix.train.on_policy.sampling import EncodedPrompt, ResponseSampler, encode_prompt
 from dynapix.train.on_policy.served_sampling import build_sampler
 from dynapix.train.rewards import REWARDS, JudgedResponse, judge_response
-from dynapix.train.student.lazy_samples import seeded_rng
+from dynapix.train.student.samples import seeded_rng
 
 ROW = "row"
 """Key of the index of a response among those that were sampled together."""

@@ -23,7 +23,7 @@ from dynapix.models.student.generation import generate
 from dynapix.models.student.prompts import Sample
 from dynapix.models.student.responses import GeneratedText, response_token_limit
 from dynapix.train.common.journal import ANSWERS
-from dynapix.train.student.lazy_samples import StudentDataset
+from dynapix.train.student.samples import StudentDataset
 
 log = logging.getLogger(__name__)
 

@@ -35,8 +35,7 @@ from dynapix.train.common.audit import audit_student
 from dynapix.train.common.callbacks import EpochCallback
 from dynapix.train.common.training_loop import common_arguments
 from dynapix.train.student.held_out_answers import HeldOutAnswers
-from dynapix.train.student.lazy_samples import StudentDataset
-from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.samples import LengthSampler, StudentDataset
 from dynapix.train.student.vision_cache import PAIRS, VisionCache, pair_digests
 
 log = logging.getLogger(__name__)

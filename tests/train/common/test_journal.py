@@ -30,7 +30,7 @@ from dynapix.train import sft
 from dynapix.train.common.callbacks import MetricsBar
 from dynapix.train.common.journal import read_journal, read_lines
 from dynapix.train.student.held_out_answers import HeldOutAnswers
-from dynapix.train.student.lazy_samples import LazySample, StudentDataset
+from dynapix.train.student.samples import LazySample, StudentDataset
 from tests.user_errors import raises_user_error
 
 

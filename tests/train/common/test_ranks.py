@@ -28,11 +28,10 @@ from dynapix.models.student.collator import IGNORED, Collator
 from dynapix.models.student.prompts import selection_sample
 from dynapix.train import contrastive, sft
 from dynapix.train.common import journal
-from dynapix.train.common.checkpoints import find_damage
 from dynapix.train.common.journal import read_journal
+from dynapix.train.common.training_loop import find_damage
 from dynapix.train.student import dataset
-from dynapix.train.student.lazy_samples import LazySample, StudentDataset
-from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.samples import LazySample, LengthSampler, StudentDataset
 from dynapix.train.student.trainer import token_losses, token_mean
 from tests.children import run_child
 from tests.train.common import launched

@@ -14,9 +14,9 @@ from safetensors.torch import load_file
 from dynapix.conf.entry import Run
 from dynapix.conf.schema import LateConfig, LoraConfig, SftCommand
 from dynapix.train import contrastive, sft
-from dynapix.train.common import checkpoints
-from dynapix.train.common.checkpoints import newest_checkpoint
+from dynapix.train.common import training_loop
 from dynapix.train.common.journal import read_journal
+from dynapix.train.common.training_loop import newest_checkpoint
 from dynapix.train.student import dataset
 from tests.user_errors import raises_user_error
 
@@ -175,9 +175,9 @@ def test_a_checkpoint_that_cannot_be_read_stops_the_run(tmp_path, monkeypatch) -
     def fail(path: Path) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setitem(checkpoints.READERS, ".json", fail)
+    monkeypatch.setitem(training_loop.READERS, ".json", fail)
     for suffix in (".safetensors", ".pt", ".pth"):
-        monkeypatch.delitem(checkpoints.READERS, suffix)
+        monkeypatch.delitem(training_loop.READERS, suffix)
     with raises_user_error("unreadable-checkpoint", contains=("trainer_state.json", "denied")):
         newest_checkpoint(tmp_path)
 

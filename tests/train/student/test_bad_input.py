@@ -36,7 +36,7 @@ from dynapix.models.tiny_qwen3_vl import build_model
 from dynapix.teacher.journal import Journal
 from dynapix.teacher.narrate import JOURNAL_FILE, ensure_rationales
 from dynapix.train import sft
-from dynapix.train.common.checkpoints import newest_checkpoint
+from dynapix.train.common.training_loop import newest_checkpoint
 from tests.user_errors import raises_user_error
 
 

@@ -15,8 +15,7 @@ from dynapix.models import loading
 from dynapix.models.layers.attention import BY_FRAME
 from dynapix.models.student.collator import IGNORED, Collator, Encoded, encode, letter_ids, pad
 from dynapix.models.student.prompts import Sample, selection_sample
-from dynapix.train.student.lazy_samples import LazySample, StudentDataset
-from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.samples import LazySample, LengthSampler, StudentDataset
 from dynapix.train.student.trainer import LetterAccuracy, sample_mean, token_mean
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error

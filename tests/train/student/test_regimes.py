@@ -27,7 +27,7 @@ from dynapix.train.student.dataset import (
     supervised_items,
     tokenizer_corpus,
 )
-from dynapix.train.student.lazy_samples import StudentDataset
+from dynapix.train.student.samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
 COT = [r for r in REGIMES if r != "answer_only"]
