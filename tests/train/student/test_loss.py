@@ -116,26 +116,6 @@ def test_a_sample_over_the_limit_is_refused(samples, processor) -> None:
         encode(samples[1], processor, length - 1)
 
 
-def test_lengths_are_estimated_without_rendering(
-    micro_store, frames, student_cfg, processor
-) -> None:
-    def refuse(epoch: int) -> Sample:
-        raise AssertionError("a sample was rendered")
-
-    items = micro_store.selection("train")[:4]
-    texts = ["near the top " * words + "\nAnswer: A" for words in (3, 9, 27, 1)]
-    samples = StudentDataset([LazySample(text, 10, text, refuse) for text in texts])
-    estimated = samples.lengths(processor, 96)
-    real = [
-        len(encode(sample, processor, 1500).input_ids)
-        for sample in (
-            selection_sample(i, "answer", "cot", frames, student_cfg.frames, t)
-            for i, t in zip(items, texts, strict=True)
-        )
-    ]
-    assert np.argsort(estimated).tolist() == np.argsort(real).tolist()
-
-
 def test_the_letter_with_the_highest_logit_is_chosen(
     micro_store, frames, student_cfg, processor, model
 ) -> None:
