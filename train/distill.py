@@ -64,7 +64,7 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
         teacher = ServerTeacher(cfg.teacher_server, processor)
     else:
         teacher_model = load_teacher(*teacher_run, precision, processor)
-        teacher = LocalTeacher(teacher_model, processor, cfg.train.beta, precision == "bf16")
+        teacher = LocalTeacher(teacher_model, processor, precision == "bf16")
     trainer = build_trainer(
         cfg, trained, run, model, teacher, processor, training, validation, checkpoint
     )

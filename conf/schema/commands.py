@@ -237,12 +237,6 @@ class DistillCommand(ContinuationCommand):
                 f"teacher_model={self.teacher_model} and teacher_server.url="
                 f"{self.teacher_server.url} are two teachers: give one of them"
             )
-        if self.train.beta != 1:
-            yield (
-                f"train.beta={self.train.beta:g} with teacher_server.url: a server returns the "
-                "log-probabilities of the sampled tokens only, which estimate the reverse "
-                "Kullback-Leibler divergence, train.beta=1"
-            )
         if self.train.temperature != 1:
             yield (
                 f"train.temperature={self.train.temperature:g} with teacher_server.url: the "

@@ -138,10 +138,6 @@ class DistillTrainConfig(StudentTrainConfig):
     sampling_batch: int | None = setting(None, least=1)
     """Number of responses that a rank samples at once; changes memory and speed, and probabilities
     by rounding. null samples all responses of a step."""
-    beta: float = setting(1.0, least=0, most=1)
-    """Divergence of the student from the teacher: 1 is the reverse Kullback-Leibler divergence, 0
-    the forward one, and between them the generalised Jensen-Shannon divergence with this weight of
-    the teacher."""
 
 
 @dataclass

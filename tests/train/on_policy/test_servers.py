@@ -257,15 +257,14 @@ def test_servers_that_cannot_sample_are_named(
         build_sampler(processor, whole, settings.train, servers, tmp_path)
 
 
-def test_two_teachers_and_other_divergences_are_refused() -> None:
+def test_two_teachers_and_other_temperatures_are_refused() -> None:
     server = serve("http://127.0.0.1:1/v1")
     problems = DistillCommand(
         teacher_model="run",
         teacher_server=server,
-        train=DistillTrainConfig(beta=0.5, temperature=0.8),
+        train=DistillTrainConfig(temperature=0.8),
     ).check()
     assert any("are two teachers" in p for p in problems)
-    assert any("train.beta=0.5 with teacher_server.url" in p for p in problems)
     assert any("train.temperature=0.8 with teacher_server.url" in p for p in problems)
     (problem,) = DistillCommand(teacher_server=replace(server, model=None)).check()
     assert "without teacher_server.model" in problem
