@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +22,9 @@ BAR_MEASURES = (
 )  # fmt: skip
 """Suffixes of the measures that the progress bar shows."""
 
-PLOT_INTERVAL = 30
-"""Minimum time (s) between two plots of the curves."""
-
 
 class JournalCallback(TrainerCallback):
-    """Appends what the trainer logs to metrics.jsonl, and plots the curves with the checkpoints.
+    """Appends what the trainer logs to metrics.jsonl, and plots the curves at the end.
 
     A run that resumes first deletes the lines of steps after its checkpoint from metrics.jsonl and
     samples.jsonl, and a run that starts again deletes all lines.
@@ -36,7 +32,6 @@ class JournalCallback(TrainerCallback):
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / JOURNAL
-        self._plotted = time.monotonic()
 
     def on_train_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
         resumed = state.global_step > 0
@@ -52,16 +47,8 @@ class JournalCallback(TrainerCallback):
         with open(self._path, "a") as file:
             file.write(json.dumps({"step": state.global_step, **values}) + "\n")
 
-    def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        if time.monotonic() - self._plotted >= PLOT_INTERVAL:
-            self._plot()
-
     def on_train_end(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        self._plot()
-
-    def _plot(self) -> None:
         plot_curves(read_journal(self._path.parent), self._path.with_name(CURVES))
-        self._plotted = time.monotonic()
 
 
 class EpochCallback(TrainerCallback):

@@ -154,10 +154,6 @@ def test_shares_of_parsed_and_correct_answers(few_steps, processor, tmp_path) ->
     assert [r["answer"] for r in rows] == ["A", "B", "C", "D"]
     assert {(r["step"], r["mode"]) for r in rows} == {(7, "answer")}
 
-    # Responses without a letter are not measured.
-    samples = held_out(["The cube is near the centre."] * 4)
-    assert answers.measure(Writer(processor, texts), "frame", samples, step=8) == {}
-
 
 def test_the_progress_bar_shows_the_latest_measures() -> None:
     bar = MetricsBar()
