@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -93,6 +94,18 @@ def test_responses_do_not_depend_on_how_many_are_sampled_at_once(
         found.append([text.text for text in sampler.sample(model, prompts, range(5))])
         assert sampler.sample(model, [], []) == []
     assert found[0] == found[1]
+
+
+def test_datasets_can_be_sent_to_worker_processes(settings, student, micro_store) -> None:
+    trained = read_trained_settings(student, SftCommand, "student")
+    rationales = ensure_rationales(micro_store, trained.teacher)
+    training, _ = paired_prompts.load_datasets(settings, trained, micro_store, rationales)
+    copy = pickle.loads(pickle.dumps(training))
+    for dataset in (training, copy):
+        dataset.set_epoch(1)
+    ours, theirs = training[0], copy[0]
+    assert (ours.seed, ours.letter) == (theirs.seed, theirs.letter)
+    assert ours.student.content == theirs.student.content
 
 
 LESS_MEMORY = {
