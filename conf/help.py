@@ -35,7 +35,7 @@ TRAINING = (
     "train.rewards.following", "train.rewards.no_numbers", "train.rewards.form", "train.lr",
     "train.epochs", "train.max_steps", "train.batch", "train.micro_batch", "train.mini_batch",
     "train.hard_negatives", "train.precision", "train.evaluations", "train.generated_items",
-    "train.best_metric", "train.report_to", "train.pools",
+    "train.report_to", "train.pools",
 )  # fmt: skip
 """Further such keys, which are listed for the commands that train. Other commands use few of
 them."""

@@ -21,8 +21,8 @@ Hooks in other modules, which subclass a library's classes or depend on how it p
   distribute those of the main rank (FSDP_CPU_RAM_EFFICIENT_LOADING).
 - `models.retriever.multi_vector` loads with `MultiVectorEncoder._load_with_module_classes`, and a
   forward pre-hook casts `token_embeddings` in the inputs of the projection.
-- `train.retriever.trainer` overrides `_load_from_checkpoint`, `_load_best_model`,
-  `get_batch_sampler`, `collect_features` and `add_model_card_callback`.
+- `train.retriever.trainer` overrides `_load_from_checkpoint`, `get_batch_sampler`,
+  `collect_features` and `add_model_card_callback`.
 - `train.retriever.inputs` adds an input in a forward pre-hook of sentence-transformers'
   `Transformer`, which passes it on to its model.
 - `train.student.trainer` overrides `_get_train_sampler` of transformers' Trainer, and

@@ -49,15 +49,15 @@ def run_title(folder: Path) -> str:
 
 
 def read_export_record(folder: Path) -> dict[str, Any]:
-    """Return the record of an export: the exported `run`, the `format`, the SHA-256 of the adapters
-    (`weights`), and the differences from the trained model's outputs (`measured`).
+    """Return the record of an export: the exported `run`, the `format`, and the SHA-256 of the
+    adapters (`weights`).
 
     Raises:
         UserError: The file is missing or damaged.
     """
     try:
         record = json.loads((folder / EXPORT).read_text())
-        return {name: record[name] for name in ("run", "format", "weights", "measured")}
+        return {name: record[name] for name in ("run", "format", "weights")}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{folder / EXPORT} is missing or damaged: delete {folder} and export again",

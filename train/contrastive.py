@@ -33,12 +33,15 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from dynapix.models.layers.fast_layers import use_fast_layers
     from dynapix.models.resolved_settings import data_digest, resolve_run
     from dynapix.models.retriever.embedder import load_retriever, tokenizer_texts
-    from dynapix.train.common.checkpoints import newest_checkpoint
     from dynapix.train.common.journal import run_metrics
     from dynapix.train.common.model_card import write_run_card
-    from dynapix.train.common.training_loop import explain_load_errors, run_training
+    from dynapix.train.common.training_loop import (
+        explain_load_errors,
+        newest_checkpoint,
+        run_training,
+    )
     from dynapix.train.retriever.batches import read_pools, split_queries
-    from dynapix.train.retriever.trainer_setup import build_trainer
+    from dynapix.train.retriever.trainer import build_trainer
 
     keep_freed_memory()
     if is_sharded():
@@ -75,9 +78,9 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     trainer = build_trainer(cfg, run, store, model, training, validation, rank_batch, checkpoint)
     lower = "lower train.mini_batch, set train.reuse_features=false"
     shrink = "retriever.image_size or retriever.frames"
-    best_step = run_training(trainer, run, checkpoint, lower, shrink)
+    run_training(trainer, run, checkpoint, lower, shrink)
 
-    metrics = run_metrics(run.folder, best_step)
+    metrics = run_metrics(run.folder)
     if rank() == 0:
         model.save_pretrained(str(run.folder / "retriever"), create_model_card=False)
         write_run_card(run, cfg, metrics)

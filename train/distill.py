@@ -24,7 +24,7 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     from dynapix.models.resolved_settings import data_digest
     from dynapix.models.trained_runs import product_folder
     from dynapix.teacher.narrate import ensure_rationales
-    from dynapix.train.common.checkpoints import newest_checkpoint
+    from dynapix.train.common.training_loop import newest_checkpoint
     from dynapix.train.on_policy.continuation import (
         inherit_settings,
         load_source,
@@ -64,7 +64,7 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
         teacher = ServerTeacher(cfg.teacher_server, processor)
     else:
         teacher_model = load_teacher(*teacher_run, precision, processor)
-        teacher = LocalTeacher(teacher_model, processor, cfg.train.beta, precision == "bf16")
+        teacher = LocalTeacher(teacher_model, processor, precision == "bf16")
     trainer = build_trainer(
         cfg, trained, run, model, teacher, processor, training, validation, checkpoint
     )

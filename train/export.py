@@ -7,7 +7,7 @@
         tokenizer and processor files
         README.md      the model card
         config.yaml, run.json, metrics.json    copied from the training run
-        export.json    the run, the format, a digest of the adapters, and measured differences
+        export.json    the run, the format, and a digest of the adapters
 
 Until it is complete, the folder has a temporary name.
 """
@@ -18,18 +18,14 @@ import logging
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dynapix.conf.entry import Run, command
 from dynapix.conf.errors import UserError
 from dynapix.conf.files import read_json, write_json
 from dynapix.conf.runs import lock_file, resolve_run_name, runs_folder
-from dynapix.conf.schema import ContrastiveCommand, ExportModelCommand, SftCommand
-
-if TYPE_CHECKING:
-    from dynapix.train.retriever.merge import RetrieverMerge
-    from dynapix.train.student.merge import StudentMerge
+from dynapix.conf.schema import ContrastiveCommand, ExportModelCommand, LoraConfig, SftCommand
 
 log = logging.getLogger(__name__)
 
@@ -58,33 +54,25 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
                 code="other-adapters",
             )
         log.info("%s is already exported; delete it to export again", folder)
-        return record["measured"]
-    measured: dict[str, float] = {}
+        return {}
     with renamed_when_complete(folder) as partial:
         if cfg.format == "adapter":
             shutil.copytree(saved, partial, dirs_exist_ok=True)
             if (resolved := run_folder / RESOLVED).exists():
                 shutil.copy(resolved, partial)
         elif cfg.product == "student":
-            from dynapix.train.student.merge import StudentMerge
-
-            measured = write_merged(StudentMerge(settings, saved), partial, cfg)
+            write_merged_student(settings, saved, partial, cfg.format)
         else:
-            from dynapix.train.retriever.merge import RetrieverMerge
-
-            measured = write_merged(RetrieverMerge(settings, saved), partial, cfg)
+            write_merged_retriever(settings, saved, partial, cfg.format)
         for file_name in RECORDS:
             shutil.copy(run_folder / file_name, partial)
         shutil.copy(settings_file(run_folder), partial / "config.yaml")
         metrics = read_json(run_folder / "metrics.json")
-        card = build_model_card(name, settings, run_folder, folder, cfg.format, measured, metrics)
+        card = build_model_card(name, settings, run_folder, folder, cfg.format, metrics)
         card.save(partial / CARD)
-        record = {"run": name, "format": cfg.format, "weights": weights, "measured": measured}
-        write_json(partial / EXPORT, record)
-    for measure, value in measured.items():
-        log.info("%s: %.4g", measure.replace("_", " "), value)
+        write_json(partial / EXPORT, {"run": name, "format": cfg.format, "weights": weights})
     log.info("the exported %s is in %s", cfg.product, folder)
-    return measured
+    return {}
 
 
 def find_run(
@@ -127,38 +115,29 @@ def find_run(
     return name, folder, settings
 
 
-def write_merged(
-    merge: StudentMerge | RetrieverMerge, folder: Path, cfg: ExportModelCommand
-) -> dict[str, float]:
-    """Write a merged model, and return the comparison of its outputs with those of the trained
-    model (see `train.common.output_comparison.compare_outputs`), which is empty with
-    `verify=false`.
+def write_merged_student(settings: SftCommand, saved: Path, folder: Path, format: str) -> None:
+    """Write a student merged with its adapters in `saved`, with weights in `format`, bf16 or
+    fp32."""
+    from dynapix.models import loading
 
-    Raises:
-        UserError: The outputs differ too much, or the benchmark or its rationales are missing.
-    """
-    from dynapix.train.common.output_comparison import compare_outputs
+    student = settings.student
+    base, processor = loading.load_base(student, settings.train.precision, list)
+    model = loading.merge_adapters(base, saved, student.quantization, format)
+    loading.write_model(model, processor, folder)
 
-    if not cfg.verify:
-        merge.write(folder, cfg.format)
-        return {}
-    items = merge.held_out(Path(cfg.store), cfg.workers)
-    log.info("running the trained %s", cfg.product)
-    trained = merge.trained_outputs(items)
-    log.info("merging")
-    merge.write(folder, cfg.format)
-    log.info("running the merged %s", cfg.product)
-    measured = compare_outputs(trained, merge.merged_outputs(folder, items))
-    for name, value in measured.items():
-        # Unlike >, "not <=" also refuses NaN.
-        if name.endswith("_difference") and not value <= merge.max_difference:
-            raise UserError(
-                f"the relative {name.replace('_', ' ')} between the merged and the trained "
-                f"{cfg.product} is {value:.3g}, above the limit of {merge.max_difference}, so "
-                "nothing was exported: try format=fp32 or format=adapter",
-                code="merge-difference",
-            )
-    return measured
+
+def write_merged_retriever(
+    settings: ContrastiveCommand, saved: Path, folder: Path, format: str
+) -> None:
+    """Write a retriever merged with its adapters in `saved`, as `write_merged_student` does."""
+    from dynapix.models import loading
+    from dynapix.models.retriever.embedder import load_head, load_retriever
+
+    base = replace(settings.retriever, lora=LoraConfig(rank=0))
+    model = load_retriever(base, settings.train.precision, [], folder)
+    model[0].model = loading.merge_adapters(model[0].model, saved, base.quantization, format)
+    load_head(model, saved)
+    model.save_pretrained(str(folder), create_model_card=False)
 
 
 @contextmanager

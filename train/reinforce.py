@@ -27,7 +27,7 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     from dynapix.models.fingerprints import weights_digest
     from dynapix.models.resolved_settings import data_digest
     from dynapix.models.trained_runs import product_folder
-    from dynapix.train.common.checkpoints import newest_checkpoint
+    from dynapix.train.common.training_loop import newest_checkpoint
     from dynapix.train.on_policy.continuation import (
         inherit_settings,
         load_source,
@@ -35,7 +35,8 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
         resolve_continuation,
         train_and_save,
     )
-    from dynapix.train.on_policy.reinforcement import build_trainer, load_items
+    from dynapix.train.on_policy.judged_items import load_items
+    from dynapix.train.on_policy.reinforcement import build_trainer
 
     compat.keep_freed_memory()
     source, trained = read_source_settings(cfg.model)

@@ -32,11 +32,10 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from dynapix.models.resolved_settings import data_digest, resolve_run
     from dynapix.teacher.narrate import ensure_rationales
     from dynapix.train.common import training_loop
-    from dynapix.train.common.checkpoints import newest_checkpoint
     from dynapix.train.common.journal import run_metrics
     from dynapix.train.common.model_card import write_run_card
     from dynapix.train.student.dataset import load_datasets, tokenizer_corpus
-    from dynapix.train.student.trainer_setup import build_trainer
+    from dynapix.train.student.trainer import build_trainer
 
     compat.keep_freed_memory()
     # Check the batch and the base now, because building the benchmark may take long.
@@ -46,7 +45,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
 
     # The main rank builds and narrates what is missing; then every rank reads it from the disk.
     with distributed.main_first():
-        checkpoint = newest_checkpoint(run.folder)
+        checkpoint = training_loop.newest_checkpoint(run.folder)
         store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
         rationales = (
             [] if cfg.train.regime == "answer_only" else ensure_rationales(store, cfg.teacher)
@@ -73,10 +72,10 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     trainer = build_trainer(cfg, run, model, processor, training, validation, checkpoint)
     lower = "lower train.micro_batch, set train.reuse_features=false"
     shrink = "student.image_size or student.frames"
-    best_step = training_loop.run_training(trainer, run, checkpoint, lower, shrink)
+    training_loop.run_training(trainer, run, checkpoint, lower, shrink)
 
     weights = training_loop.gather_weights(trainer)
-    metrics = run_metrics(run.folder, best_step)
+    metrics = run_metrics(run.folder)
     if rank() == 0:
         loading.save_student(model, processor, run.folder / "student", precision, weights)
         write_run_card(run, cfg, metrics)

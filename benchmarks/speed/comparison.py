@@ -35,7 +35,7 @@ from dynapix.conf.runs import Run
 from dynapix.conf.schema import TrainConfig
 from dynapix.models.precision import resolve_precision
 from dynapix.models.tiny_qwen3_vl import SPECIAL_TOKENS, build_processor
-from dynapix.train.common.arguments import common_arguments
+from dynapix.train.common.training_loop import common_arguments
 
 OURS = "ours"
 """Name of the variant that uses this project's trainer with the preset's settings."""

@@ -51,8 +51,7 @@ from dynapix.models.layers.fast_layers import use_fast_layers
 from dynapix.models.retriever import embedder
 from dynapix.models.retriever.inputs import Retriever, frame_input, query_input
 from dynapix.train.retriever.batches import QueryBatchSampler
-from dynapix.train.retriever.trainer import NUMBER, numbered_rows
-from dynapix.train.retriever.trainer_setup import build_trainer
+from dynapix.train.retriever.trainer import NUMBER, build_trainer, numbered_rows
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,7 @@ def build_plain_trainer(
             batch_sampler=lambda *_, **__: sampler,
         ),
         train_dataset=numbered_rows(len(queries)),
-        loss=MatryoshkaLoss(model, ranking, list(cfg.retriever.widths), cfg.train.width_weights),
+        loss=MatryoshkaLoss(model, ranking, list(cfg.retriever.widths)),
         data_collator=collator,
     )
 

@@ -89,7 +89,7 @@ def measure(name: str, overrides: list[str], steps: int) -> Measurements:
     with tempfile.TemporaryDirectory() as folder, unlimited:
         model, _ = loading.load_student(trained.student, train.precision, list)
         model.eval().to(rank_device())
-        teacher = LocalTeacher(model, processor, train.beta, train.precision == "bf16")
+        teacher = LocalTeacher(model, processor, train.precision == "bf16")
         run = Run("benchmark", Path(folder))
         trainer = distillation.build_trainer(
             cfg, trained, run, student, teacher, processor, training, validation, None

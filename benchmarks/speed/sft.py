@@ -50,9 +50,8 @@ from dynapix.models.student.collator import Collator, encode, pad
 from dynapix.models.student.prompts import Sample
 from dynapix.teacher.narrate import ensure_rationales
 from dynapix.train.student.dataset import load_datasets, tokenizer_corpus
-from dynapix.train.student.length_sampler import LengthSampler
-from dynapix.train.student.trainer import token_mean
-from dynapix.train.student.trainer_setup import build_trainer
+from dynapix.train.student.samples import LengthSampler
+from dynapix.train.student.trainer import build_trainer, token_mean
 
 
 @dataclass(frozen=True)

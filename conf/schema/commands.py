@@ -237,12 +237,6 @@ class DistillCommand(ContinuationCommand):
                 f"teacher_model={self.teacher_model} and teacher_server.url="
                 f"{self.teacher_server.url} are two teachers: give one of them"
             )
-        if self.train.beta != 1:
-            yield (
-                f"train.beta={self.train.beta:g} with teacher_server.url: a server returns the "
-                "log-probabilities of the sampled tokens only, which estimate the reverse "
-                "Kullback-Leibler divergence, train.beta=1"
-            )
         if self.train.temperature != 1:
             yield (
                 f"train.temperature={self.train.temperature:g} with teacher_server.url: the "
@@ -276,19 +270,6 @@ class ContrastiveCommand(CommandConfig):
                 "retriever.encoder=sentence_transformers, or choose another retriever, such as "
                 "retriever=qwen3_vl_emb_8b"
             )
-        weights, widths = self.train.width_weights, self.retriever.widths
-        if weights is not None and (
-            len(weights) != len(widths) or min(weights) < 0 or max(weights) == 0
-        ):
-            yield (
-                f"train.width_weights={weights}: give each of the {len(widths)} widths in "
-                f"retriever.widths={list(widths)} a weight of 0 or more, at least one above 0"
-            )
-        if weights is not None and self.retriever.late is not None:
-            yield (
-                "train.width_weights with retriever.late: a late-interaction retriever has one "
-                "width; leave train.width_weights=null"
-            )
         if self.train.reuse_features and not self.retriever.lora.rank:
             yield (
                 "train.reuse_features=true with retriever.lora.rank=0: without adapters, training "
@@ -308,9 +289,6 @@ class ExportModelCommand(CommandConfig):
     format: str = setting("bf16", ("bf16", "fp32", "adapter"))
     """bf16 and fp32 merge the adapters into the dequantised base and write the weights in that
     precision; adapter writes only the adapters."""
-    verify: bool = True
-    """Compare the outputs of the merged model with those of the trained model on held-out items of
-    the run's benchmark. false skips the comparison and needs no benchmark."""
 
     def find_run_problems(self) -> list[str]:
         for other in TRAINER_FOLDERS:

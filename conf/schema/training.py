@@ -47,14 +47,9 @@ class TrainConfig(Settings):
     on a sample of what the run trains on."""
     evaluations: int = setting(10, least=1)
     """Number of evaluations, evenly spaced over the run and in addition to one before the first
-    step. A run saves as many checkpoints, also evenly spaced, but at least two unless
-    `best_metric` is set."""
+    step. A run saves as many checkpoints, also evenly spaced, but at least two."""
     keep_checkpoints: int = setting(2, least=1)
-    """Number of checkpoints to keep, including the best one."""
-    best_metric: str | None = None
-    """Metric in metrics.jsonl that selects the checkpoint whose weights become the trained model,
-    such as eval_answer_letter_accuracy, eval_reasoning_loss or eval_recall@10. The lowest value of
-    a loss is the best; of any other metric, the highest. null selects the last step."""
+    """Number of checkpoints to keep."""
     workers: int = setting(0, least=0)
     """For a student, the number of background processes that prepare batches. For a retriever, the
     number of mini-batches that a background thread prepares in advance. 0 prepares each batch when
@@ -67,17 +62,6 @@ class TrainConfig(Settings):
             yield (
                 f"{group}max_steps={self.max_steps} and {group}epochs={self.epochs}: give 1 or "
                 f"more steps, or {group}max_steps=-1 and {group}epochs above 0"
-            )
-        if self.best_metric is not None and not self.hold_out:
-            yield (
-                f"{group}best_metric={self.best_metric} with {group}hold_out=false: a metric of "
-                f"trained items selects no checkpoint; set {group}best_metric=null or "
-                f"{group}hold_out=true"
-            )
-        if self.best_metric is not None and self.evaluations == 1:
-            yield (
-                f"{group}best_metric={self.best_metric} with {group}evaluations=1: only the last "
-                f"checkpoint has an evaluation; set {group}evaluations to 2 or more"
             )
 
 
@@ -162,10 +146,6 @@ class DistillTrainConfig(OnPolicyTrainConfig, StudentTrainConfig):
     permute_candidates: bool | None = None
     """Shuffle the order of each item's candidates in every epoch; null does as the student's
     training did."""
-    beta: float = setting(1.0, least=0, most=1)
-    """Divergence of the student from the teacher: 1 is the reverse Kullback-Leibler divergence, 0
-    the forward one, and between them the generalised Jensen-Shannon divergence with this weight of
-    the teacher."""
 
 
 @dataclass
@@ -253,8 +233,6 @@ class ContrastiveTrainConfig(TrainConfig):
     """Keep the frozen vision tower's features between the two forward passes of a step, which does
     not change the gradient. With an 8B model, the features of a query take about 30 MB. No effect
     if a batch is embedded once."""
-    width_weights: list[float] | None = None
-    """Weight of the loss at each width of retriever.widths; null weights all widths equally."""
     validation_queries: int = setting(128, least=1)
     """Number of validation queries, from scenes of the training split that are not trained on."""
 

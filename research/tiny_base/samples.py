@@ -22,7 +22,7 @@ from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.motion import find_cut
 from dynapix.train.common.held_out import check_not_empty, held_out_scenes
 from dynapix.train.student.dataset import prompt_corpus, uses_only
-from dynapix.train.student.lazy_samples import seeded_rng
+from dynapix.train.student.samples import seeded_rng
 from research.tiny_base.false_words import falsify_words
 from research.tiny_base.oracle_targets import (
     ObjectTarget,

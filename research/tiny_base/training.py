@@ -37,9 +37,9 @@ from dynapix.models.distributed import average_gradients
 from dynapix.models.student.collator import IGNORED
 from dynapix.train.common.curves import plot_curves
 from dynapix.train.common.journal import CURVES, JOURNAL, read_journal
-from dynapix.train.common.muon import Muon
 from research.tiny_base.collator import OracleCollator, letter_token_ids
 from research.tiny_base.heads import OracleHeads
+from research.tiny_base.muon import Muon
 from research.tiny_base.oracle_targets import SPATIAL_WORDS, WORDS, OracleTargets
 from research.tiny_base.pointing import pointing_losses
 from research.tiny_base.probe import Probe

@@ -66,7 +66,6 @@ def test_unknown_key_suggests_the_nearest(override, suggested):
         ("benchmark.height=129", "invalid-setting", "benchmark.height=129"),
         ("train.keep_checkpoints=0", "invalid-setting", "train.keep_checkpoints=0"),
         ("train.max_steps=0", "invalid-setting", "train.max_steps=0"),
-        ("train.best_metric=eval_answer_loss", "invalid-setting", "train.evaluations=1"),
         ("train.lr=inf", "invalid-setting", "train.lr=inf"),
         ("train.epochs=nan", "invalid-setting", "train.epochs=nan"),
         ("benchmark.world.camera.position=[nan,0,2]", "invalid-setting", "camera.position"),

@@ -61,7 +61,7 @@ def served(micro, micro_store, tmp_path_factory) -> Iterator[Served]:
     trained = Run("answers", folder / "sft" / "answers")
     open_run(trained, asdict(settings), "train.sft")
     write_json(trained.folder / "metrics.json", sft.main.__wrapped__(settings, trained))
-    exported = ExportModelCommand(**{**shared, "run": "answers", "format": "fp32", "verify": False})
+    exported = ExportModelCommand(**{**shared, "run": "answers", "format": "fp32"})
     into = folder / "export_model"
     into.mkdir()
     export.main.__wrapped__(exported, Run("answers", into))

@@ -114,7 +114,7 @@ def test_qwen3_vl_takes_the_vision_towers_outputs_instead_of_pixels(model) -> No
                    "_get_num_items_in_batch"]),
         (GRPOTrainer, ["_send_telemetry", "create_model_card"]),
         (SentenceTransformerTrainer,
-         ["_load_from_checkpoint", "_load_best_model", "get_batch_sampler", "collect_features",
+         ["_load_from_checkpoint", "get_batch_sampler", "collect_features",
           "add_model_card_callback"]),
         (Linear4bit, ["_cast_input_dtype"]),
     ],

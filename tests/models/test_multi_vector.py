@@ -140,14 +140,6 @@ def test_the_audit_marks_scored_tokens(model, late_cfg, queries, frames) -> None
     assert ">>><|image_pad|>...<<<" in audit
 
 
-def test_width_weights_need_a_retriever_with_one_vector(contrastive_settings, late_cfg) -> None:
-    weighed = replace(contrastive_settings.train, width_weights=[1.0, 1.0])
-    settings = replace(contrastive_settings, train=weighed)
-    assert not settings.check()
-    (problem,) = replace(settings, retriever=late_cfg).check()
-    assert problem.startswith("train.width_weights with retriever.late")
-
-
 @pytest.mark.parametrize("retriever", ["tiny", "qwen3_vl_emb_8b"])
 def test_the_overlay_turns_any_retriever_into_a_multi_vector_one(retriever) -> None:
     register("train.contrastive", ContrastiveCommand)

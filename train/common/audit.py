@@ -103,7 +103,6 @@ def describe_model(
     grids = []
     for name, medium in (("video_grid_thw", "a video"), ("image_grid_thw", "an image")):
         if name in inputs:
-            merge = processor.image_processor.merge_size
             time, height, width = inputs[name][0].tolist()
             merge = processor.image_processor.merge_size
             grids.append(f"{medium} of {time} x {height // merge} x {width // merge} tokens")

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
 from transformers import ProgressCallback, TrainerCallback
 from transformers.trainer_callback import TrainerControl, TrainerState
 
-from dynapix.conf.errors import UserError
 from dynapix.conf.files import write_json_lines
 from dynapix.train.common.curves import plot_curves
 from dynapix.train.common.journal import ANSWERS, CURVES, JOURNAL, read_journal, read_lines
@@ -24,12 +22,9 @@ BAR_MEASURES = (
 )  # fmt: skip
 """Suffixes of the measures that the progress bar shows."""
 
-PLOT_INTERVAL = 30
-"""Minimum time (s) between two plots of the curves."""
-
 
 class JournalCallback(TrainerCallback):
-    """Appends what the trainer logs to metrics.jsonl, and plots the curves with the checkpoints.
+    """Appends what the trainer logs to metrics.jsonl, and plots the curves at the end.
 
     A run that resumes first deletes the lines of steps after its checkpoint from metrics.jsonl and
     samples.jsonl, and a run that starts again deletes all lines.
@@ -37,7 +32,6 @@ class JournalCallback(TrainerCallback):
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / JOURNAL
-        self._plotted = time.monotonic()
 
     def on_train_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
         resumed = state.global_step > 0
@@ -53,44 +47,8 @@ class JournalCallback(TrainerCallback):
         with open(self._path, "a") as file:
             file.write(json.dumps({"step": state.global_step, **values}) + "\n")
 
-    def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        if time.monotonic() - self._plotted >= PLOT_INTERVAL:
-            self._plot()
-
     def on_train_end(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        self._plot()
-
-    def _plot(self) -> None:
         plot_curves(read_journal(self._path.parent), self._path.with_name(CURVES))
-        self._plotted = time.monotonic()
-
-
-class BestCheckpointCallback(TrainerCallback):
-    """Raises UserError if the initial evaluation did not measure train.best_metric, and sets the
-    folder of the best checkpoint on every rank.
-
-    The library sets the folder only if it already exists on the disk. With FSDP, the ranks write a
-    checkpoint in parts, and some may not find it yet: then an earlier checkpoint remains the best,
-    or the ranks disagree and wait for each other forever at the end of the run.
-    """
-
-    def on_step_begin(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        best = args.metric_for_best_model
-        if best is None or state.best_global_step:
-            return
-        names = {k for r in state.log_history for k in r if k.startswith("eval_")}
-        names = sorted(k for k in names if not k.endswith((*NOT_REPRODUCIBLE, "_preparation_time")))
-        if f"eval_{best.removeprefix('eval_')}" not in names:
-            raise UserError(
-                f"train.best_metric={best} is not measured by this run's evaluations; the options "
-                f"are {', '.join(names)}",
-                code="unknown-option",
-            )
-
-    def on_save(self, args, state: TrainerState, control: TrainerControl, **_) -> None:
-        if state.best_global_step:
-            folder = Path(args.output_dir, f"checkpoint-{state.best_global_step}")
-            state.best_model_checkpoint = str(folder)
 
 
 class EpochCallback(TrainerCallback):

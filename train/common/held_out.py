@@ -13,12 +13,6 @@ from dynapix.data.store import Store
 HELD_OUT_SHARE = 0.1
 """Share of the training scenes that are held out."""
 
-REPORTS = {
-    "data.build": "shortfalls",
-    "teacher.narrate": "rejected rationales and items with too short a prefix",
-}
-"""What the commands that make training data report."""
-
 Row = TypeVar("Row")
 
 
@@ -49,10 +43,10 @@ def check_not_empty(count: int, what: str, command: str = "data.build") -> None:
 
     Args:
         what: Names the missing items, queries or rationales.
-        command: The command whose report explains why there are none, from `REPORTS`.
+        command: The command whose report explains why there are none.
     """
     if count == 0:
         raise UserError(
-            f"there are no {what}: see the {REPORTS[command]} that python -m {command} prints",
+            f"there are no {what}: python -m {command} reports why",
             code="no-training-data",
         )

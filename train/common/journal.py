@@ -12,8 +12,6 @@ JOURNAL = "metrics.jsonl"
 ANSWERS = "samples.jsonl"
 """The answers that a student generated at each evaluation, one JSON line per answer."""
 CURVES = "curves.png"
-BEST_STEP = "best_step"
-"""Name, among a run's metrics, of the step of the best checkpoint."""
 
 
 def read_journal(folder: Path) -> list[dict[str, Any]]:
@@ -28,15 +26,11 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     return [record for record in records if "step" in record]
 
 
-def run_metrics(folder: Path, best_step: int | None = None) -> dict[str, float]:
+def run_metrics(folder: Path) -> dict[str, float]:
     """Return a run's metrics: `<name>_at_start` from the first evaluation, and `<name>` from the
-    evaluation of the weights that were kept, those of `best_step` or else of the last step."""
-    records = [r for r in read_journal(folder) if any(k.startswith("eval_") for k in r)]
+    last one."""
     metrics: dict[str, float] = {}
-    if best_step is not None:
-        records = [r for r in records if r["step"] <= best_step]
-        metrics[BEST_STEP] = float(best_step)
-    for record in records:
+    for record in read_journal(folder):
         for key, value in record.items():
             if key.startswith("eval_"):
                 name = key.removeprefix("eval_")

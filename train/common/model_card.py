@@ -19,7 +19,6 @@ from dynapix.models.resolved_settings import read_resolved
 from dynapix.models.student.chat_format import TIMED_PROCESSORS
 from dynapix.models.student.prompts import choose_instruction, write_time
 from dynapix.models.trained_runs import modes_of_regime
-from dynapix.train.common.journal import BEST_STEP
 
 CARD = "README.md"
 TIMES = {
@@ -40,7 +39,7 @@ def write_run_card(
     product = "student" if isinstance(settings, SftCommand) else "retriever"
     format = "adapter" if getattr(settings, product).lora.rank else "whole"
     folder = run.folder / product
-    card = build_model_card(run.name, settings, run.folder, folder, format, {}, metrics)
+    card = build_model_card(run.name, settings, run.folder, folder, format, metrics)
     card.save(folder / CARD)
 
 
@@ -50,7 +49,6 @@ def build_model_card(
     run: Path,
     location: Path,
     format: str,
-    measured: dict[str, float],
     metrics: dict[str, float],
 ) -> ModelCard:
     """Return the card of a trained student or retriever.
@@ -61,8 +59,6 @@ def build_model_card(
         run: Folder of the training run, with its student or retriever.
         location: Folder from which the card's code loads the model.
         format: bf16, fp32, adapter, or whole for a model all of whose weights were trained.
-        measured: What `train.common.output_comparison.compare_outputs` returned; empty without a
-            comparison.
         metrics: Metrics of the run.
     """
     student = isinstance(settings, SftCommand)
@@ -121,11 +117,8 @@ def build_model_card(
         record=record,
         settings=yaml.safe_dump({product: asdict(preset), "train": asdict(train)}, sort_keys=False),
         items="items" if student else "queries",
-        best_step=metrics.get(BEST_STEP),
-        best_metric=train.best_metric,
         metrics=metrics,
         at_start=AT_START_SUFFIX,
-        measured=measured,
     )
 
 

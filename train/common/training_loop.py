@@ -1,14 +1,21 @@
-"""Run a trainer to its last step, and turn errors of the libraries into advice for the user."""
+"""Run a trainer to its last step: its checkpoints, its arguments, and advice for the user instead
+of errors of the libraries."""
 
 from __future__ import annotations
 
+import errno
+import json
 import logging
 import os
+import re
+import zipfile
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
 from tqdm.contrib.logging import logging_redirect_tqdm
 from transformers import PrinterCallback, ProgressCallback, Trainer
@@ -16,34 +23,149 @@ from transformers.trainer_callback import TrainerState
 
 from dynapix.conf.errors import UserError
 from dynapix.conf.runs import Run, rank, run_id
+from dynapix.conf.schema import TrainConfig
+from dynapix.models.compat import checkpointing_arguments
 from dynapix.models.distributed import is_sharded
 from dynapix.models.memory import explain_out_of_memory
-from dynapix.train.common.arguments import PROJECT
-from dynapix.train.common.callbacks import BestCheckpointCallback, JournalCallback, MetricsBar
-from dynapix.train.common.checkpoints import STATE, check_best_checkpoint
+from dynapix.train.common.callbacks import JournalCallback, MetricsBar
 
 log = logging.getLogger(__name__)
 
+PROJECT = "dynapix"
+"""Name of the project in experiment trackers."""
+SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
+"""The name in transformers of each value of train.schedule."""
 MESSAGE_PREFIX = f"{UserError.__module__}.{UserError.__qualname__}: "
 """The text before the message of a UserError in the traceback of another process."""
+MIN_CHECKPOINTS = 2
+"""Minimum number of checkpoints of a run, so that a killed run loses at most half of it."""
+STATE = "trainer_state.json"
+PARTS = {
+    "file of weights": (
+        "**/*.safetensors",
+        "pytorch_model_fsdp*.bin",
+        "pytorch_model_fsdp*/.metadata",
+    ),
+    "optimizer": ("optimizer.*", "optimizer_*/.metadata"),
+    "schedule": ("scheduler.pt",),
+    "random state": ("rng_state*.pth",),
+    "trainer's state": (STATE,),
+}
+"""The parts of a checkpoint. Each part has patterns of files, at least one of which must match: if,
+say, the optimizer or the random state were missing, the trainer would resume without an error, but
+not as if it had never stopped. Of the files that FSDP writes, .metadata is written last."""
+READERS = {
+    ".json": lambda path: json.loads(path.read_bytes()),
+    ".safetensors": lambda path: safe_open(path, "pt"),
+    # torch writes zip archives, whose table of contents is at the end.
+    **dict.fromkeys((".pt", ".pth", ".bin"), lambda path: zipfile.ZipFile(path).close()),
+}
+"""By suffix, a function that raises an error if a file is incomplete."""
+ACCESS_ERRNOS = (errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE)
+"""Numbers of operating system errors that say nothing about the content of a file."""
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """Return the newest complete checkpoint in a run's folder, or None.
+
+    Newer ones that a kill, a crash or a full disk left incomplete are skipped with a warning.
+    """
+    named = [(re.fullmatch(r"checkpoint-(\d+)", p.name), p) for p in folder.glob("checkpoint-*")]
+    numbered = sorted(((int(m[1]), p) for m, p in named if m), reverse=True)
+    for k, (_, path) in enumerate(numbered):
+        if (problem := find_damage(path)) is None:
+            return path
+        instead = "trying the one before" if k + 1 < len(numbered) else "training starts again"
+        log.warning("%s is incomplete (%s): %s", path, problem, instead)
+    return None
+
+
+def find_damage(checkpoint: Path) -> str | None:
+    """Return a phrase that says what is missing or incomplete in a checkpoint, or None.
+
+    The trainer writes its state last, but if the machine crashes, any file may be lost.
+    """
+    for part, patterns in PARTS.items():
+        if not any(True for pattern in patterns for _ in checkpoint.glob(pattern)):
+            return f"its {part} is missing"
+    for path in sorted(checkpoint.rglob("*")):
+        try:
+            if read := READERS.get(path.suffix):
+                read(path)
+        except (OSError, ValueError, SafetensorError, zipfile.BadZipFile) as error:
+            if isinstance(error, OSError) and error.errno in ACCESS_ERRNOS:
+                # The checkpoint may be complete; without it, the run would start again.
+                raise UserError(
+                    f"{path} cannot be read ({error}): correct this and run the same command again",
+                    code="unreadable-checkpoint",
+                ) from error
+            return f"{path.relative_to(checkpoint)} is incomplete"
+    return None
+
+
+def common_arguments(
+    train: TrainConfig, run: Run, seed: int, checkpoint: Path | None
+) -> dict[str, Any]:
+    """Return the `TrainingArguments` that students and retrievers have in common.
+
+    Args:
+        train: The settings; `precision` is bf16 or fp32, not auto.
+        checkpoint: The checkpoint that the run resumes from, or None.
+    """
+    if checkpoint is None:
+        checkpoints = max(train.evaluations, MIN_CHECKPOINTS)
+        # The trainer reads a value below 1 as a share of all steps, but 1 as every step.
+        steps = {
+            "eval_steps": min(1 / train.evaluations, 0.9999),
+            "save_steps": min(1 / checkpoints, 0.9999),
+        }
+    else:
+        # The numbers of steps that the trainer computed from the shares when the run started.
+        state = json.loads((checkpoint / STATE).read_text())
+        steps = {name: state[name] for name in ("eval_steps", "save_steps")}
+    return {
+        "output_dir": str(run.folder),
+        "seed": seed,
+        "data_seed": seed,
+        "learning_rate": train.lr,
+        "lr_scheduler_type": SCHEDULES[train.schedule],
+        "warmup_steps": train.warmup,
+        "weight_decay": train.weight_decay,
+        "adam_beta2": train.adam_beta2,
+        "max_grad_norm": train.max_grad_norm,
+        "num_train_epochs": train.epochs,
+        "max_steps": train.max_steps,
+        "bf16": train.precision == "bf16",
+        "use_cpu": not torch.cuda.is_available(),
+        **checkpointing_arguments(train.gradient_checkpointing),
+        "eval_strategy": "steps",
+        "save_strategy": "steps",
+        **steps,
+        # A resumed run already has the initial evaluation in its metrics.jsonl.
+        "eval_on_start": checkpoint is None,
+        "save_total_limit": train.keep_checkpoints,
+        "logging_steps": 1,
+        "dataloader_num_workers": train.workers,
+        "dataloader_pin_memory": torch.cuda.is_available(),
+        "remove_unused_columns": False,
+        "report_to": list(train.report_to) or "none",
+        "run_name": run.name,
+        "project": PROJECT,
+        "disable_tqdm": False,
+    }
 
 
 def run_training(
     trainer: Trainer, run: Run, checkpoint: Path | None, lower: str, shrink: str
-) -> int | None:
+) -> None:
     """Train from the start or a checkpoint, and keep the journal and the curves.
 
     Args:
         lower: What to do if memory runs out, without changing the result of the run.
         shrink: Settings that also save memory if they are lowered, but change the result.
 
-    Returns:
-        If train.best_metric is set, the step of the best checkpoint, whose weights the trainer's
-        model then has. Otherwise None, and the model has the weights of the last step.
-
     Raises:
-        UserError: memory runs out, the evaluations do not measure train.best_metric, or a worker
-            process or another rank raises a UserError.
+        UserError: memory runs out, or a worker process or another rank raises a UserError.
     """
     add_callbacks(trainer, run)
     check_fsdp(trainer, checkpoint)
@@ -54,21 +176,15 @@ def run_training(
     )
     with explain_errors("while training", advice):
         train_to_last_step(trainer, checkpoint)
-    best_step = trainer.state.best_global_step
-    if best_step:
-        measure = f"{trainer.args.metric_for_best_model} = {trainer.state.best_metric:.4g}"
-        log.info("keeping the checkpoint of step %d, the best by %s", best_step, measure)
-    return best_step
 
 
 def add_callbacks(trainer: Trainer, run: Run) -> None:
-    """Add the progress bar, the journal and the check of train.best_metric, and set up W&B."""
+    """Add the progress bar and the journal, and set up W&B."""
     trainer.remove_callback(ProgressCallback)
     trainer.remove_callback(PrinterCallback)
     trainer.add_callback(MetricsBar())
     if rank() == 0:
         trainer.add_callback(JournalCallback(run.folder))
-    trainer.add_callback(BestCheckpointCallback())
     if "wandb" in trainer.args.report_to:
         # Keep W&B's files in the run's folder; a resumed run continues the same run at W&B.
         wandb = {"DIR": run.folder, "PROJECT": PROJECT, "RUN_ID": run_id(run), "RESUME": "allow"}
@@ -78,16 +194,14 @@ def add_callbacks(trainer: Trainer, run: Run) -> None:
 
 def train_to_last_step(trainer: Trainer, checkpoint: Path | None) -> None:
     """Train from the start or from a checkpoint. If the checkpoint is that of the last step, only
-    load the final weights: those of the best checkpoint, if there is one."""
+    load its weights."""
     if checkpoint is not None:
         log.info("resuming from %s", checkpoint)
         state = TrainerState.load_from_json(str(checkpoint / STATE))
-        check_best_checkpoint(checkpoint, state.best_global_step)
         if state.global_step >= state.max_steps:
             # The trainer would train for one more step.
             trainer.state = state
-            best = state.best_global_step or state.global_step
-            load_weights(trainer, checkpoint.with_name(f"checkpoint-{best}"))
+            load_weights(trainer, checkpoint)
             return
     # Log lines are printed above the progress bar.
     with logging_redirect_tqdm():

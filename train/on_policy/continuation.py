@@ -134,8 +134,8 @@ def train_and_save(
         shrink: Settings that save memory if they are lowered, but change the result.
     """
     lower = "lower train.micro_batch or train.sampling_batch,"
-    best_step = run_training(trainer, run, checkpoint, lower, shrink)
-    metrics, folder = run_metrics(run.folder, best_step), run.folder / "student"
+    run_training(trainer, run, checkpoint, lower, shrink)
+    metrics, folder = run_metrics(run.folder), run.folder / "student"
     if rank() == 0:
         loading.save_student(trainer.model, processor, folder, trained.train.precision)
         write_run_card(run, trained, metrics)

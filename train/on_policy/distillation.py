@@ -38,11 +38,14 @@ from dynapix.train.on_policy.sampling import EncodedPrompt, ResponseSampler, enc
 from dynapix.train.on_policy.served_sampling import build_sampler
 from dynapix.train.on_policy.teachers import Teacher
 from dynapix.train.student.held_out_answers import HeldOutAnswers
-from dynapix.train.student.lazy_samples import StudentDataset
-from dynapix.train.student.length_sampler import LengthSampler
-from dynapix.train.student.metrics import LetterAccuracy
-from dynapix.train.student.trainer import StudentTrainer, TrainerCollator, token_mean
-from dynapix.train.student.trainer_setup import student_arguments
+from dynapix.train.student.samples import LengthSampler, StudentDataset
+from dynapix.train.student.trainer import (
+    LetterAccuracy,
+    StudentTrainer,
+    TrainerCollator,
+    student_arguments,
+    token_mean,
+)
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from dynapix.data.store import Store
 from dynapix.models.student.prompts import Sample
 from dynapix.train.common.held_out import check_not_empty
 from dynapix.train.student.dataset import SupervisedItem, split_items, supervised_items
-from dynapix.train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
+from dynapix.train.student.samples import LazySample, StudentDataset, seeded_rng
 
 
 @dataclass(frozen=True)

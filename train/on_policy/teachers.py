@@ -1,4 +1,5 @@
-"""Teachers of on-policy distillation: a model in this process, or a model on servers."""
+"""Teachers of on-policy distillation, a model in this process or one on servers, and how far a
+student is from them."""
 
 from __future__ import annotations
 
@@ -21,10 +22,29 @@ from dynapix.models.student.collator import IGNORED, Collator, Encoded, encode
 from dynapix.models.student.prompts import Sample
 from dynapix.models.trained_runs import product_folder, read_trained_settings
 from dynapix.teacher.servers.pool import NoResponseError, ServerPool, run_limited
-from dynapix.train.on_policy.divergence import estimate_divergence, measure_divergence
 
 PARTIAL_CHARACTER = "\N{REPLACEMENT CHARACTER}"
 """What a tokenizer decodes a token to that is a part of a character."""
+
+
+def kl_divergence(log_p: Tensor, log_q: Tensor) -> Tensor:
+    """Return the Kullback-Leibler divergence KL(p || q) (N,) of distributions (N, V), given as
+    logarithms."""
+    return (log_p.exp() * (log_p - log_q)).sum(dim=-1)
+
+
+def estimate_divergence(student: Tensor, teacher: Tensor) -> Tensor:
+    """Return estimates (N,) of the reverse Kullback-Leibler divergence KL(S || T) from one token
+    each that was sampled from S. Over the tokens of S, the means of an estimate and of its gradient
+    are the divergence and its gradient.
+
+    Args:
+        student: (N,) logarithms of the student's probabilities S of the tokens.
+        teacher: (N,) logarithms of the teacher's probabilities T of the tokens.
+    """
+    difference = (student - teacher).detach()
+    # The second term is 0. Its gradient is that of log S, weighted by the difference.
+    return difference + difference * (student - student.detach())
 
 
 class Teacher(Protocol):
@@ -50,14 +70,10 @@ class Teacher(Protocol):
 
 
 class LocalTeacher:
-    """A model in this process, whose distributions are known whole.
+    """A model in this process, whose distributions are known whole."""
 
-    Args:
-        beta: See `measure_divergence`.
-    """
-
-    def __init__(self, model: nn.Module, processor: ProcessorMixin, beta: float, bf16: bool):
-        self._model, self._beta, self._bf16 = model, beta, bf16
+    def __init__(self, model: nn.Module, processor: ProcessorMixin, bf16: bool) -> None:
+        self._model, self._bf16 = model, bf16
         # The sampled responses are limited by student.max_new_tokens already.
         self._collate = Collator(processor, None)
 
@@ -74,7 +90,7 @@ class LocalTeacher:
         # A larger model's table of tokens may be padded to another size.
         width = min(logits.shape[-1], teacher.shape[-1])
         ours, theirs = (log_softmax(x[:, :width].float(), dim=-1) for x in (logits, teacher))
-        return measure_divergence(ours, theirs, self._beta)
+        return kl_divergence(ours, theirs)
 
 
 class ServerTeacher:

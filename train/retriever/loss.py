@@ -46,7 +46,6 @@ class RankingLoss(nn.Module):
         model: The retriever.
         inputs: Loads the inputs of a mini-batch.
         widths: Embedding sizes. The loss at a width scores that many leading entries of a vector.
-        weights: Weight of the loss at each width; None weights every width by 1.
         scale: Inverse temperature of the scores.
         mini_batch: Queries or frames per mini-batch. The gradients do not depend on it.
         prefetch: Number of mini-batches that a thread loads in advance.
@@ -58,7 +57,6 @@ class RankingLoss(nn.Module):
         inputs: RetrieverInputs,
         *,
         widths: Sequence[int],
-        weights: Sequence[float] | None = None,
         scale: float,
         mini_batch: int,
         prefetch: int = 0,
@@ -67,8 +65,8 @@ class RankingLoss(nn.Module):
         # With several ranks, the trainer replaces this attribute by the model wrapped in DDP.
         self.model = model
         self._inputs = inputs
-        self._widths, self._weights = widths, weights or [1.0] * len(widths)
-        self._scale, self._mini_batch, self._prefetch = scale, mini_batch, prefetch
+        self._widths, self._scale = widths, scale
+        self._mini_batch, self._prefetch = mini_batch, prefetch
 
     def forward(
         self, columns: Sequence[Sequence[QueryOrFrame]], labels: None = None
@@ -140,10 +138,10 @@ class RankingLoss(nn.Module):
             frames = gather_object(frames)
         identical = identical_frames(frames, targets)
         loss = torch.zeros((), device=queries.device)
-        for width, weight in zip(self._widths, self._weights, strict=True):
+        for width in self._widths:
             cut = [normalize(v[..., :width], dim=-1) for v in (queries, documents)]
             scores = self._scale * maxsim(*cut, query_mask, document_mask)
-            loss += weight * cross_entropy(scores.masked_fill(identical, -torch.inf), targets)
+            loss += cross_entropy(scores.masked_fill(identical, -torch.inf), targets)
         return loss
 
     def _propagate(

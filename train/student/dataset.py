@@ -26,7 +26,7 @@ from dynapix.teacher.narrator import write_facts, write_match_lines
 from dynapix.teacher.predicates.grounding import Grounding
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary
 from dynapix.train.common.held_out import check_not_empty, held_out_scenes, shuffled
-from dynapix.train.student.lazy_samples import LazySample, StudentDataset, seeded_rng
+from dynapix.train.student.samples import LazySample, StudentDataset, seeded_rng
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from dynapix.models.student.generation import generate
 from dynapix.models.student.prompts import Sample
 from dynapix.models.student.responses import GeneratedText, response_token_limit
 from dynapix.train.common.journal import ANSWERS
-from dynapix.train.student.lazy_samples import StudentDataset
+from dynapix.train.student.samples import StudentDataset
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class HeldOutAnswers:
         self, model: nn.Module, mode: str, samples: StudentDataset, step: int
     ) -> dict[str, float]:
         """Generate answers, which the main rank writes, and return the shares of parsable and of
-        correct answers among the samples whose answer is a letter; empty if there are none.
+        correct answers.
 
         Raises:
             UserError: memory runs out.
@@ -87,18 +87,14 @@ class HeldOutAnswers:
                     "text": generated.text,
                     "letter": parsed.letter,
                     "reason": None if parsed.letter else parsed.reason and str(parsed.reason),
-                    # None if the reference response has no answer line.
                     "answer": parse_choice(sample.response).letter,
                 }
             )
         if rank() == 0:
             self._write(rows)
-        graded = [row for row in rows if row["answer"]]
-        if not graded:
-            return {}
         return {
-            "generated_parse_rate": sum(r["letter"] is not None for r in graded) / len(graded),
-            "generated_accuracy": sum(r["letter"] == r["answer"] for r in graded) / len(graded),
+            "generated_parse_rate": sum(r["letter"] is not None for r in rows) / len(rows),
+            "generated_accuracy": sum(r["letter"] == r["answer"] for r in rows) / len(rows),
         }
 
     def _write(self, rows: list[dict[str, Any]]) -> None:
@@ -106,6 +102,6 @@ class HeldOutAnswers:
             file.writelines(json.dumps(row) + "\n" for row in rows)
         # One of the answers, which depends on the step, is logged.
         row = rows[rows[0]["step"] % len(rows)]
-        answer = f"; the answer is {row['answer']}" if row["answer"] else ""
         text = indent(row["text"] or "(empty)", "    ")
-        log.info("step %d, %s%s:\n%s", row["step"], row["sample"], answer, text)
+        what = row["step"], row["sample"], row["answer"]
+        log.info("step %d, %s; the answer is %s:\n%s", *what, text)

@@ -6,6 +6,7 @@ non-finite loss or gradient stops the run before the affected weights are saved.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,23 +15,72 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
+from torch import nn
 from torch.distributed.fsdp import register_fsdp_forward_method
-from torch.nn import Module
 from torch.nn.functional import cross_entropy
 from torch.utils.data import DataLoader, Sampler
-from transformers import EvalPrediction, Trainer
+from transformers import EvalPrediction, ProcessorMixin, Trainer, TrainingArguments
 
 from dynapix.conf.errors import UserError
 from dynapix.conf.files import write_json
-from dynapix.conf.runs import rank
-from dynapix.models.student.collator import IGNORED, Collator
+from dynapix.conf.runs import Run, local_world_size, rank, world_size
+from dynapix.conf.schema import SftCommand, StudentTrainConfig
+from dynapix.models.distributed import split_batch
+from dynapix.models.layers.shared_prompts import shares_prompts
+from dynapix.models.memory import available_cpu_bytes
+from dynapix.models.student.chat_format import takes_clips
+from dynapix.models.student.collator import IGNORED, Collator, letter_ids
 from dynapix.models.student.prompts import Sample
+from dynapix.train.common.audit import audit_student
+from dynapix.train.common.callbacks import EpochCallback
+from dynapix.train.common.training_loop import common_arguments
 from dynapix.train.student.held_out_answers import HeldOutAnswers
-from dynapix.train.student.metrics import LetterAccuracy
+from dynapix.train.student.samples import LengthSampler, StudentDataset
 from dynapix.train.student.vision_cache import PAIRS, VisionCache, pair_digests
+
+log = logging.getLogger(__name__)
 
 STOPPED = "stopped.json"
 """File with the samples of a non-finite loss or gradient; ranks above 0 prefix their number."""
+
+
+class LetterAccuracy:
+    """Share of samples whose correct letter has the highest logit of all letters.
+
+    The model reads the correct response up to the letter. In reasoning mode, this includes the
+    teacher's rationale, so the accuracy measures whether the student draws the conclusion from it.
+
+    Args:
+        letters: Token ids of the letters, from `letter_ids`.
+    """
+
+    def __init__(self, letters: list[int]) -> None:
+        self._letters = torch.tensor(letters)
+
+    def reduce(self, logits: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        """Return (B, 2): the index of the chosen letter and that of the correct letter.
+
+        The letter is the second-to-last supervised token; the last ends the turn.
+        """
+        letters = self._letters.to(logits.device)
+        positions = torch.arange(labels.shape[1], device=labels.device)
+        # With several ranks, the trainer pads batches on the right, to the width of the widest.
+        letter = torch.where(labels != IGNORED, positions, 0).amax(dim=1) - 1
+        rows = torch.arange(len(labels), device=labels.device)
+        chosen = logits[rows, letter - 1][:, letters].argmax(dim=-1)
+        right = (labels[rows, letter, None] == letters).int().argmax(dim=-1)
+        return torch.stack([chosen, right], dim=-1)
+
+    @staticmethod
+    def measure(prediction: EvalPrediction, samples: StudentDataset) -> dict[str, float]:
+        """Return the accuracy over all samples and by family."""
+        right = prediction.predictions[:, 0] == prediction.predictions[:, 1]
+        families = np.asarray(samples.families)
+        by_family = {
+            f"letter_accuracy_{family}": float(right[families == family].mean())
+            for family in sorted(set(samples.families))
+        }
+        return {"letter_accuracy": float(right.mean()), **by_family}
 
 
 def token_mean(
@@ -167,7 +217,11 @@ class StudentTrainer(Trainer):
         return output
 
     def compute_loss(
-        self, model: Module, inputs: dict[str, Any], return_outputs: bool = False, **settings: Any
+        self,
+        model: nn.Module,
+        inputs: dict[str, Any],
+        return_outputs: bool = False,
+        **settings: Any,
     ) -> Any:
         """Raise UserError for a non-finite loss, after the ids of its samples are written."""
         ids = inputs.pop("sample_ids")
@@ -199,3 +253,93 @@ class StudentTrainer(Trainer):
             "this step are kept",
             code=f"non-finite-{what}",
         )
+
+
+def prefetch_factor(workers: int, accumulation: int) -> int | None:
+    """Return the number of batches that each worker prepares in advance; None without workers.
+
+    The trainer requests all micro-batches of an optimizer step at once. Together, the workers
+    prepare at least as many in advance, so that they are ready when the previous step ends.
+    """
+    return max(2, math.ceil(accumulation / workers)) if workers else None
+
+
+def student_arguments(
+    train: StudentTrainConfig, run: Run, seed: int, checkpoint: Path | None, all_weights: bool
+) -> TrainingArguments:
+    """Return the arguments of a student's trainer.
+
+    Args:
+        train: The settings; `precision` is bf16 or fp32, not auto.
+        checkpoint: The checkpoint that the run resumes from, or None.
+        all_weights: Whether all weights are trained, not only adapters.
+    """
+    accumulation = split_batch(train.batch, train.micro_batch)
+    return TrainingArguments(
+        **common_arguments(train, run, seed, checkpoint),
+        per_device_train_batch_size=train.micro_batch,
+        gradient_accumulation_steps=accumulation,
+        per_device_eval_batch_size=train.micro_batch,
+        dataloader_prefetch_factor=prefetch_factor(train.workers, accumulation),
+        label_names=["labels"],
+        # Every pass uses all adapters. If all weights are trained, prompts without images leave
+        # those of the vision tower unused.
+        ddp_find_unused_parameters=all_weights,
+    )
+
+
+def build_trainer(
+    cfg: SftCommand,
+    run: Run,
+    model: nn.Module,
+    processor: ProcessorMixin,
+    training: StudentDataset,
+    validation: dict[str, StudentDataset],
+    checkpoint: Path | None,
+) -> StudentTrainer:
+    """Audit the model and the longest sample, and return a trainer.
+
+    Args:
+        cfg: Settings whose train.precision is bf16 or fp32, not auto.
+        checkpoint: The checkpoint that the run resumes from, or None.
+
+    Raises:
+        UserError: the model does not fit its preset, the longest sample is too long, or
+            train.reuse_features is set and the vision tower is trained or sharded.
+    """
+    train, student = cfg.train, cfg.student
+    collator = Collator(processor, student.max_length)
+    lengths = training.lengths(processor, student.image_size)
+    longest = training[lengths.index(max(lengths))]
+    log.info(audit_student(model, processor, student, longest, collator))
+    sampler = LengthSampler(
+        lengths,
+        training.item_ids,
+        train.batch,
+        cfg.seed,
+        train.micro_batch,
+        world_size(),
+        pairs=train.micro_batch > 1 and shares_prompts(model),
+    )
+    cache = answers = None
+    if train.reuse_features and not takes_clips(processor):
+        log.info("train.reuse_features has no effect: only features of Qwen models are reused")
+    elif train.reuse_features:
+        # The ranks of this machine together cache up to half of its free memory.
+        limit = available_cpu_bytes() // 2 // local_world_size()
+        cache = VisionCache(model, train.precision, limit)
+    if train.generated_items:
+        answers = HeldOutAnswers(train, student, processor, run.folder)
+    return StudentTrainer(
+        model=model,
+        args=student_arguments(train, run, cfg.seed, checkpoint, not student.lora.rank),
+        data_collator=TrainerCollator(collator, digests=cache is not None),
+        train_dataset=training,
+        eval_dataset=validation,
+        compute_loss_func=LOSSES[train.weighting],
+        callbacks=[EpochCallback(training, sampler)],
+        sampler=sampler,
+        accuracy=LetterAccuracy(letter_ids(processor)),
+        answers=answers,
+        vision_cache=cache,
+    )

@@ -1,9 +1,10 @@
-"""Train the runs that a JSON file lists, one after another, as a rank of `accelerate launch`."""
+"""Train the runs that a file lists, one after another, as a rank of `accelerate launch`."""
 
 from __future__ import annotations
 
-import json
+import logging
 import os
+import pickle
 import shutil
 import sys
 from pathlib import Path
@@ -11,15 +12,16 @@ from typing import Any
 
 from accelerate.state import AcceleratorState, PartialState
 from accelerate.utils import DistributedType
-from hydra.core.config_store import ConfigStore
 
+from dynapix.conf import entry
 from dynapix.conf.errors import UserError
-from dynapix.conf.runs import rank
+from dynapix.conf.failures import report_failures
+from dynapix.conf.runs import Run, rank
+from dynapix.conf.schema import SftCommand
 from dynapix.train import contrastive, sft
 from dynapix.train.student import dataset
 from dynapix.train.student.trainer import LOSSES
 
-TRAINERS = {"sft": sft.main, "contrastive": contrastive.main}
 VALIDATION_ITEMS = 3
 """Number of validation items in the settings of the tests; there are more training items."""
 build = dataset.supervised_items
@@ -53,19 +55,22 @@ def fail(*_: Any, **__: Any) -> None:
 
 
 def main() -> None:
-    plan = json.loads(Path(sys.argv[1]).read_text())
-    ConfigStore.instance().store(group="benchmark", name="micro", node=plan["benchmark"])
+    logging.basicConfig(level=logging.INFO)
     enable_fsdp_on_cpus()
     dataset.supervised_items = five_samples
-    for run in plan["runs"]:
+    for run in pickle.loads(Path(sys.argv[1]).read_bytes()):
         # accelerate launch sets this with --use_fsdp.
         os.environ["ACCELERATE_USE_FSDP"] = str(run["fsdp"]).lower()
+        folder, settings = run["folder"], run["settings"]
+        folder.mkdir(parents=True, exist_ok=True)
         if rank() == 0 and run["checkpoint"]:
-            shutil.copytree(run["checkpoint"], Path(run["folder"]) / Path(run["checkpoint"]).name)
+            shutil.copytree(run["checkpoint"], folder / run["checkpoint"].name)
         if rank() == run["failing_rank"]:
             LOSSES["token"] = fail
-        sys.argv[1:] = run["overrides"]
-        TRAINERS[run["trainer"]]()
+        trainer = sft if isinstance(settings, SftCommand) else contrastive
+        with report_failures(str(folder)):
+            start = trainer.main.__wrapped__
+            entry._run(trainer.__name__, start, settings, Run(folder.name, folder))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What is measured while a student is trained, where it is recorded, and the best checkpoint."""
+"""What is measured while a student is trained, and where it is recorded."""
 
 from __future__ import annotations
 
@@ -30,25 +30,17 @@ from dynapix.train import sft
 from dynapix.train.common.callbacks import MetricsBar
 from dynapix.train.common.journal import read_journal, read_lines
 from dynapix.train.student.held_out_answers import HeldOutAnswers
-from dynapix.train.student.lazy_samples import LazySample, StudentDataset
+from dynapix.train.student.samples import LazySample, StudentDataset
 from tests.user_errors import raises_user_error
 
 
 @pytest.fixture(scope="module")
 def settings(few_steps) -> SftCommand:
-    return few_steps(
-        validation_items=4,
-        generated_items=2,
-        keep_checkpoints=1,
-        best_metric="eval_answer_generated_parse_rate",
-        report_to=["tensorboard"],
-    )
+    return few_steps(validation_items=4, generated_items=2, report_to=["tensorboard"])
 
 
 @pytest.fixture(scope="module")
 def trained(settings, tmp_path_factory) -> tuple[Path, dict[str, float]]:
-    """A run whose best checkpoint is the first: its best_metric, the share of answers that can be
-    parsed, is 0 at every step."""
     folder = tmp_path_factory.mktemp("trained")
     return folder, sft.main.__wrapped__(settings, Run("trained", folder))
 
@@ -59,24 +51,11 @@ def equal_adapters(one: Path, two: Path) -> bool:
 
 
 @pytest.mark.slow
-def test_the_best_checkpoint_becomes_the_student(trained) -> None:
-    folder, results = trained
-    assert sorted(p.name for p in folder.glob("checkpoint-*")) == ["checkpoint-2"]
-    assert equal_adapters(folder / "student", folder / "checkpoint-2")
-    assert results["best_step"] == 2
-    at_best = [r for r in read_journal(folder) if r["step"] == 2]
-    for mode in ("reasoning", "answer"):
-        (loss,) = [r[key] for r in at_best if (key := f"eval_{mode}_loss") in r]
-        assert results[f"{mode}_loss"] == loss
-        assert results[f"{mode}_generated_parse_rate"] == 0
-
-
-@pytest.mark.slow
 def test_generated_answers_equal_those_of_evaluation_select(
     trained, settings, micro_store, frames, tmp_path
 ) -> None:
     folder, _ = trained
-    rows = [r for r in read_lines(folder / "samples.jsonl") if r["step"] == 2]
+    rows = [r for r in read_lines(folder / "samples.jsonl") if r["step"] == 4]
     cfg = SelectCommand(batch=2, student=settings.student)
     student = LocalModel(cfg, folder, settings.student, "fp32")
     compat.keep_differentiable(student.loaded[0])
@@ -98,15 +77,15 @@ def test_generated_answers_equal_those_of_evaluation_select(
 @pytest.mark.slow
 def test_generating_answers_and_resuming_do_not_change_a_run(trained, settings, tmp_path) -> None:
     folder, results = trained
-    changes = {"generated_items": 0, "best_metric": None, "report_to": [], "keep_checkpoints": 2}
-    plain = replace(settings, train=replace(settings.train, **changes))
+    losses = [r["eval_answer_loss"] for r in read_journal(folder) if "eval_answer_loss" in r]
+    assert (results["answer_loss_at_start"], results["answer_loss"]) == (losses[0], losses[-1])
+    plain = replace(settings, train=replace(settings.train, generated_items=0, report_to=[]))
     unmeasured = tmp_path / "unmeasured"
     unmeasured.mkdir()
     sft.main.__wrapped__(plain, Run("unmeasured", unmeasured))
     common = [{k: v for k, v in r.items() if "_generated_" not in k} for r in read_journal(folder)]
     assert read_journal(unmeasured) == common
-    assert equal_adapters(folder / "checkpoint-2", unmeasured / "checkpoint-2")
-    assert not equal_adapters(unmeasured / "student", unmeasured / "checkpoint-2")
+    assert equal_adapters(folder / "student", unmeasured / "student")
     assert not (unmeasured / "samples.jsonl").exists()
 
     # The first time, the run resumes from a checkpoint that is older than the last lines of its
@@ -134,15 +113,6 @@ def test_trackers_receive_every_measure(trained) -> None:
                 scalars = tracked.Scalars(f"eval/{key.removeprefix('eval_')}")
                 (found,) = [s.value for s in scalars if s.step == record["step"]]
                 assert found == pytest.approx(value, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_an_unknown_best_metric_is_refused(settings, tmp_path) -> None:
-    train = replace(settings.train, best_metric="letter_accuracy", report_to=[], generated_items=0)
-    with raises_user_error("unknown-option", contains="eval_answer_letter_accuracy"):
-        sft.main.__wrapped__(replace(settings, train=train), Run("run", tmp_path))
-    assert not list(tmp_path.glob("checkpoint-*"))
-    assert not any("loss" in r for r in read_journal(tmp_path))
 
 
 class Writer(nn.Module):
@@ -183,10 +153,6 @@ def test_shares_of_parsed_and_correct_answers(few_steps, processor, tmp_path) ->
     assert [r["letter"] for r in rows] == ["A", "C", None, "D"]
     assert [r["answer"] for r in rows] == ["A", "B", "C", "D"]
     assert {(r["step"], r["mode"]) for r in rows} == {(7, "answer")}
-
-    # Responses without a letter are not measured.
-    samples = held_out(["The cube is near the centre."] * 4)
-    assert answers.measure(Writer(processor, texts), "frame", samples, step=8) == {}
 
 
 def test_the_progress_bar_shows_the_latest_measures() -> None:

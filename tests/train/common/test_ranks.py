@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 import subprocess
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,11 +28,10 @@ from dynapix.models.student.collator import IGNORED, Collator
 from dynapix.models.student.prompts import selection_sample
 from dynapix.train import contrastive, sft
 from dynapix.train.common import journal
-from dynapix.train.common.checkpoints import find_damage
 from dynapix.train.common.journal import read_journal
+from dynapix.train.common.training_loop import find_damage
 from dynapix.train.student import dataset
-from dynapix.train.student.lazy_samples import LazySample, StudentDataset
-from dynapix.train.student.length_sampler import LengthSampler
+from dynapix.train.student.samples import LazySample, LengthSampler, StudentDataset
 from dynapix.train.student.trainer import token_losses, token_mean
 from tests.children import run_child
 from tests.train.common import launched
@@ -61,60 +61,15 @@ def train_alone(settings: SftCommand, folder: Path, checkpoint: Path | None = No
     return folder
 
 
-def overrides(settings: SftCommand | ContrastiveCommand, folder: Path) -> list[str]:
-    """Return the overrides that the command lines of both trainers have in common."""
-    train = {k: v for k, v in asdict(settings.train).items() if k != "report_to"}
-    return [
-        "benchmark=micro", f"store={settings.store}", f"run={folder.name}",
-        f"checkpoints={folder.parents[1]}", "workers=1",
-        *(f"train.{k}={'null' if v is None else v}" for k, v in train.items()),
-    ]  # fmt: skip
-
-
-def plan_student(settings: SftCommand, folder: Path, **changes: Any) -> dict[str, Any]:
-    """Describe the run of a student for launched.py."""
-    student = settings.student
-    keys = (
-        "name", "model", "quantization", "image_size", "frames", "max_length", "max_new_tokens",
-    )  # fmt: skip
-    command = [
-        "+exp=cot",
-        *overrides(settings, folder),
-        *(f"student.{key}={getattr(student, key)}" for key in keys),
-        f"student.lora.rank={student.lora.rank}",
-        f"student.lora.alpha={student.lora.alpha}",
-    ]
-    plan = {"trainer": "sft", "fsdp": False, "checkpoint": None, "failing_rank": None}
-    return {**plan, "overrides": command, "folder": folder, **changes}
-
-
-def plan_retriever(settings: ContrastiveCommand, folder: Path) -> dict[str, Any]:
-    """Describe the run of a retriever for launched.py."""
-    retriever = settings.retriever
-    late, sizes = retriever.late, retriever.architecture
-    model = (
-        [f"retriever.architecture.{key}={value}" for key, value in asdict(sizes).items()]
-        if sizes
-        else [
-            f"retriever.model={retriever.model}",
-            "retriever.architecture=null",
-            f"retriever.lora.rank={retriever.lora.rank}",
-        ]
-    )
-    command = [
-        *(["+exp=late_interaction", f"retriever.late.width={late.width}"] if late else []),
-        "retriever=tiny_scratch",
-        *model,
-        *overrides(settings, folder),
-        f"retriever.image_size={retriever.image_size}",
-        f"retriever.frames={retriever.frames}",
-        f"retriever.max_length={retriever.max_length}",
-        f"retriever.widths={retriever.widths}",
-        f'retriever.query_instruction="{retriever.query_instruction}"',
-        f'retriever.frame_instruction="{retriever.frame_instruction}"',
-    ]
-    plan = {"trainer": "contrastive", "fsdp": False, "checkpoint": None, "failing_rank": None}
-    return {**plan, "overrides": command, "folder": folder}
+def plan(
+    settings: SftCommand | ContrastiveCommand,
+    folder: Path,
+    fsdp: bool = False,
+    checkpoint: Path | None = None,
+    failing_rank: int | None = None,
+) -> dict[str, Any]:
+    """Describe a run for launched.py."""
+    return locals()
 
 
 def launch(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -175,8 +130,7 @@ def test_two_ranks_train_what_one_trains(
     one = train_alone(settings, runs / "one")
     # Unlike 4-bit weights, those of an unquantised base are sharded too.
     unquantised = replace(settings.student, quantization="none")
-    best = replace(settings.train, best_metric="eval_answer_loss")
-    plain = replace(settings, student=unquantised, train=best)
+    plain = replace(settings, student=unquantised)
     train_alone(plain, runs / "plain")
     train = contrastive_settings.train
     many = replace(contrastive_settings.retriever, late=LateConfig(width=24))
@@ -191,25 +145,17 @@ def test_two_ranks_train_what_one_trains(
         contrastive.main.__wrapped__(retriever_settings, Run(name, folder))
     sharded = runs / "sharded"
     planned = [
-        plan_student(settings, runs / "two"),
-        plan_student(settings, runs / "resumed", checkpoint=one / "checkpoint-2"),
-        plan_student(settings, sharded, fsdp=True),
-        plan_student(
-            settings, runs / "sharded-resumed", fsdp=True, checkpoint=sharded / "checkpoint-2"
-        ),
-        plan_student(
-            settings, runs / "sharded-ended", fsdp=True, checkpoint=sharded / "checkpoint-4"
-        ),
-        *(
-            plan_retriever(cfg, tmp_path / "contrastive" / f"{name}-two")
-            for name, cfg in retrievers.items()
-        ),
-        plan_student(plain, runs / "plain-sharded", fsdp=True),
-        plan_student(settings, runs / "failing", failing_rank=1),
+        plan(settings, runs / "two"),
+        plan(settings, runs / "resumed", checkpoint=one / "checkpoint-2"),
+        plan(settings, sharded, fsdp=True),
+        plan(settings, runs / "sharded-resumed", fsdp=True, checkpoint=sharded / "checkpoint-2"),
+        plan(settings, runs / "sharded-ended", fsdp=True, checkpoint=sharded / "checkpoint-4"),
+        *(plan(cfg, tmp_path / "contrastive" / f"{name}-two") for name, cfg in retrievers.items()),
+        plan(plain, runs / "plain-sharded", fsdp=True),
+        plan(settings, runs / "failing", failing_rank=1),
     ]
-    file = tmp_path / "runs.json"
-    benchmark = asdict(settings.benchmark)
-    file.write_text(json.dumps({"benchmark": benchmark, "runs": planned}, default=str))
+    file = tmp_path / "runs.pkl"
+    file.write_bytes(pickle.dumps(planned))
     ended = launch(*SHARDED, launched.__file__, file)
     assert error_lines(ended) == ["error: a failure of this rank  [test-failure]"], ended.stderr
     assert ended.returncode == 1
@@ -238,7 +184,9 @@ def test_two_ranks_train_what_one_trains(
     assert find_damage(last) is None
     record = json.loads((runs / "two" / "run.json").read_text())
     assert (record["ranks"], record["earlier_starts"]) == (2, [])
-    assert (runs / "two" / "run.log").read_text().count("loading student") == 1
+    # Only the main rank logs.
+    starts = [p for p in planned if isinstance(p["settings"], SftCommand)]
+    assert ended.stderr.count("loading student ") == len(starts)
     assert json.loads((runs / "two" / "metrics.json").read_text()) == pytest.approx(
         journal.run_metrics(one), rel=1e-5
     )

@@ -16,11 +16,10 @@ from dynapix.conf import gpus
 from dynapix.conf.entry import Run
 from dynapix.conf.failures import report_failures
 from dynapix.conf.schema import SftCommand
-from dynapix.data.records import SelectionItem
 from dynapix.data.store import Store
 from dynapix.train import sft
 from dynapix.train.common.held_out import HELD_OUT_SHARE, held_out_scenes
-from dynapix.train.student.dataset import load_datasets, uses_only
+from dynapix.train.student.dataset import split_items, uses_only
 from dynapix.train.student.trainer import LOSSES, token_mean
 from tests.user_errors import raises_user_error
 
@@ -72,37 +71,20 @@ def test_too_little_memory_names_the_settings_to_lower(settings, tmp_path, monke
         sft.main.__wrapped__(settings, Run("run", tmp_path))
 
 
-class OneMore:
-    """A store with one more training item."""
-
-    def __init__(self, store: Store, item: SelectionItem) -> None:
-        self.store, self.item = store, item
-
-    def training_items(self) -> list[SelectionItem]:
-        return [*self.store.training_items(), self.item]
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.store, name)
-
-
-def test_no_training_item_shows_a_held_out_scene(settings, micro_store) -> None:
+def test_no_training_item_shows_a_held_out_scene(micro_store, monkeypatch) -> None:
     held_out = held_out_scenes(micro_store)
     others = set(micro_store.scene_ids("train")) - held_out
-    item = next(i for i in micro_store.selection("train") if uses_only(i, others))
+    items = micro_store.training_items()
+    item = next(i for i in items if uses_only(i, others))
     candidates = list(item.candidates)
     distractor = replace(candidates[item.answer - 1], scene_id=next(iter(held_out)))
     candidates[item.answer - 1] = distractor
     crossed = replace(item, item_id="crossed", candidates=tuple(candidates))
-    settings = replace(settings, train=replace(settings.train, regime="answer_only"))
-    plain, with_crossed, with_copy = (
-        load_datasets(settings, store, [])[0]
-        for store in (
-            micro_store,
-            OneMore(micro_store, crossed),
-            OneMore(micro_store, replace(item, item_id="copy")),
-        )
-    )
-    assert len(plain) == len(with_crossed) < len(with_copy)
+    counts = []
+    for more in ([], [crossed], [replace(item, item_id="copy")]):
+        monkeypatch.setattr(Store, "training_items", lambda _, more=more: [*items, *more])
+        counts.append(len(split_items(micro_store, 4, seed=0)[0]))
+    assert counts == [counts[0], counts[0], counts[0] + 1]
 
 
 class Names:

@@ -13,7 +13,7 @@ from dynapix.models.student.collator import Collator
 from dynapix.models.student.prompts import selection_sample
 from dynapix.train import sft
 from dynapix.train.common.training_loop import user_message
-from dynapix.train.student.trainer_setup import prefetch_factor
+from dynapix.train.student.trainer import prefetch_factor
 from tests.user_errors import raises_user_error
 
 
@@ -44,7 +44,7 @@ def test_the_error_of_a_worker_is_reported_without_its_traceback(
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_sample_that_is_too_long_ends_the_run(few_steps, tmp_path, monkeypatch, workers) -> None:
     """The audit may miss the longest sample, because lengths are estimated."""
-    monkeypatch.setattr("dynapix.train.student.trainer_setup.audit_student", lambda *_: "")
+    monkeypatch.setattr("dynapix.train.student.trainer.audit_student", lambda *_: "")
     settings = few_steps(regime="answer_only", workers=workers)
     settings = replace(settings, student=replace(settings.student, max_length=150))
     # The error of a worker process loses its code.

@@ -95,16 +95,19 @@ def test_unusable_queries_are_refused(
     assert_refused(settings, tmp_path / "run", name, code=code)
 
 
-def test_a_batch_larger_than_the_training_set_is_refused(contrastive_settings, tmp_path) -> None:
-    train = replace(contrastive_settings.train, batch=4096)
-    settings = replace(contrastive_settings, train=train)
-    assert_refused(settings, tmp_path / "run", "train.batch=4096", code="batch-too-large")
-
-
-def test_a_width_beyond_the_embedding_is_refused(contrastive_settings, tmp_path) -> None:
-    wide = replace(contrastive_settings.retriever, widths=[4096, 64, 32])
-    settings = replace(contrastive_settings, retriever=wide)
-    assert_refused(settings, tmp_path / "run", "4096", "retriever.widths=[64,32]")
+@pytest.mark.parametrize(
+    ("group", "changes", "parts"),
+    [
+        ("train", {"batch": 4096}, ["train.batch=4096"]),
+        ("retriever", {"widths": [4096, 64, 32]}, ["4096", "retriever.widths=[64,32]"]),
+    ],
+)
+def test_settings_that_exceed_the_data_or_the_model_are_refused(
+    contrastive_settings, tmp_path, group, changes, parts
+) -> None:
+    changed = replace(getattr(contrastive_settings, group), **changes)
+    settings = replace(contrastive_settings, **{group: changed})
+    assert_refused(settings, tmp_path / "run", *parts)
 
 
 def test_contradictory_batch_settings_are_refused(contrastive_settings) -> None:
@@ -173,23 +176,21 @@ def test_a_cached_hub_model_keeps_its_modules_and_names_its_commit(
     check_parameter_counts(count_parameters(loaded), "small", "none", 4)
 
 
-def test_the_processor_of_another_model_is_refused(
-    contrastive_settings, saved_base, tmp_path
+@pytest.mark.parametrize(
+    "files",
+    [
+        ["processor_config.json", "tokenizer.json", "tokenizer_config.json"],
+        ["model.safetensors"],
+    ],
+    ids=["processor", "weights"],
+)
+def test_files_of_another_model_are_refused(
+    contrastive_settings, saved_base, tmp_path, files
 ) -> None:
     other = tmp_path / "other"
     save_family("qwen2_5_vl", [], other)
-    for file in ("processor_config.json", "tokenizer.json", "tokenizer_config.json"):
+    for file in files:
         shutil.copy(Path(saved_base) / file, other)
-    settings = train_adapters_over(contrastive_settings, other)
-    assert_refused(settings, tmp_path / "run", str(other), code="other-processor")
-
-
-def test_the_weights_of_another_model_are_refused(
-    contrastive_settings, saved_base, tmp_path
-) -> None:
-    other = tmp_path / "other"
-    save_family("qwen2_5_vl", [], other)
-    shutil.copy(Path(saved_base) / "model.safetensors", other)
     settings = train_adapters_over(contrastive_settings, other)
     assert_refused(settings, tmp_path / "run", str(other))
 

@@ -30,7 +30,6 @@ from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 
 NEGATIVES = 2
-WEIGHTS = [1.0, 0.5]
 LATE = LateConfig(width=24)
 Gradients = tuple[float, dict[str, torch.Tensor]]
 
@@ -89,10 +88,9 @@ def scale(cfg: RetrieverConfig) -> float:
 
 
 def ranking_loss(model, inputs: RetrieverInputs, cfg: RetrieverConfig, **options) -> RankingLoss:
-    widths = (
-        {"widths": [cfg.late.width]} if cfg.late else {"widths": cfg.widths, "weights": WEIGHTS}
-    )
-    return RankingLoss(model, inputs, **widths, **{"scale": scale(cfg), "mini_batch": 3, **options})
+    widths = [cfg.late.width] if cfg.late else cfg.widths
+    options = {"scale": scale(cfg), "mini_batch": 3, **options}
+    return RankingLoss(model, inputs, widths=widths, **options)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +106,7 @@ def library(trained, distinct, frames) -> Gradients:
         loss = CachedMultiVectorMultipleNegativesRankingLoss(model, **options)
     else:
         ranking = CachedMultipleNegativesRankingLoss(model, **options)
-        loss = MatryoshkaLoss(model, ranking, cfg.widths, WEIGHTS)
+        loss = MatryoshkaLoss(model, ranking, cfg.widths)
     return gradients(model, loss, features)
 
 
@@ -183,15 +181,15 @@ def test_the_loss_equals_its_formula_with_identical_frames_masked(
                 masked[row, column] = -math.inf
     assert masked.isinf().any()
     expected = 0.0
-    for width, weight in zip(cfg.widths, WEIGHTS, strict=True):
+    for width in [cfg.late.width] if cfg.late else cfg.widths:
         if cfg.late:
-            scores, weight = maxsim(vectors, document_vectors), 1 / len(cfg.widths)
+            scores = maxsim(vectors, document_vectors)
         else:
             rows, columns = (
                 normalize(side[:, :width], dim=1) for side in (vectors, document_vectors)
             )
             scores = rows @ columns.T
-        expected += weight * cross_entropy(scores * scale(cfg) + masked, target).item()
+        expected += cross_entropy(scores * scale(cfg) + masked, target).item()
     model.train()
     assert value == pytest.approx(expected, rel=1e-4)
 

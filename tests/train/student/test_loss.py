@@ -15,10 +15,8 @@ from dynapix.models import loading
 from dynapix.models.layers.attention import BY_FRAME
 from dynapix.models.student.collator import IGNORED, Collator, Encoded, encode, letter_ids, pad
 from dynapix.models.student.prompts import Sample, selection_sample
-from dynapix.train.student.lazy_samples import LazySample, StudentDataset
-from dynapix.train.student.length_sampler import LengthSampler
-from dynapix.train.student.metrics import LetterAccuracy
-from dynapix.train.student.trainer import sample_mean, token_mean
+from dynapix.train.student.samples import LazySample, LengthSampler, StudentDataset
+from dynapix.train.student.trainer import LetterAccuracy, sample_mean, token_mean
 from tests.tiny_models import randomize_adapters
 from tests.user_errors import raises_user_error
 
@@ -116,26 +114,6 @@ def test_a_sample_over_the_limit_is_refused(samples, processor) -> None:
     encode(samples[1], processor, length)
     with raises_user_error("sample-too-long", contains=(str(length), "student.max_length")):
         encode(samples[1], processor, length - 1)
-
-
-def test_lengths_are_estimated_without_rendering(
-    micro_store, frames, student_cfg, processor
-) -> None:
-    def refuse(epoch: int) -> Sample:
-        raise AssertionError("a sample was rendered")
-
-    items = micro_store.selection("train")[:4]
-    texts = ["near the top " * words + "\nAnswer: A" for words in (3, 9, 27, 1)]
-    samples = StudentDataset([LazySample(text, 10, text, refuse) for text in texts])
-    estimated = samples.lengths(processor, 96)
-    real = [
-        len(encode(sample, processor, 1500).input_ids)
-        for sample in (
-            selection_sample(i, "answer", "cot", frames, student_cfg.frames, t)
-            for i, t in zip(items, texts, strict=True)
-        )
-    ]
-    assert np.argsort(estimated).tolist() == np.argsort(real).tolist()
 
 
 def test_the_letter_with_the_highest_logit_is_chosen(

@@ -27,7 +27,7 @@ from dynapix.train.student.dataset import (
     supervised_items,
     tokenizer_corpus,
 )
-from dynapix.train.student.lazy_samples import StudentDataset
+from dynapix.train.student.samples import StudentDataset
 
 TEACHER = TeacherConfig(name="template")
 COT = [r for r in REGIMES if r != "answer_only"]
@@ -147,7 +147,8 @@ def test_estimated_lengths_differ_as_the_numbers_of_tokens(
     supervised = by_mode["reasoning"][:3] + by_mode["answer"][:3]
     samples = [s.lazy_sample(frames, count) for count in (4, 5, 12) for s in supervised]
     data = StudentDataset(samples)
-    estimates = np.array(data.lengths(processor, student_cfg.image_size))
+    unrendered = StudentDataset([replace(sample, render=None) for sample in samples])
+    estimates = np.array(unrendered.lengths(processor, student_cfg.image_size))
     size = student_cfg.max_length
     tokens = np.array([len(encode(sample, processor, size).input_ids) for sample in data])
     assert np.ptp(tokens) > 200

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.linalg import qr, svdvals
 
-from dynapix.train.common.muon import Muon, orthogonalize
+from research.tiny_base.muon import Muon, orthogonalize
 
 
 @pytest.mark.parametrize("shape", [(12, 12), (8, 30), (30, 8)])
