@@ -123,7 +123,7 @@ def test_build_resumed_at_other_settings_equals_a_fresh_one_or_is_refused(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"data.build.{stage}", stop)
+        patch.setattr(f"dynapix.data.build.{stage}", stop)
         with pytest.raises(KeyboardInterrupt):
             build(small(**killed), tmp_path / "small", Workers(1))
     if killed == KILLED["counterfactual scenes"]:

@@ -61,7 +61,7 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> tuple[Store, list[np.ndar
         return kept
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("data.items.cells.choose_items", record)
+        patch.setattr("dynapix.data.items.cells.choose_items", record)
         store = ensure_items(settings("balanced"), tmp_path_factory.mktemp("store"), Workers(1))
     return store, pools
 
@@ -208,7 +208,7 @@ def test_build_with_other_quotas_after_a_kill_leaves_no_alternatives_behind(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("data.build.make_databases", stop)
+        patch.setattr("dynapix.data.build.make_databases", stop)
         with pytest.raises(KeyboardInterrupt):
             ensure_items(settings("killed"), tmp_path, Workers(1))
     fewer = settings("killed")

@@ -256,7 +256,7 @@ def test_killed_build_resumes_to_the_same_bytes(
         return made[0]
 
     with monkeypatch.context() as patch:
-        patch.setattr("data.items.cells.fill_quota", fill_first_cell)
+        patch.setattr("dynapix.data.items.cells.fill_quota", fill_first_cell)
         with pytest.raises(KeyboardInterrupt):
             ensure_items(settings("contact"), tmp_path, Workers(1))
     assert [*tmp_path.glob(".*.partial/parts/*.json")]

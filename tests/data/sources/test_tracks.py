@@ -265,7 +265,7 @@ def test_build_resumed_after_files_changed_equals_a_fresh_one(
 ) -> None:
     folder = shutil.copytree(videos, tmp_path / "videos")
     with monkeypatch.context() as patch:
-        patch.setattr("data.build.make_databases", interrupt)
+        patch.setattr("dynapix.data.build.make_databases", interrupt)
         with pytest.raises(KeyboardInterrupt):
             build(config(folder), tmp_path / "resumed", Workers(1))
     path = folder / changed
