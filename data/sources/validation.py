@@ -40,10 +40,6 @@ AGREEMENT, MAX_DEVIATION = 0.1, 0.25
 an object's velocities up to which a factor explains the difference."""
 
 
-COPY = re.compile(r"(?: - Copy| copy(?: \d+)?| \(\d+\))+(?=(?:\.\w+)?$)")
-"""What file managers append to the name of a copy."""
-
-
 class RecordError(UserError):
     """A scene's record in a release that does not have the published layout or cannot be read. The
     message states the file, what it contains and what was expected."""
@@ -122,27 +118,15 @@ def check_unique_scenes(
         )
     if not paths:
         raise UserError(f"{folder} contains no scene: expected {contents}", code="empty-release")
-    listed, first = {*paths}, {}
+    first: dict[str, Path] = {}
     for path in paths:
-        original = Path(*(COPY.sub("", part) for part in path.parts))
-        others = [first.setdefault(key, path) for key in (id_of(path), path.resolve())]
-        others += [original] if original in listed and _may_be_copy(path, original) else []
-        if other := next((other for other in others if other != path), None):
+        if (other := first.setdefault(id_of(path), path)) != path:
             raise UserError(
                 f"{folder} contains scene {id_of(path)} twice, as {other} and as {path}: "
                 "choose a folder that contains each scene once",
                 code="duplicate-scene",
             )
     return paths
-
-
-def _may_be_copy(copy: Path, original: Path) -> bool:
-    """Return whether a scene named as a copy may be one. Parts of a file, such as the clips of a
-    video, are copies only if the files have the same size: videos are often numbered."""
-    if copy.exists():
-        return True
-    files = (next(p for p in each.parents if p.exists()) for each in (copy, original))
-    return len({file.stat().st_size for file in files}) == 1
 
 
 def check_unique_objects(where: str, ids: Sequence[int]) -> None:

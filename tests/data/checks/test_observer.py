@@ -99,19 +99,6 @@ def test_the_error_of_observers_is_recovered_from_their_answers(store, items, re
     assert np.median(found) == pytest.approx(6, rel=0.2)
 
 
-@pytest.mark.parametrize("error", [2.0, 4.0, 8.0, 16.0])
-def test_the_median_error_of_twenty_observers_is_close_to_their_error(error) -> None:
-    """Items of all ceilings, whose chances are those of the observers. The standard deviation of
-    the median is about 2%."""
-    rng = np.random.default_rng(4)
-    centres = np.log(rng.uniform(1, 40, 600))
-    chances = 0.25 + 0.75 / (1 + np.exp(3 * (np.log(ERRORS)[:, None] - centres)))
-    curve = known_curve(chances.mean(axis=1))
-    answers = rng.random((20, 600)) < chances[ERRORS.index(error)]
-    found = [curve.error_of(exactly(accuracy)).value for accuracy in answers.mean(axis=1)]
-    assert np.median(found) == pytest.approx(error, rel=0.1)
-
-
 @pytest.mark.slow
 def test_results_are_kept_and_do_not_depend_on_what_was_kept(store, results) -> None:
     [*paths] = sorted((store.folder / OBSERVER_FOLDER).glob("test-*.json"))

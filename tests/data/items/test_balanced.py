@@ -20,7 +20,6 @@ from dynapix.conf.schema import (
     WorldConfig,
 )
 from dynapix.data.build import ensure_items
-from dynapix.data.checks.counts import summarize_store
 from dynapix.data.items.futures import balanced as balanced_items
 from dynapix.data.items.futures.balanced_subset import choose_items
 from dynapix.data.items.pickers import CellInputs, shuffle_candidates
@@ -62,7 +61,7 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> tuple[Store, list[np.ndar
         return kept
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("data.items.cells.choose_items", record)
+        patch.setattr("dynapix.data.items.cells.choose_items", record)
         store = ensure_items(settings("balanced"), tmp_path_factory.mktemp("store"), Workers(1))
     return store, pools
 
@@ -86,16 +85,6 @@ def test_families_fill_their_quotas(store: Store, items: list[SelectionItem]) ->
     assert {i.family for i in items} == {"event", "time", "window"}
     assert len(items) > 0.7 * (sum(QUOTAS.values()) + 8 + 4)
     assert {i.distractors for i in items} == {"alternative"}
-
-
-@pytest.mark.slow
-def test_short_cells_are_named_with_the_settings_to_change(tmp_path: Path) -> None:
-    selection = replace(settings("short").selection, min_displacement=90.0, time={}, window={})
-    cfg = settings("short", scenes=6, selection=selection)
-    cfg.retrieval.builders = {"1": Quota(2, 0)}
-    summary = summarize_store(ensure_items(cfg, tmp_path, Workers(1)))
-    assert "short: event/contact_offset/test has 0 of 2" in summary
-    assert "raise benchmark.scenes" in summary.splitlines()[-1]
 
 
 @pytest.mark.slow
@@ -219,7 +208,7 @@ def test_build_with_other_quotas_after_a_kill_leaves_no_alternatives_behind(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("data.build.make_databases", stop)
+        patch.setattr("dynapix.data.build.make_databases", stop)
         with pytest.raises(KeyboardInterrupt):
             ensure_items(settings("killed"), tmp_path, Workers(1))
     fewer = settings("killed")
@@ -245,9 +234,7 @@ def test_shuffled_candidates_keep_the_target_and_have_even_letters(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "world", ["dusk", "falling", "masses", "near", "ramp", "screen", "settling"]
-)
+@pytest.mark.parametrize("world", ["falling", "ramp", "screen"])
 def test_alternatives_keep_the_laws_of_every_world(tmp_path: Path, world: str) -> None:
     cfg = compose("data.build", BuildCommand, ["benchmark=tiny_balanced", f"world={world}"])
     few = settings("few")

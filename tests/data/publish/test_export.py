@@ -26,7 +26,6 @@ from dynapix.data.publish.columns import DESCRIPTIONS, dataset_features
 from dynapix.data.publish.huggingface import ensure_export, render_card
 from dynapix.data.publish.leaderboard import CELL_WIDTH, EVAL_FILE, GAP
 from dynapix.data.records import (
-    SPLITS,
     Rationale,
     RetrievalQuery,
     SelectionItem,
@@ -278,16 +277,6 @@ def test_the_card_of_a_release_states_its_licence_and_no_local_path(
     assert card.data.source_datasets == ["extended"]
     assert "somebody" not in str(card)
     assert "Scenes are simulated" not in str(card)
-
-
-def test_the_card_counts_the_rows_of_every_suite(exported, loaded) -> None:
-    text = (exported / "README.md").read_text()
-    family = r"^\| (?:dynapix|matched_anchor) \| \w+ \| all \| (\d+) \| (\d+) \|$"
-    counted = re.findall(family, text, re.MULTILINE)
-    tables = ("selection", "matched_anchor")
-    rows = {s: sum(len(loaded[name].get(s, ())) for name in tables) for s in SPLITS}
-    assert sum(int(train) for train, _ in counted) == rows["train"]
-    assert sum(int(test) for _, test in counted) == rows["test"]
 
 
 def test_the_leaderboard_asks_the_test_items(micro_store, exported) -> None:

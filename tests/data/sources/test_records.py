@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,45 +51,6 @@ SCENES = {
     "tracks": (tracks, write_video),
 }
 """For each layout, its reader, and a function that writes a scene and returns its main file."""
-
-
-def copy_name(path: Path, addition: str) -> Path:
-    if path.name == "metadata.json":
-        return path.parent.with_name(f"{path.parent.name}{addition}") / path.name
-    shard = ".tfrecord-" in path.name
-    return path.with_name(
-        f"{path.name}{addition}" if shard else f"{path.stem}{addition}{path.suffix}"
-    )
-
-
-@pytest.mark.parametrize("addition", [" (1)", " copy", " copy 2", " - Copy", " - Copy (2)"])
-@pytest.mark.parametrize("layout", SCENES)
-def test_a_copy_of_a_scene_is_refused(tmp_path, layout, addition) -> None:
-    reader, write = SCENES[layout]
-    path = write(tmp_path)
-    assert len(reader.list_scenes(tmp_path)) == 1
-    copy = copy_name(path, addition)
-    copy.parent.mkdir(exist_ok=True)
-    shutil.copy(path, copy)
-    with raises_user_error("duplicate-scene", contains=(str(copy), "twice")):
-        reader.list_scenes(tmp_path)
-
-
-@pytest.mark.parametrize("layout", SCENES)
-def test_a_link_to_a_scene_is_refused(tmp_path, layout) -> None:
-    reader, write = SCENES[layout]
-    path = write(tmp_path)
-    link = {
-        "clevrer": path.with_name("annotation_00001.json"),
-        "movi_a": tmp_path / "00001" / path.name,
-        "movi_a shard": path.with_name("movi_a-train.tfrecord-00001-of-00002"),
-        "physion": path.with_name("0001.hdf5"),
-        "tracks": path.with_name("other.mp4"),
-    }[layout]
-    link.parent.mkdir(exist_ok=True)
-    link.symlink_to(path)
-    with raises_user_error("duplicate-scene", contains=(str(link), "twice")):
-        reader.list_scenes(tmp_path)
 
 
 def test_files_that_a_user_writes_may_begin_with_a_byte_order_mark(tmp_path) -> None:

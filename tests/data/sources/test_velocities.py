@@ -193,15 +193,19 @@ def read_physion(folder: Path, factor: float) -> Scene:
     return physion.read_scene(path, folder, "test", fps=30)
 
 
-def test_a_stored_scene_keeps_its_sizes(tmp_path: Path) -> None:
-    """A scene of the standard sizes records none, so that its bytes do not depend on them."""
+def test_a_stored_scene_keeps_what_differs_from_the_standard(tmp_path: Path) -> None:
+    """Default values are not recorded, so that the bytes of other scenes do not depend on them."""
     scene = read_clevrer(tmp_path, 1.0)
-    for given in (scene, replace(scene, radii=(), scales=())):
+    tracked = {"records_contacts": False, "speed_bounds": (0.2, 0.5, 1.0)}
+    for given in (replace(scene, **tracked), replace(scene, radii=(), scales=())):
         save_scene(given, path := tmp_path / "scene.npz")
-        assert load_scene(path).object_radii == given.object_radii
-        assert load_scene(path).object_scales == given.object_scales
+        loaded = load_scene(path)
+        for name in ("object_radii", "object_scales", "records_contacts", "speed_bounds"):
+            assert getattr(loaded, name) == getattr(given, name)
+        np.testing.assert_array_equal(loaded.velocities, given.velocities)
         with np.load(path) as file:
-            assert ("radii" in json.loads(str(file["header"]))) == bool(given.radii)
+            header = json.loads(str(file["header"]))
+        assert ("radii" in header) == ("records_contacts" in header) == bool(given.radii)
 
 
 @pytest.mark.parametrize("read", [read_clevrer, read_movi_a, read_physion])
