@@ -31,7 +31,6 @@ from dynapix.conf.schema import LoraConfig, RetrieverConfig, StudentConfig
 from dynapix.models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
-    check_adapters,
     check_available,
     check_complete,
     check_family,
@@ -278,7 +277,6 @@ def load_trainable(
     base, processor = load_base(cfg, precision, list)
     prepare_for_training(base)
     with explain_damage(folder):
-        check_adapters(folder, base, cfg.lora.rank, cfg.model)
         model = peft.PeftModel.from_pretrained(base, folder, is_trainable=True)
     return name_base(without_embeddings(model), cfg), processor
 
@@ -322,8 +320,7 @@ def load_trained(
         merge: In fp32, merge adapters into an unquantised base.
 
     Raises:
-        UserError: `folder` contains no student, or adapters of another base or rank; or it is
-            damaged; or the base cannot be loaded.
+        UserError: `folder` contains no student or is damaged, or the base cannot be loaded.
     """
     import peft
 
@@ -331,7 +328,6 @@ def load_trained(
         check_safetensors(folder)
         base, processor = load_base(cfg, precision, list)
         with explain_damage(folder):
-            check_adapters(folder, base, cfg.lora.rank, cfg.model)
             model = peft.PeftModel.from_pretrained(base, folder)
         if merge and precision == "fp32" and cfg.quantization == "none":
             # A forward pass takes 0.87 times as long. In bf16, the sum of the weights is rounded.
