@@ -265,12 +265,6 @@ def load_trainable(
     """
     import peft
 
-    if (folder / EXPORT).exists() and not (folder / ADAPTER_CONFIG).exists():
-        raise UserError(
-            f"{folder} is a merged export, which has no adapters to train: give the run that was "
-            "exported",
-            code="merged-export",
-        )
     if not cfg.lora.rank:
         return load_student(replace(cfg, model=str(folder), architecture=None), precision, list)
     check_safetensors(folder)
@@ -303,8 +297,8 @@ def check_safetensors(folder: Path) -> None:
     """Raise UserError if the adapters in a folder have no safetensors; peft would read a pickle."""
     if not (weights := folder / ADAPTER_WEIGHTS).exists():
         raise UserError(
-            f"{folder} has no student: {weights} is missing; give the folder of a finished run, or "
-            "train again",
+            f"{folder} has no adapters: {weights} is missing; give the folder of a finished run (a "
+            "merged export has none), or train again",
             code="missing-run",
         )
 
@@ -450,20 +444,15 @@ def explain_unloadable(group: str, model: str, key: str = "model") -> Iterator[N
     check_available(group, model, key)
     try:
         yield
-    except LOAD_ERRORS as error:
-        where = "that folder" if Path(model).is_dir() else "the hub or its cache"
-        raise UserError(
-            f"{group}.{key}={model} cannot be loaded from {where}: {first_line(error)}; "
-            "restore its files, or give another model",
-            code="unloadable-model",
-        ) from error
-    except RuntimeError as error:
+    except (*LOAD_ERRORS, RuntimeError) as error:
+        has_other_shapes = "ignore_mismatched_sizes" in str(error)
         # A lack of memory is a RuntimeError, too.
-        if "ignore_mismatched_sizes" not in str(error):
+        if isinstance(error, RuntimeError) and not has_other_shapes:
             raise
+        reason = "other shapes than in config.json" if has_other_shapes else first_line(error)
         raise UserError(
-            f"{group}.{key}={model} has weights of other shapes than its config.json says: restore "
-            "the files that belong together, or give another model",
+            f"{group}.{key}={model} cannot be loaded from its folder, the hub or its cache "
+            f"({reason}): restore the files that belong together, or give another model",
             code="unloadable-model",
         ) from error
 
