@@ -1,15 +1,13 @@
-"""Checks that a base, its processor, its adapters and a retriever's other modules fit together."""
+"""Checks that a base can be loaded, and that its processor belongs to it."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from huggingface_hub import constants
-from safetensors import safe_open
 
 from dynapix.conf.errors import UserError
 from dynapix.conf.proxies import proxy_hint
@@ -17,7 +15,6 @@ from dynapix.conf.schema import RetrieverConfig
 from dynapix.models.fingerprints import find_commit
 
 if TYPE_CHECKING:
-    from torch import nn
     from transformers import PreTrainedConfig, PreTrainedTokenizerBase, ProcessorMixin
 
 ADAPTER_WEIGHTS = "adapter_model.safetensors"
@@ -35,8 +32,6 @@ QWEN_FIELDS = {
     "video_token_id": "video_token_id",
 }
 """Fields of a processor of Qwen, and those of the model's configuration that they must equal."""
-SINGLE_VECTOR_MODULES = ("Transformer", "Pooling", "Normalize")
-"""Types of the modules of a single-vector retriever, of which only the first has weights."""
 
 
 def check_family(model: str, config: PreTrainedConfig) -> None:
@@ -104,64 +99,13 @@ def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
     return None
 
 
-def check_adapters(folder: Path, base: nn.Module, rank: int, model: str | None) -> None:
-    """Check that the adapters in a folder, if there are any, have the given rank and fit a base.
-
-    Args:
-        base: The loaded base, with or without adapters.
-        rank: The value of student.lora.rank.
-        model: The value of student.model, for the error message.
-
-    Raises:
-        UserError: The adapters have another rank or were trained on another base.
-        SafetensorError: The file of the adapters is damaged.
-    """
-    if not (path := folder / ADAPTER_WEIGHTS).exists():
-        return
-    modules = {name.removeprefix(PEFT_PREFIX): module for name, module in base.named_modules()}
-    with safe_open(path, "pt") as file:
-        shapes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
-    for name, shape in shapes.items():
-        adapted, _, side = name.removeprefix(PEFT_PREFIX).partition(".lora_")
-        # A is (rank, inputs), B is (outputs, rank).
-        own_rank, width = shape if side.startswith("A") else reversed(shape)
-        if own_rank != rank:
-            raise UserError(
-                f"{folder} has adapters of rank {own_rank}, but student.lora.rank is {rank}: set "
-                f"student.lora.rank={own_rank}, or train another run (run=NAME)",
-                code="other-rank",
-            )
-        module = modules.get(adapted)
-        actual = module and getattr(module, "in_features" if side[0] == "A" else "out_features")
-        if actual != width:
-            difference = f"has width {width}, not {actual}" if module else "does not exist"
-            raise UserError(
-                f"{folder} has adapters of another base than {model} ({adapted} {difference}): "
-                "set student.model to the base that they were trained on, or train again",
-                code="other-base",
-            )
-
-
-def check_late_base(source: str, config: PreTrainedConfig, revision: str | None) -> None:
+def check_late_base(source: str, config: PreTrainedConfig) -> None:
     """Raise UserError if a model cannot be the base of a multi-vector retriever: it is no Qwen3-VL,
-    by whose tokens the scored tokens are found, or it is a saved retriever with modules after its
-    backbone whose weights would be lost."""
-    from sentence_transformers.util import load_file_path
-
+    by whose tokens the scored tokens are found."""
     if config.model_type != "qwen3_vl":
         raise UserError(
             f"retriever.model={source} is a {config.model_type}, but late interaction finds the "
             "tokens to score in Qwen3-VL only: set retriever.late=null, or give a Qwen3-VL",
-            code="unsupported-model",
-        )
-    path = load_file_path(source, "modules.json", revision=revision)
-    modules = json.loads(Path(path).read_text()) if path else []
-    kinds = [module["type"].rpartition(".")[2] for module in modules]
-    if lost := [kind for kind in kinds if kind not in SINGLE_VECTOR_MODULES]:
-        raise UserError(
-            f"{source} has modules after its backbone that would be lost if it were used as a base "
-            f"({', '.join(lost)}): give another base, or evaluate the run that trained it "
-            "(model=RUN)",
             code="unsupported-model",
         )
 

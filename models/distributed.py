@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import cache
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     import torch
     from accelerate import PartialState
     from torch import distributed
-    from torch.nn import Parameter
 
 
 Input, Output = TypeVar("Input"), TypeVar("Output")
@@ -37,7 +36,7 @@ def main_first() -> Iterator[None]:
         return
     from torch import distributed
 
-    group = _patient_group()
+    group = patient_group()
     if rank() > 0:
         distributed.barrier(group)
     yield
@@ -46,7 +45,7 @@ def main_first() -> Iterator[None]:
 
 
 @cache
-def _patient_group() -> distributed.ProcessGroup:
+def patient_group() -> distributed.ProcessGroup:
     """Return a group of all ranks for tensors on CPUs, whose operations may wait for days. All
     ranks make the first call together."""
     from torch import distributed
@@ -68,7 +67,7 @@ def map_over_ranks(
     for first in range(0, len(inputs), world_size()):
         own = inputs[first + rank() : first + rank() + 1]
         results: list[list[Output]] = [[] for _ in range(world_size())]
-        distributed.all_gather_object(results, [*map(function, own)], _patient_group())
+        distributed.all_gather_object(results, [*map(function, own)], patient_group())
         for result in results:
             yield from result
 
@@ -80,7 +79,7 @@ def share_from_main(value: Input) -> Input:
     from torch import distributed
 
     shared = [value]
-    distributed.broadcast_object_list(shared, 0, _patient_group())
+    distributed.broadcast_object_list(shared, 0, patient_group())
     return shared[0]
 
 
@@ -101,38 +100,15 @@ def _get_state() -> PartialState:
     return PartialState(cpu=not torch.cuda.is_available(), timeout=STEP_TIMEOUT)
 
 
-def average_gradients(parameters: Iterable[Parameter]) -> None:
-    """Replace the gradients of parameters on the CPU by their means over all ranks.
-
-    A gradient that only some ranks have is 0 on the others; one that no rank has stays None, so
-    that the optimizer leaves its parameter unchanged.
-    """
-    if world_size() == 1:
-        return
-    import torch
-    from torch import distributed
-
-    parameters, group = [*parameters], _patient_group()
-    present = torch.tensor([float(p.grad is not None) for p in parameters])
-    distributed.all_reduce(present, group=group)
-    trained = [p for p, ranks in zip(parameters, present.tolist(), strict=True) if ranks]
-    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in trained]
-    joined = torch.cat([g.flatten() for g in gradients])
-    distributed.all_reduce(joined, group=group)
-    means = (joined / world_size()).split([p.numel() for p in trained])
-    for parameter, mean in zip(trained, means, strict=True):
-        parameter.grad = mean.view_as(parameter)
-
-
 def end_ranks() -> None:
     """Wait for all ranks, and end their communication. A rank that exits without this can abort the
     others."""
     if world_size() > 1:
         from torch import distributed
 
-        distributed.barrier(_patient_group())
+        distributed.barrier(patient_group())
         distributed.destroy_process_group()
-        _patient_group.cache_clear()
+        patient_group.cache_clear()
 
 
 def split_batch(batch: int, micro_batch: int = 1, key: str = "train.batch") -> int:
@@ -144,16 +120,12 @@ def split_batch(batch: int, micro_batch: int = 1, key: str = "train.batch") -> i
     Raises:
         UserError: The batch cannot be split into full micro-batches, equally many on each rank.
     """
-    ranks, samples = world_size(), micro_batch * world_size()
+    samples = micro_batch * world_size()
     if batch % samples:
         parts = f" in micro-batches of train.micro_batch={micro_batch}" if micro_batch > 1 else ""
-        multiple = max(1, round(batch / samples)) * samples
-        remedies = [f"{key} to a multiple of {samples}, such as {multiple}"]
-        if smaller := [n for n in range(1, micro_batch) if batch % (n * ranks) == 0]:
-            remedies.insert(0, f"train.micro_batch to {max(smaller)}")
         raise UserError(
-            f"{key}={batch} cannot be split over {ranks} ranks{parts}: set "
-            f"{' or '.join(remedies)}, or change the number of ranks",
+            f"{key}={batch} cannot be split over {world_size()} ranks{parts}: set {key} to a "
+            f"multiple of {samples}, or change the number of ranks or train.micro_batch",
             code="uneven-batch",
         )
     return batch // samples

@@ -31,7 +31,6 @@ from dynapix.conf.schema import LoraConfig, RetrieverConfig, StudentConfig
 from dynapix.models.checks import (
     ADAPTER_CONFIG,
     ADAPTER_WEIGHTS,
-    check_adapters,
     check_available,
     check_complete,
     check_family,
@@ -266,19 +265,12 @@ def load_trainable(
     """
     import peft
 
-    if (folder / EXPORT).exists() and not (folder / ADAPTER_CONFIG).exists():
-        raise UserError(
-            f"{folder} is a merged export, which has no adapters to train: give the run that was "
-            "exported",
-            code="merged-export",
-        )
     if not cfg.lora.rank:
         return load_student(replace(cfg, model=str(folder), architecture=None), precision, list)
     check_safetensors(folder)
     base, processor = load_base(cfg, precision, list)
     prepare_for_training(base)
     with explain_damage(folder):
-        check_adapters(folder, base, cfg.lora.rank, cfg.model)
         model = peft.PeftModel.from_pretrained(base, folder, is_trainable=True)
     return name_base(without_embeddings(model), cfg), processor
 
@@ -305,8 +297,8 @@ def check_safetensors(folder: Path) -> None:
     """Raise UserError if the adapters in a folder have no safetensors; peft would read a pickle."""
     if not (weights := folder / ADAPTER_WEIGHTS).exists():
         raise UserError(
-            f"{folder} has no student: {weights} is missing; give the folder of a finished run, or "
-            "train again",
+            f"{folder} has no adapters: {weights} is missing; give the folder of a finished run (a "
+            "merged export has none), or train again",
             code="missing-run",
         )
 
@@ -322,8 +314,7 @@ def load_trained(
         merge: In fp32, merge adapters into an unquantised base.
 
     Raises:
-        UserError: `folder` contains no student, or adapters of another base or rank; or it is
-            damaged; or the base cannot be loaded.
+        UserError: `folder` contains no student or is damaged, or the base cannot be loaded.
     """
     import peft
 
@@ -331,7 +322,6 @@ def load_trained(
         check_safetensors(folder)
         base, processor = load_base(cfg, precision, list)
         with explain_damage(folder):
-            check_adapters(folder, base, cfg.lora.rank, cfg.model)
             model = peft.PeftModel.from_pretrained(base, folder)
         if merge and precision == "fp32" and cfg.quantization == "none":
             # A forward pass takes 0.87 times as long. In bf16, the sum of the weights is rounded.
@@ -454,20 +444,15 @@ def explain_unloadable(group: str, model: str, key: str = "model") -> Iterator[N
     check_available(group, model, key)
     try:
         yield
-    except LOAD_ERRORS as error:
-        where = "that folder" if Path(model).is_dir() else "the hub or its cache"
-        raise UserError(
-            f"{group}.{key}={model} cannot be loaded from {where}: {first_line(error)}; "
-            "restore its files, or give another model",
-            code="unloadable-model",
-        ) from error
-    except RuntimeError as error:
+    except (*LOAD_ERRORS, RuntimeError) as error:
+        has_other_shapes = "ignore_mismatched_sizes" in str(error)
         # A lack of memory is a RuntimeError, too.
-        if "ignore_mismatched_sizes" not in str(error):
+        if isinstance(error, RuntimeError) and not has_other_shapes:
             raise
+        reason = "other shapes than in config.json" if has_other_shapes else first_line(error)
         raise UserError(
-            f"{group}.{key}={model} has weights of other shapes than its config.json says: restore "
-            "the files that belong together, or give another model",
+            f"{group}.{key}={model} cannot be loaded from its folder, the hub or its cache "
+            f"({reason}): restore the files that belong together, or give another model",
             code="unloadable-model",
         ) from error
 

@@ -92,56 +92,44 @@ def read_trained_settings(
         UserError: `folder` is not the folder of a run or an export of this product, the run is not
             finished, or its settings are damaged.
     """
-    _check_run_folder(folder, product, key)
-    config = settings_file(folder)
-    try:
-        saved = OmegaConf.load(config)
-        if not OmegaConf.is_dict(saved) or product not in saved:
-            raise UserError(
-                f"{key}={folder} is not a run that trained a {product}: give the folder of one",
-                code="missing-run",
-            )
-        finished = (folder / "metrics.json").exists() and (folder / product).is_dir()
-        if not finished and not (folder / EXPORT).exists():
-            raise UserError(
-                f"{key}={folder} is not finished: run its command again to resume it",
-                code="unfinished-run",
-            )
-        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), saved))
-    except (YAMLError, OmegaConfBaseException, ValueError) as error:
-        first = str(error).partition("\n")[0]
+    record, config = folder / "run.json", settings_file(folder)
+    command = read_json(record).get("command", "train.") if record.exists() else "train."
+    saved = _read_settings(config) if config.exists() and command.startswith("train.") else {}
+    if product not in saved:
         raise UserError(
-            f"{config} is damaged or of another version of DynaPix ({first}); train again",
-            code="damaged-file",
-        ) from error
+            f"{key}={folder} is no run that trained a {product}, and no export of one: give a "
+            f"folder such as checkpoints/{TRAINER_FOLDERS[product]}/RUN, and give a base as "
+            f"{product}.model={folder}",
+            code="missing-run",
+        )
+    finished = (folder / "metrics.json").exists() and (folder / product).is_dir()
+    if not finished and not (folder / EXPORT).exists():
+        raise UserError(
+            f"{key}={folder} is not finished: run its command again to resume it",
+            code="unfinished-run",
+        )
+    settings = _read_settings(config, schema)
     setattr(settings, product, with_resolved_commit(folder, getattr(settings, product)))
     settings.train.precision = read_resolved(folder).get("precision", settings.train.precision)
     return settings
 
 
-def _check_run_folder(folder: Path, product: str, key: str) -> None:
-    """Raise UserError, and name the folder to give instead, if a folder is evidently not that of a
-    training run or of an export."""
-    if (folder / EXPORT).exists():
-        return
-    record = folder / "run.json"
-    command = read_json(record).get("command", "train.") if record.exists() else "train."
-    if (folder / product / EXPORT).exists():
-        problem = f"contains an export: give {key}={folder / product}"
-    elif folder.name == product and settings_file(folder.parent).exists():
-        problem = f"is the {product} of a run: give {key}={folder.parent}"
-    elif (folder / "config.json").exists():
-        problem = f"is a base: give {product}.model={folder}"
-    elif not command.startswith("train."):
-        problem = f"is a run of {command}: give the folder of a run that trained a {product}"
-    elif not settings_file(folder).exists():
-        problem = (
-            "is no run, because config.yaml is missing: give the folder of a run, such as "
-            f"checkpoints/{TRAINER_FOLDERS[product]}/RUN"
-        )
-    else:
-        return
-    raise UserError(f"{key}={folder} {problem}", code="missing-run")
+def _read_settings(config: Path, schema: type | None = None, group: str | None = None) -> Any:
+    """Return a file of settings as a dict, which is empty if the file has another form; or, with a
+    schema, the whole or one `group` as an instance of the schema."""
+    try:
+        saved = OmegaConf.load(config)
+        if schema is None:
+            return OmegaConf.to_container(saved) if OmegaConf.is_dict(saved) else {}
+        part = saved[group] if group else saved
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), part))
+    except (YAMLError, OmegaConfBaseException, ValueError) as error:
+        first = str(error).partition("\n")[0]
+        raise UserError(
+            f"{config} is damaged or of another version of DynaPix ({first}): train again, or "
+            "restore the file",
+            code="damaged-file",
+        ) from error
 
 
 def resolve_model(
@@ -186,21 +174,10 @@ def resolve_model(
 
 def _check_base_unseen(base: str | None, tested: BenchmarkConfig) -> None:
     """As `check_unseen`, for a base whose folder records the settings of its training."""
-    if base is None or not (config := Path(base) / "config.yaml").exists():
+    config = Path(base or "") / "config.yaml"
+    if base is None or not config.exists() or "benchmark" not in _read_settings(config):
         return
-    try:
-        saved = OmegaConf.load(config)
-        if not OmegaConf.is_dict(saved) or "benchmark" not in saved:
-            return
-        schema = OmegaConf.structured(BenchmarkConfig)
-        trained = OmegaConf.to_object(OmegaConf.merge(schema, saved.benchmark))
-    except (YAMLError, OmegaConfBaseException, ValueError) as error:
-        first = str(error).partition("\n")[0]
-        raise UserError(
-            f"{config} is damaged or of another version of DynaPix ({first}), so that the scenes "
-            "on which the base was trained are unknown: restore the file, or delete it",
-            code="damaged-file",
-        ) from error
+    trained = _read_settings(config, BenchmarkConfig, "benchmark")
     check_unseen(f"the base {base}", trained, tested)
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
+import torch
 from torch import nn
 from transformers import PreTrainedModel, ProcessorMixin
 
@@ -26,6 +28,7 @@ from dynapix.data.records import RetrievalQuery
 from dynapix.data.store import Store
 from dynapix.models.tiny_qwen3_vl import build_model, build_processor
 from dynapix.train.student import dataset
+from dynapix.train.student.trainer import token_mean
 
 SMALL = ArchitectureConfig(
     hidden=64,
@@ -94,6 +97,29 @@ def randomize_adapters(model: nn.Module, std: float) -> None:
     for name, weight in model.named_parameters():
         if "lora_B" in name:
             nn.init.normal_(weight, std=std)
+
+
+Gradients = dict[str, torch.Tensor]
+
+
+def collect_gradients(model: nn.Module) -> Gradients:
+    return {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
+
+
+def loss_and_gradients(model: nn.Module, batch: dict[str, Any]) -> tuple[torch.Tensor, Gradients]:
+    """Return the loss and all gradients, with the same dropout in each call."""
+    model.zero_grad()
+    torch.manual_seed(1)
+    inputs = {name: value for name, value in batch.items() if name != "labels"}
+    loss = token_mean(model(**inputs), batch["labels"])
+    loss.backward()
+    return loss.detach(), collect_gradients(model)
+
+
+def assert_equal_gradients(found: Gradients, expected: Gradients) -> None:
+    assert found.keys() == expected.keys()
+    for name, gradient in expected.items():
+        assert (found[name] - gradient).norm() <= 1e-4 * gradient.norm() + 1e-7, name
 
 
 @pytest.fixture(scope="session")

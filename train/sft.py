@@ -27,7 +27,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
 
     from dynapix.data.build import ensure_benchmark
     from dynapix.models import compat, distributed, loading
-    from dynapix.models.checks import check_adapters, check_available
+    from dynapix.models.checks import check_available
     from dynapix.models.layers.fast_layers import use_fast_layers
     from dynapix.models.resolved_settings import data_digest, resolve_run
     from dynapix.teacher.narrate import ensure_rationales
@@ -66,8 +66,6 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
         if not distributed.is_sharded():
             model.to(distributed.rank_device())
     use_fast_layers(model)
-    if checkpoint is not None:
-        check_adapters(checkpoint, model, student.lora.rank, student.model)
 
     trainer = build_trainer(cfg, run, model, processor, training, validation, checkpoint)
     lower = "lower train.micro_batch, set train.reuse_features=false"

@@ -20,20 +20,21 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
+from torch.nn import Parameter
 from torch.nn.functional import cross_entropy
 from tqdm import tqdm
 from transformers import PreTrainedModel, ProcessorMixin
 
 from dynapix.conf.entry import Run
 from dynapix.conf.errors import UserError
-from dynapix.conf.runs import rank
+from dynapix.conf.runs import rank, world_size
 from dynapix.data.records import SelectionItem
-from dynapix.models.distributed import average_gradients
+from dynapix.models.distributed import patient_group
 from dynapix.models.student.collator import IGNORED
 from dynapix.train.common.curves import plot_curves
 from dynapix.train.common.journal import CURVES, JOURNAL, read_journal
@@ -338,3 +339,23 @@ def first_token_ids(processor: ProcessorMixin) -> dict[str, list[int]]:
         kind: [encode(f" {word}", add_special_tokens=False)[0] for word in words]
         for kind, words in (WORDS | SPATIAL_WORDS).items()
     }
+
+
+def average_gradients(parameters: Iterable[Parameter]) -> None:
+    """Replace the gradients of parameters on the CPU by their means over all ranks.
+
+    A gradient that only some ranks have is 0 on the others; one that no rank has stays None, so
+    that the optimizer leaves its parameter unchanged.
+    """
+    if world_size() == 1:
+        return
+    parameters, group = [*parameters], patient_group()
+    present = torch.tensor([float(p.grad is not None) for p in parameters])
+    distributed.all_reduce(present, group=group)
+    trained = [p for p, ranks in zip(parameters, present.tolist(), strict=True) if ranks]
+    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in trained]
+    joined = torch.cat([g.flatten() for g in gradients])
+    distributed.all_reduce(joined, group=group)
+    means = (joined / world_size()).split([p.numel() for p in trained])
+    for parameter, mean in zip(trained, means, strict=True):
+        parameter.grad = mean.view_as(parameter)

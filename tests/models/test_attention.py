@@ -186,8 +186,8 @@ def test_unused_memory_of_the_cache_changes_no_results(
 
 
 @pytest.mark.parametrize("precision", ["bf16", "fp32"])
-def test_padding_and_a_cache_change_no_results(samples, processor, model, precision) -> None:
-    """Padding makes no value infinite, and a key-value cache does not change the logits."""
+def test_padding_changes_no_results(samples, processor, model, precision) -> None:
+    """Padding makes no value infinite."""
     choose_attention(model, precision, LENGTH)
     collate, reduced = Collator(processor, LENGTH), precision == "bf16"
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=reduced):
@@ -195,17 +195,8 @@ def test_padding_and_a_cache_change_no_results(samples, processor, model, precis
         counts = [int((collate([s])["labels"] != -100).sum()) for s in samples]
         alone = sum(loss_of(model, collate([s])) * n for s, n in zip(samples, counts, strict=True))
         together = loss_of(model, batch)
-        torch.testing.assert_close(
-            together, alone / sum(counts), atol=5e-3 if reduced else 1e-5, rtol=0
-        )
-        del batch["labels"], batch["logits_to_keep"]
-        with_cache, without = (
-            model.generate(**batch, max_new_tokens=5, do_sample=False, use_cache=cache,
-                           output_logits=True, return_dict_in_generate=True).logits
-            for cache in (True, False)
-        )  # fmt: skip
-    tolerance = 0.1 if reduced else 1e-4
-    torch.testing.assert_close(with_cache[0], without[0], atol=tolerance, rtol=0)
+    tolerance = 5e-3 if reduced else 1e-5
+    torch.testing.assert_close(together, alone / sum(counts), atol=tolerance, rtol=0)
 
 
 def test_a_saved_model_names_no_attention_of_this_project(model, tmp_path) -> None:

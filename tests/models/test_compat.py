@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import inspect
-import sys
 
 import bitsandbytes as bnb
 import peft
@@ -14,15 +12,13 @@ from peft.tuners.lora import LoraLayer
 from peft.tuners.lora.bnb import Linear4bit
 from peft.tuners.lora.layer import Linear, LoraVariant
 from sentence_transformers import MultiVectorEncoder, SentenceTransformerTrainer
-from sentence_transformers.base.modules import Dense
 from torch import nn
-from transformers import AttentionInterface, AttentionMaskInterface, Trainer, TrainingArguments
+from transformers import Trainer, TrainingArguments
 from transformers.cache_utils import DynamicLayer
 from trl import GRPOTrainer
 from trl.trainer.utils import RepeatSampler
 
 from dynapix.models import compat
-from dynapix.models.layers import attention
 from dynapix.models.layers.fast_layers import use_fast_layers
 
 CHANGED = "a library changed this hook; correct models/compat.py or the version bounds:"
@@ -57,28 +53,6 @@ def test_4_bit_weights_count_as_the_entries_that_they_stand_for() -> None:
     assert compat.four_bit_entries(nn.Linear(4, 4).weight) is None
 
 
-def test_a_vision_tower_passes_all_frames_to_a_function_named_flash(model) -> None:
-    assert attention.BY_FRAME in AttentionInterface().valid_keys()
-    assert attention.MATMUL in AttentionMaskInterface().valid_keys()
-    model.set_attn_implementation({"vision_config": attention.BY_FRAME})
-    calls = []
-
-    def record(module, query, key, value, attention_mask, **settings):
-        calls.append(settings)
-        return attention.attend_by_frame(module, query, key, value, attention_mask, **settings)
-
-    AttentionInterface.register(attention.BY_FRAME, record)
-    try:
-        grid = torch.tensor([[3, 4, 4]])
-        model.model.visual(torch.zeros(48, 3 * 2 * 16 * 16), grid_thw=grid)
-    finally:
-        AttentionInterface.register(attention.BY_FRAME, attention.attend_by_frame)
-    bounds = {tuple(settings["cu_seq_lens_q"].tolist()) for settings in calls}
-    assert bounds == {(0, 16, 32, 48)}, (
-        f"{CHANGED} Qwen3-VL's vision tower does not pass all frames at once"
-    )
-
-
 def test_peft_layers_use_a_lora_variant(model) -> None:
     assert issubclass(Linear, LoraLayer)
     assert issubclass(Linear4bit, LoraLayer)
@@ -91,19 +65,6 @@ def test_peft_layers_use_a_lora_variant(model) -> None:
     assert "lora_variant" in inspect.getsource(Linear.forward), (
         f"{CHANGED} the forward of peft's Linear does not use lora_variant"
     )
-
-
-def test_qwen3_vl_takes_the_vision_towers_outputs_instead_of_pixels(model) -> None:
-    token, grid = model.config.image_token_id, torch.tensor([[1, 4, 4]])
-    ids = torch.tensor([[10, *[token] * 4, 11]])
-    inputs = {"input_ids": ids, "image_grid_thw": grid, "mm_token_type_ids": (ids == token).long()}
-    pixels = torch.randn(16, 3 * 2 * 16 * 16)
-    with torch.no_grad():
-        (image,) = compat.encode_images(model, pixels, grid, bf16=False)
-        outputs = {"image": compat.encoder_outputs(image)}
-        cached = model(**inputs, mm_encoder_outputs=outputs).logits
-        direct = model(**inputs, pixel_values=pixels).logits
-    assert torch.equal(cached, direct), f"{CHANGED} mm_encoder_outputs does not replace the pixels"
 
 
 @pytest.mark.parametrize(
@@ -146,19 +107,3 @@ def test_grpo_trainer_keeps_measures_and_an_order_that_can_be_seeded() -> None:
     assert isinstance(sampler.generator, torch.Generator), (
         f"{CHANGED} RepeatSampler has no generator"
     )
-
-
-def test_the_projection_of_a_multi_vector_model_takes_a_dict_with_token_embeddings() -> None:
-    received = []
-    projection = Dense(4, 2, activation_function=None, module_input_name="token_embeddings")
-    projection.register_forward_pre_hook(lambda module, args: received.append(args))
-    projection({"token_embeddings": torch.ones(1, 3, 4)})
-    assert "token_embeddings" in received[0][0], (
-        f"{CHANGED} the projection of sentence-transformers takes another input"
-    )
-
-
-def test_freed_memory_is_kept_by_mallopt() -> None:
-    compat.keep_freed_memory()
-    if sys.platform == "linux":
-        assert hasattr(ctypes.CDLL(None), "mallopt"), f"{CHANGED} libc has no mallopt"

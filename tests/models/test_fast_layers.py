@@ -28,8 +28,7 @@ from dynapix.models.layers.fast_layers import (
 )
 from dynapix.models.student.collator import Collator
 from dynapix.models.student.prompts import selection_sample
-from dynapix.train.student.trainer import token_mean
-from tests.tiny_models import randomize_adapters
+from tests.tiny_models import assert_equal_gradients, loss_and_gradients, randomize_adapters
 
 KINDS = {
     "nf4": {"lora": LoraConfig(rank=4, alpha=12, dropout=0.2)},
@@ -51,19 +50,6 @@ def student(request, nf4_cfg, micro_store, frames):
     return model.train(), batch, cfg.lora.rank > 0
 
 
-def loss_and_gradients(
-    model: nn.Module, batch: dict
-) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Return the loss and all gradients, with the same dropout in each call."""
-    model.zero_grad()
-    torch.manual_seed(1)
-    inputs = {name: value for name, value in batch.items() if name not in ("labels", "sample_ids")}
-    loss = token_mean(model(**inputs), batch["labels"])
-    loss.backward()
-    computed = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
-    return loss.detach(), computed
-
-
 def test_loss_and_every_gradient_are_the_same(student) -> None:
     model, batch, adapted = student
     plain, gradients = loss_and_gradients(model, batch)
@@ -75,9 +61,7 @@ def test_loss_and_every_gradient_are_the_same(student) -> None:
     assert bool(variants) is adapted
     assert all(isinstance(v, AddedInPlace) for v in variants)
     torch.testing.assert_close(fused, plain, rtol=1e-5, atol=0)
-    assert computed.keys() == gradients.keys()
-    for name, gradient in gradients.items():
-        assert (computed[name] - gradient).norm() <= 1e-4 * gradient.norm(), name
+    assert_equal_gradients(computed, gradients)
 
 
 def test_norms_and_rotations_equal_those_of_transformers() -> None:
@@ -162,7 +146,7 @@ def test_saved_weights_are_unchanged_and_give_the_same_logits(student, tmp_path)
     assert after.keys() == before.keys()
     assert all(torch.equal(after[name], value) for name, value in before.items())
     if adapted:
-        inputs = {k: v for k, v in batch.items() if k not in ("labels", "sample_ids")}
+        inputs = {k: v for k, v in batch.items() if k != "labels"}
         with torch.no_grad():
             fused = model.eval()(**inputs).logits
             model.save_pretrained(tmp_path)

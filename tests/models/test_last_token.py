@@ -14,9 +14,14 @@ from dynapix.models.layers.attention import MATMUL
 from dynapix.models.retriever import embedder
 from dynapix.models.retriever.inputs import Retriever, model_inputs, preprocess
 from dynapix.models.retriever.last_token import LastTokenTower, compute_last_token
-from tests.tiny_models import randomize_adapters
+from tests.tiny_models import (
+    Gradients,
+    assert_equal_gradients,
+    collect_gradients,
+    randomize_adapters,
+)
 
-Results = tuple[torch.Tensor, dict[str, torch.Tensor]]
+Results = tuple[torch.Tensor, Gradients]
 
 
 @pytest.fixture(scope="module")
@@ -44,15 +49,12 @@ def results(model: Retriever, inputs: dict[str, Any]) -> Results:
     model.zero_grad()
     embedded = model(dict(inputs))["sentence_embedding"]
     (embedded * torch.linspace(-1, 1, embedded.numel()).view_as(embedded)).sum().backward()
-    found = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
-    return embedded.detach(), found
+    return embedded.detach(), collect_gradients(model)
 
 
 def assert_equal(found: Results, expected: Results) -> None:
     torch.testing.assert_close(found[0], expected[0], atol=1e-6, rtol=1e-5)
-    assert found[1].keys() == expected[1].keys()
-    for name, gradient in expected[1].items():
-        assert (found[1][name] - gradient).norm() <= 1e-4 * gradient.norm() + 1e-7, name
+    assert_equal_gradients(found[1], expected[1])
 
 
 @pytest.mark.parametrize("attention", ["sdpa", "eager", MATMUL])

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import bitsandbytes as bnb
-import numpy as np
 import pytest
 import torch
 from peft.tuners.lora import LoraLayer
@@ -36,10 +35,7 @@ from dynapix.data.records import FPS, sample_prefix_frames
 from dynapix.models import loading
 from dynapix.models.student.collator import Collator, encode
 from dynapix.models.student.prompts import (
-    Clip,
-    Sample,
     build_response,
-    build_sample,
     selection_sample,
 )
 from dynapix.models.towers import check_parameter_counts, count_parameters
@@ -204,33 +200,24 @@ def test_adapters_are_fp32_over_a_base_that_stays_bf16(preset, quantized) -> Non
 
 
 @pytest.mark.parametrize(
-    ("skipped", "message"),
+    ("changed", "message"),
     [
-        (["visual", "lm_head"], "vision has some 4-bit parameters"),
-        (["model.visual"], "embeddings and head has some 4-bit parameters"),
-        (["model.visual", "model.language_model", "lm_head"], "language has no 4-bit parameters"),
+        ({"skipped": ["visual", "lm_head"]}, "vision has some 4-bit parameters"),
+        ({"skipped": ["model.visual"]}, "embeddings and head has some 4-bit parameters"),
+        (
+            {"skipped": ["model.visual", "model.language_model", "lm_head"]},
+            "language has no 4-bit parameters",
+        ),
+        ({"targets": "all-linear"}, "vision has some LoRA parameters"),
+        ({"targets": r".*\.(qkv|q_proj)"}, "vision has some LoRA parameters"),
+        ({"targets": r".*\.embed_tokens"}, "embeddings and head has some LoRA parameters"),
     ],
 )
-def test_a_wrong_skip_list_is_refused(skipped, message) -> None:
-    quantization = nf4()
-    quantization.llm_int8_skip_modules = skipped
-    cfg = student("qwen3_vl_2b")
-    model = loading.add_adapters(base_of(cfg.name, quantization), cfg.lora)
-    with raises_user_error("other-parameters", contains=message):
-        check_parameter_counts(count_parameters(model), cfg.name, cfg.quantization, cfg.lora.rank)
-
-
-@pytest.mark.parametrize(
-    ("targets", "message"),
-    [
-        ("all-linear", "vision has some LoRA parameters"),
-        (r".*\.(qkv|q_proj)", "vision has some LoRA parameters"),
-        (r".*\.embed_tokens", "embeddings and head has some LoRA parameters"),
-    ],
-)
-def test_adapters_outside_the_language_tower_are_refused(targets, message) -> None:
-    cfg = student("qwen3_vl_2b")
-    model = loading.add_adapters(base_of(cfg.name, nf4()), replace(cfg.lora, targets=targets))
+def test_only_the_language_tower_may_be_quantised_and_adapted(changed, message) -> None:
+    quantization, cfg = nf4(), student("qwen3_vl_2b")
+    quantization.llm_int8_skip_modules = changed.get("skipped", quantization.llm_int8_skip_modules)
+    lora = replace(cfg.lora, targets=changed.get("targets"))
+    model = loading.add_adapters(base_of(cfg.name, quantization), lora)
     with raises_user_error("other-parameters", contains=message):
         check_parameter_counts(count_parameters(model), cfg.name, cfg.quantization, cfg.lora.rank)
 
@@ -283,30 +270,6 @@ def test_frames_are_resized_to_320_px_and_have_their_true_times(
     times = [(a + b) / 2 / FPS for a, b in zip(shown[::2], shown[1::2], strict=True)]
     timestamps = re.findall(r"<(\d+\.\d) seconds>", released.tokenizer.decode(encoded.input_ids))
     assert timestamps == [f"{time:.1f}" for time in times]
-
-
-def media(size: int, count: int) -> Sample:
-    """Return a sample with a video of `count` black frames and an image that is one of them."""
-    video = np.zeros((count, size, size, 3), np.uint8)
-    return build_sample("black", [video[0]], None, Clip(video, list(range(count))))
-
-
-def test_a_video_of_default_size_is_shrunk_where_an_image_is_not(processor) -> None:
-    """This is why `pin_sizes` exists; if the test fails, check whether it is still needed."""
-    encoded = encode(media(336, 12), released_processor(processor, {}), 3072)
-    assert encoded.media["video_grid_thw"].tolist() == [[6, 16, 16]]
-    assert encoded.media["image_grid_thw"].tolist() == [[1, 20, 20]]
-
-
-@pytest.mark.parametrize("count", [2, 5, 9, 11, 12])
-@pytest.mark.parametrize("size", [32, 96, 112, 240, 336, 350])
-def test_a_frame_has_one_size_in_every_video_and_image(size, count, processor) -> None:
-    released = released_processor(processor, RELEASED_PIXELS)
-    loading.pin_sizes(released, size, 12)
-    encoded = encode(media(size, count), released, 3072)
-    edge = 2 * round(size / 32)
-    assert encoded.media["image_grid_thw"].tolist() == [[1, edge, edge]]
-    assert encoded.media["video_grid_thw"].tolist() == [[(count + 1) // 2, edge, edge]]
 
 
 @presets

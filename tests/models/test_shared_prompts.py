@@ -18,8 +18,7 @@ from dynapix.models.layers.fast_layers import use_fast_layers
 from dynapix.models.layers.shared_prompts import PADDING, SHARED, pack_samples, shares_prompts
 from dynapix.models.student.collator import Collator
 from dynapix.models.student.prompts import selection_sample
-from dynapix.train.student.trainer import token_mean
-from tests.tiny_models import randomize_adapters
+from tests.tiny_models import assert_equal_gradients, loss_and_gradients, randomize_adapters
 
 RATIONALE = "the red cube moves to the right, and " * 8 + "it stops.\nAnswer: B"
 ONE_ITEM = [(0, "reasoning"), (0, "answer")]
@@ -58,15 +57,10 @@ def results(model: nn.Module, batch: dict[str, Any]) -> tuple[torch.Tensor, Any,
     """Return the loss, all gradients, and the shape of the hidden states in the tower."""
     tower, shapes = model.get_base_model().model.language_model, []
     hook = tower.layers[0].register_forward_hook(lambda _m, _i, out: shapes.append(out.shape[:2]))
-    model.zero_grad()
     try:
-        inputs = {name: value for name, value in batch.items() if name != "labels"}
-        loss = token_mean(model(**inputs), batch["labels"])
-        loss.backward()
+        return *loss_and_gradients(model, batch), shapes[0]
     finally:
         hook.remove()
-    found = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
-    return loss.detach(), found, shapes[0]
 
 
 def assert_equal_results(model: nn.Module, fast: nn.Module, batch: dict[str, Any]) -> Any:
@@ -75,9 +69,7 @@ def assert_equal_results(model: nn.Module, fast: nn.Module, batch: dict[str, Any
     shared_loss, found, packed = results(fast, batch)
     assert plain == batch["input_ids"].shape
     torch.testing.assert_close(shared_loss, loss, rtol=1e-5, atol=0)
-    assert found.keys() == gradients.keys()
-    for name, gradient in gradients.items():
-        assert (found[name] - gradient).norm() <= 1e-4 * gradient.norm() + 1e-7, name
+    assert_equal_gradients(found, gradients)
     return packed
 
 

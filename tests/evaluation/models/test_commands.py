@@ -120,14 +120,14 @@ def test_a_run_that_cannot_be_measured_is_refused(trained_student, tmp_path, dam
 def test_other_folders_than_runs_are_named(trained_student, tmp_path) -> None:
     run, base = tmp_path / "run", tmp_path / "base"
     shutil.copytree(trained_student, run)
-    with raises_user_error("missing-run", contains=f"model={run}"):
+    with raises_user_error("missing-run", contains=f"model={run / 'student'}"):
         read_trained_settings(run / "student", SftCommand, "student")
     shutil.copytree(run / "student", base)
     (base / "config.json").write_text("{}")
     with raises_user_error("missing-run", contains=f"student.model={base}"):
         read_trained_settings(base, SftCommand, "student")
     (run / "run.json").write_text('{"command": "evaluation.select"}')
-    with raises_user_error("missing-run", contains="a run of evaluation.select"):
+    with raises_user_error("missing-run", contains="no run that trained a student"):
         read_trained_settings(run, SftCommand, "student")
 
 

@@ -56,15 +56,10 @@ def trained(settings, tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_adapters_of_another_rank_are_refused(settings, trained, tmp_path) -> None:
+def test_adapters_of_another_rank_are_refused(settings, trained) -> None:
     other = replace(settings, student=replace(settings.student, lora=LoraConfig(rank=8)))
     with raises_user_error("other-settings", contains="student.lora.rank was 4 and is now 8"):
         open_run(Run("trained", trained), asdict(other), "train.sft")
-    with raises_user_error("other-rank", contains="student.lora.rank"):
-        loading.load_trained(other.student, "fp32", trained / "student")
-    shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
-    with raises_user_error("other-rank", contains="checkpoint-1"):
-        sft.main.__wrapped__(other, Run("run", tmp_path))
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +77,8 @@ def test_adapters_of_another_base_are_refused(
     settings, trained, wider, saved_base, tmp_path
 ) -> None:
     over = replace(settings.student, model=wider)
-    with raises_user_error("other-base", contains=("64", "128")):
-        loading.load_trained(over, "fp32", trained / "student")
     with raises_user_error("other-base", contains=str(trained)):
         resolved_settings.check_base(trained, over)
-    shutil.copytree(trained / "checkpoint-1", tmp_path / "checkpoint-1")
-    with raises_user_error("other-base", contains="checkpoint-1"):
-        sft.main.__wrapped__(replace(settings, student=over), Run("run", tmp_path))
     # A base may be moved to another folder.
     shutil.copytree(saved_base, tmp_path / "moved")
     resolved_settings.check_base(trained, replace(over, model=str(tmp_path / "moved")))

@@ -12,7 +12,8 @@ ROOT = Path(__file__).parents[2]
 AVERAGE = """
 import torch
 from dynapix.conf.runs import rank
-from dynapix.models.distributed import average_gradients, end_ranks
+from dynapix.models.distributed import end_ranks
+from research.tiny_base.training import average_gradients
 
 gradients = [[[2.0, 4.0], None, None], [[4.0, 8.0], [1.0, 3.0], None]][rank()]
 parameters = [torch.nn.Parameter(torch.zeros(2)) for _ in gradients]
