@@ -216,14 +216,6 @@ class MajorityVote(Accuracy):
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """A coefficient of agreement over some items; its value is None where it is undefined."""
-
-    value: float | None
-    items: int
-
-
-@dataclass(frozen=True)
 class StudyReport:
     """report.json of evaluation.study.export.
 
@@ -233,10 +225,9 @@ class StudyReport:
         annotators: Annotators with votes.
         depth: Number of items by number of votes.
         accuracy: Accuracy by annotator.
-        fleiss_kappa: Over the items that all annotators with votes answered.
-        krippendorff_alpha: Over the items with two votes or more.
-        seconds: Median decision times by family: by the server's clock, by the client's clock, and
-            the number of votes that were timed.
+        fleiss_kappa: Over the `kappa_items` items that all annotators with votes answered; None
+            where it is undefined.
+        seconds: Median decision times by family.
     """
 
     benchmark: str
@@ -247,9 +238,9 @@ class StudyReport:
     depth: dict[str, int]
     accuracy: dict[str, Accuracy]
     majority: MajorityVote | None
-    fleiss_kappa: Agreement
-    krippendorff_alpha: Agreement
-    seconds: dict[str, dict[str, float]]
+    fleiss_kappa: float | None
+    kappa_items: int
+    seconds: dict[str, float]
 
 
 @dataclass(frozen=True)

@@ -346,10 +346,8 @@ def human_table(study: StudyReport) -> Table:
     rows = [human_row(name, accuracy) for name, accuracy in study.accuracy.items()]
     if study.majority:
         rows.append(human_row("Majority vote", study.majority))
-    for clock in ("server", "client"):
-        times = {f: study.seconds.get(f, {}).get(clock) for f in FAMILIES}
-        cells = {f.capitalize(): time and f"{time:.1f}" for f, time in times.items()}
-        rows.append({"name": f"Median seconds, {clock}", **cells})
+    times = {f.capitalize(): f"{seconds:.1f}" for f, seconds in study.seconds.items()}
+    rows.append({"name": "Median seconds", **dict.fromkeys(FAMILY_COLUMNS), **times})
     columns = [*FAMILY_COLUMNS, "Macro", "Micro", "Items"]
     return table_with_paper("human", "human", columns, {"": rows}, _human_notes(study))
 
@@ -362,7 +360,7 @@ def human_row(name: str, accuracy: Accuracy) -> Row:
 
 def _human_notes(study: StudyReport) -> tuple[str, ...]:
     depth = [f"{items} with {votes}" for votes, items in study.depth.items()]
-    kappa, alpha = study.fleiss_kappa, study.krippendorff_alpha
+    kappa = "undefined" if study.fleiss_kappa is None else f"{study.fleiss_kappa:.2f}"
     undecided = study.majority.undecided if study.majority else 0
     return (
         INTERVAL_NOTE,
@@ -370,18 +368,11 @@ def _human_notes(study: StudyReport) -> tuple[str, ...]:
         f"of judgments: {', '.join(depth)}.",
         f"A majority is more than half of an item's votes; {undecided} items have no majority and "
         "count as wrong.",
-        f"Fleiss' kappa: {_agreement(kappa.value)} on the {kappa.items} items that all "
+        f"Fleiss' kappa: {kappa} on the {study.kappa_items} items that all "
         f"{len(study.annotators)} annotators answered (paper: {reference('human_kappa'):.2f} "
         "on 19 items).",
-        f"Krippendorff's alpha: {_agreement(alpha.value)} on the {alpha.items} items with "
-        "two votes or more.",
-        "Median seconds: over items whose page was loaded only once. The server's clock includes "
-        "time in which the server was down.",
+        "Median seconds: over items whose page was loaded only once.",
     )
-
-
-def _agreement(value: float | None) -> str:
-    return "undefined" if value is None else f"{value:.2f}"
 
 
 def _width(width: int | None) -> str:
