@@ -164,8 +164,8 @@ class TwoStageCommand(GenerationCommand):
 class StudyCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     items: str = path("60")
-    """Number of test items, sampled evenly from the families; or a file that lists items, with one
-    item_id, or one JSON object with the key item_id, per line."""
+    """Number of test items, sampled evenly from the families; or a file with one item_id per
+    line."""
     annotators: int = setting(3, least=1)
     """Number of annotators. Each has a personal link and answers every item."""
     seed: int = setting(0, least=0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -55,33 +53,20 @@ def choose_items(cfg: StudyCommand, store: Store) -> list[SelectionItem]:
 
 
 def read_item_ids(path: Path) -> list[str]:
-    """Return the item ids in a file. A line is an id, or a JSON object with an item_id.
-
-    Raises:
-        UserError: The file cannot be read, lists no item, or lists an item twice.
-    """
+    """Return the item ids in a file, one in each line. Raises UserError if it cannot be read."""
     try:
-        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
-        ids = [str(json.loads(x)["item_id"]) if x.startswith("{") else x for x in lines]
-    except OSError as error:
+        lines = path.read_text("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
         raise UserError(
-            f"items={path}: {error.strerror}; give a number of items, or a file of item ids",
-            code="missing-file",
-        ) from error
-    except (ValueError, KeyError) as error:
-        raise UserError(
-            f"items={path} cannot be read ({error}): give one item_id, or one JSON object with an "
-            "item_id, per line",
+            f"items={path} cannot be read ({error}): give a number of items, or a file with one "
+            "item_id per line",
             code="invalid-items",
         ) from error
-    repeated = [item_id for item_id, count in Counter(ids).items() if count > 1]
-    if repeated or not ids:
-        problem = (
-            f"lists {repeated[0]} more than once: remove the repeated line"
-            if repeated
-            else "lists no item: give one item_id per line"
+    ids = list(dict.fromkeys(line.strip() for line in lines if line.strip()))
+    if not ids:
+        raise UserError(
+            f"items={path} lists no item: give one item_id per line", code="invalid-items"
         )
-        raise UserError(f"items={path} {problem}", code="invalid-items")
     return ids
 
 

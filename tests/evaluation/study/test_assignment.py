@@ -12,7 +12,7 @@ from dynapix.conf.schema import StudyCommand
 from dynapix.data.records import FAMILIES, Candidate, SelectionItem
 from dynapix.evaluation.study import storage
 from dynapix.evaluation.study.assignment import assign_items
-from dynapix.evaluation.study.setup import choose_items, item_scenes, read_item_ids, sample_items
+from dynapix.evaluation.study.setup import choose_items, item_scenes, sample_items
 from dynapix.evaluation.study.workflow import open_next_item
 from tests.user_errors import raises_user_error
 
@@ -38,7 +38,7 @@ def items() -> list[SelectionItem]:
     return [item(k, family) for k, family in enumerate(families)]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_correct_answers_are_balanced_over_letters(items, seed) -> None:
     by_id = {i.item_id: i for i in items}
     assignments = assign_items(items, NAMES, seed)
@@ -128,31 +128,16 @@ def test_sampled_items_are_balanced_and_do_not_share_scenes() -> None:
         sample_items(pool, 61, 0)
 
 
-def test_a_file_of_items_has_plain_ids_or_json(micro_store, tmp_path) -> None:
+def test_a_file_lists_items(micro_store, tmp_path) -> None:
     first, second, *_ = [i.item_id for i in micro_store.selection("test")]
     file = tmp_path / "items.txt"
-    file.write_text(f'{second}\n\n{{"item_id": "{first}", "note": 2}}\n')
+    for content, code in (
+        (None, "invalid-items"), ("\n", "invalid-items"), ("elsewhere\n", "unknown-item"),
+    ):  # fmt: skip
+        if content is not None:
+            file.write_text(content)
+        with raises_user_error(code, contains="item"):
+            choose_items(StudyCommand(items=str(file)), micro_store)
+    file.write_text(f"{second}\n\n{first}\n")
     chosen = choose_items(StudyCommand(items=str(file)), micro_store)
     assert [i.item_id for i in chosen] == [second, first]
-    file.write_text("elsewhere\n")
-    with raises_user_error("unknown-item", contains=("elsewhere", str(micro_store.folder))):
-        choose_items(StudyCommand(items=str(file)), micro_store)
-
-
-@pytest.mark.parametrize(
-    ("content", "code"),
-    [
-        (b"", "invalid-items"),
-        (b"i1\ni1\n", "invalid-items"),
-        (b'{"item": 1}', "invalid-items"),
-        (b"i1\n{", "invalid-items"),
-        (b"\xff\xfe\x00", "invalid-items"),
-        (None, "missing-file"),
-    ],
-)
-def test_an_invalid_file_of_items_is_refused(tmp_path, content, code) -> None:
-    file = tmp_path / "items.txt"
-    if content is not None:
-        file.write_bytes(content)
-    with raises_user_error(code, contains="items.txt"):
-        read_item_ids(file)
