@@ -10,11 +10,9 @@ import numpy as np
 
 from dynapix.data.checks.intervals import Interval, SceneBootstrap
 from dynapix.data.records import FAMILIES, RetrievalQuery
-from dynapix.evaluation.metrics.calibration import Calibration, PositionBias
-from dynapix.evaluation.metrics.pairs import PairScores
 from dynapix.evaluation.metrics.ranking import query_metrics
 from dynapix.evaluation.metrics.reasons import ReasonSummary
-from dynapix.evaluation.metrics.significance import PairedComparison
+from dynapix.evaluation.metrics.significance import PairedComparison, PairScores
 
 if TYPE_CHECKING:
     from dynapix.evaluation.retrieval.exact_search import Ranks
@@ -123,9 +121,8 @@ class SelectionReport:
         build: Hash that identifies the benchmark's build.
         controls: Comparisons of the unchanged items with each control. For matched-anchor items,
             also comparisons of the event question with the time question of each pair.
-        subtypes, readings, positions, calibration: Details by `SelectionResult.key`. `readings`
-            has the numbers of parsed responses, of valid records, and of responses that could not
-            be parsed for each reason.
+        subtypes, readings: Details by `SelectionResult.key`. `readings` has the numbers of parsed
+            responses, of valid records, and of responses that could not be parsed for each reason.
         reasons: What the rationales claim, by `SelectionResult.key`, for reasoning modes.
         pairs: Scores of pairs about interventions, by `SelectionResult.key`.
         asked: The mode and the control of each variant, and the `key` of its lines in
@@ -137,8 +134,6 @@ class SelectionReport:
     controls: list[PairedComparison]
     subtypes: dict[str, dict[str, Interval]]
     readings: dict[str, dict[str, int]]
-    positions: dict[str, PositionBias]
-    calibration: dict[str, Calibration]
     reasons: dict[str, ReasonSummary] = field(default_factory=dict)
     asked: list[tuple[str, str | None, str]] = field(default_factory=list)
     pairs: dict[str, list[PairScores]] = field(default_factory=dict)
