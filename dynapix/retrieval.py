@@ -11,8 +11,7 @@ import numpy as np
 from dynapix.benchmark import Benchmark, Query, refuse_repeated
 from dynapix.conf.errors import UserError
 from dynapix.conf.files import expand_path, write_json, write_text
-from dynapix.evaluation.metrics.arrays import to_array
-from dynapix.evaluation.metrics.ranking import share_above
+from dynapix.evaluation.metrics.ranking import share_above, to_array
 from dynapix.evaluation.metrics.results import RetrievalReport, RetrievalResult, retrieval_results
 from dynapix.evaluation.retrieval.exact_search import Ranks, exact_ranks, write_ranks
 from dynapix.integrations.logs import read_mteb

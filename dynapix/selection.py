@@ -20,8 +20,8 @@ from dynapix.conf.errors import UserError
 from dynapix.conf.files import expand_path, write_json, write_json_lines, write_text
 from dynapix.conf.schema.benchmark import PAIRED
 from dynapix.data.records import LETTERS
-from dynapix.evaluation.metrics.arrays import to_array
 from dynapix.evaluation.metrics.future_moment import FutureMoment, measure_future_moment
+from dynapix.evaluation.metrics.ranking import to_array
 from dynapix.evaluation.metrics.results import SIMILARITY, SelectionReport, SelectionResult
 from dynapix.evaluation.metrics.selection import (
     Choices,
@@ -261,8 +261,8 @@ class Result:
             o.item_id: nearest_candidates(o.scores).letters if o.scores else o.letter or ""
             for o in self.outcomes
         }
-        records, scene_of = [item.record for item in self.items], self.benchmark.store.scene
-        measured = measure_future_moment(records, {self.name: letters}, scene_of, self.seed)
+        records = [item.record for item in self.items]
+        measured = measure_future_moment(records, {self.name: letters}, self.seed)
         return measured.get(self.name)
 
     def compare(self, other: Result) -> Comparison:

@@ -28,15 +28,17 @@ def main(cfg: RetrieveCommand, run: Run) -> dict[str, float]:
     end_ranks()
     if rank() > 0:
         return {}
+    widths = preset.widths if preset.late is None else [preset.late.width]
     rows, ranks = [], {}
     for name, query_embeddings, frame_embeddings in embedded:
         log.info("ranking %s frames with %s", f"{len(frame_names):,}", name)
-        ranks[name] = standard_test.rank_targets(
-            preset,
+        ranks[name] = exact_search.exact_ranks(
             query_embeddings.rows([q.query_id for q in queries]),
             frame_embeddings.rows([q.target.name for q in queries]),
             frame_embeddings.parts(frame_names),
+            widths,
             frame_embeddings.rows(twins) if twins else None,
+            preset.late is not None,
         )
         rows += results.retrieval_results(store.name, name, ranks[name], queries, cfg.seed)
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import logging
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dynapix.conf.entry import Run, command
 from dynapix.conf.errors import UserError
+from dynapix.conf.files import write_text
 from dynapix.conf.runs import rank
 from dynapix.conf.schema import SelectCommand, SftCommand
 
 if TYPE_CHECKING:
     from dynapix.data.records import SelectionItem
     from dynapix.data.store import Store
+    from dynapix.evaluation.metrics.results import SelectionReport
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +62,6 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
     from dynapix.evaluation.metrics.reasons import measure_reasons
     from dynapix.evaluation.metrics.results import variant_name
     from dynapix.evaluation.metrics.selection import Choices, build_selection_report
-    from dynapix.evaluation.reporting.selection_report import write_report
 
     items = select_items(store, cfg.suite, cfg.limit, cfg.seed)
     frames = FrameReader(store, student.image_size)
@@ -146,6 +149,25 @@ def limit_items(items: list[SelectionItem], limit: int | None, seed: int) -> lis
         return [item for k in rng.permutation(len(pairs))[: limit // 2] for item in pairs[k]]
     order = rng.permutation(len(items))
     return interleave([items[k] for k in order], lambda item: item.family)[:limit]
+
+
+def write_report(report: SelectionReport, folder: Path, suite: str) -> None:
+    """Write report.txt, report.json and selection.png into `folder`, and log the main tables.
+    `suite` is the suite of the items."""
+    from dynapix.evaluation.reporting import tables
+    from dynapix.evaluation.reporting.figures import plot_accuracies
+    from dynapix.evaluation.reporting.reference import SUITE
+
+    results = report.rows
+    parts = [tables.selection_table(results, suite)]
+    parts += [tables.paired_table(report.controls)] if report.controls else []
+    parts += [tables.pair_table(report.pairs)] if report.pairs else []
+    log.info("%s", "\n\n".join(map(str, parts)))
+    parts += tables.detail_tables({r.key: (r.key, report) for r in results})
+    write_text(folder / "report.txt", "\n\n".join(map(str, parts)) + "\n")
+    write_text(folder / "report.json", json.dumps(asdict(report), indent=1))
+    by_family = {f"{r.name} ({r.variant})": r.families for r in results}
+    plot_accuracies(by_family, folder / "selection.png", suite == SUITE)
 
 
 if __name__ == "__main__":

@@ -4,11 +4,20 @@ the highest similarity to the prefix and the question."""
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from dynapix.conf.entry import Run, command
 from dynapix.conf.files import write_json_lines
 from dynapix.conf.runs import rank
 from dynapix.conf.schema import SimilarityCommand
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from dynapix.conf.schema import RetrieverConfig
+    from dynapix.data.records import SelectionItem
+    from dynapix.evaluation.embedders.cache import EmbeddingCache
 
 log = logging.getLogger(__name__)
 
@@ -24,9 +33,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         choose_letters,
         credit_choices,
     )
-    from dynapix.evaluation.reporting.selection_report import write_report
-    from dynapix.evaluation.retrieval import candidate_similarity
-    from dynapix.evaluation.select import select_items
+    from dynapix.evaluation.select import select_items, write_report
     from dynapix.models.distributed import end_ranks
 
     preset, store, embedders = open_retriever(cfg, run)
@@ -39,9 +46,10 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     choices, score_rows = [], []
     for name, queries, embeddings in embedded:
         log.info("scoring %s items with %s", f"{len(items):,}", name)
-        scores = candidate_similarity.score_candidates(items, queries, embeddings, preset)
+        scores = score_candidates(items, queries, embeddings, preset)
         credits = credit_choices(scores, [item.answer for item in items])
-        score_rows += candidate_similarity.score_rows(name, items, scores)
+        for item, row in zip(items, scores.tolist(), strict=True):
+            score_rows.append({"by": name, "item_id": item.item_id, "scores": row})
         letters = choose_letters(scores)
         choices.append(Choices(name, SIMILARITY, None, credits, letters))
 
@@ -49,6 +57,28 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     report = build_selection_report(choices, items, store.name, store.identity, cfg.seed, cfg.suite)
     write_report(report, run.folder, items[0].suite)
     return report.rows[0].metrics
+
+
+def score_candidates(
+    items: Sequence[SelectionItem],
+    queries: EmbeddingCache,
+    frames: EmbeddingCache,
+    preset: RetrieverConfig,
+) -> np.ndarray:
+    """Return the fp32 scores (items, candidates) at the widest width, computed as in retrieval:
+    equal embeddings have bit-identical scores."""
+    import numpy as np
+
+    from dynapix.evaluation.retrieval.exact_search import pair_scores
+
+    query_rows = queries.rows([item.name for item in items])
+    late = preset.late is not None
+    width = preset.late.width if late else preset.widths[0]
+    columns = []
+    for k in range(len(items[0].candidates)):
+        frame_rows = frames.rows([item.candidates[k].name for item in items])
+        columns.append(pair_scores(query_rows, frame_rows, width, late))
+    return np.stack(columns, axis=1)
 
 
 if __name__ == "__main__":

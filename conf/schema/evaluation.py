@@ -164,17 +164,10 @@ class TwoStageCommand(GenerationCommand):
 class StudyCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     items: str = path("60")
-    """Number of test items, sampled evenly from the families; or a file that lists items, with one
-    item_id, or one JSON object with the key item_id, per line."""
+    """Number of test items, sampled evenly from the families; or a file with one item_id per
+    line."""
     annotators: int = setting(3, least=1)
     """Number of annotators. Each has a personal link and answers every item."""
-    practice: int = setting(3, least=0)
-    """Number of practice items from the training split. Each annotator answers them first, with
-    feedback; these answers are not scored."""
-    rest_every: int = setting(20, least=1)
-    """Number of items between two breaks."""
-    session_days: float = setting(14.0, above=0)
-    """Days after which an annotator has to sign in again, with a new link from links.txt."""
     seed: int = setting(0, least=0)
     """Seed of the sample of items and of each annotator's order of items and candidates."""
     host: str = "127.0.0.1"

@@ -19,8 +19,8 @@ from dynapix.conf.errors import UserError
 from dynapix.conf.schema import RetrieverConfig
 from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.records import FrameRef, sample_prefix_frames
-from dynapix.evaluation.embedders.embedder import Query
 from dynapix.models.loading import DTYPES, explain_unloadable, for_inference, place_weights
+from dynapix.models.retriever.inputs import Query
 
 EmbedClips = Callable[[list[np.ndarray]], np.ndarray]
 

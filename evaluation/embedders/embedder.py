@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from dynapix.conf.schema import ContrastiveCommand, EmbedderConfig, RetrieverCon
 from dynapix.conf.schema.evaluation import EmbeddingCommand
 from dynapix.data.build import ensure_benchmark
 from dynapix.data.frames.frame_cache import FrameReader
-from dynapix.data.records import FrameRef, RetrievalQuery, SelectionItem
+from dynapix.data.records import FrameRef
 from dynapix.data.store import Store
 from dynapix.evaluation.embedders.cache import EmbeddingCache
 from dynapix.evaluation.metrics.results import UNTRAINED
@@ -31,6 +31,10 @@ from dynapix.models.precision import resolve_precision
 from dynapix.models.resolved_settings import check_base
 from dynapix.models.trained_runs import product_folder, resolve_model, run_title
 
+if TYPE_CHECKING:
+    from dynapix.evaluation.embedders.joint_encoder import Encoder
+    from dynapix.models.retriever.inputs import Query
+
 EMBEDDINGS = "embeddings"
 """Folder of the embeddings in a store."""
 INPUT_VERSION = 2
@@ -39,20 +43,7 @@ earlier embeddings are not reused."""
 PACKAGES = ("sentence-transformers", "transformers")
 """Packages that turn a prompt and pixels into a model's input, which depends on their versions."""
 
-Query = RetrievalQuery | SelectionItem
 Input = TypeVar("Input")
-
-
-class Encoder(Protocol):
-    """A loaded model. Its methods return fp32 embeddings (inputs, entries)."""
-
-    def embed_queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
-        """Embed prefixes with their questions."""
-
-    def embed_frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray: ...
-
-    def embed_texts(self, texts: list[str]) -> np.ndarray:
-        """Embed texts as queries without a prefix."""
 
 
 @dataclass(frozen=True)

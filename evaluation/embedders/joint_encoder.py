@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -12,18 +12,26 @@ from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.parallel import batched
 from dynapix.data.records import FrameRef
 from dynapix.evaluation.embedders.cache import pad_rows
-from dynapix.evaluation.embedders.embedder import Encoder, Query
 from dynapix.models.compat import keep_freed_memory
 from dynapix.models.retriever.embedder import load_retriever, load_trained
-from dynapix.models.retriever.inputs import encode, model_inputs
-
-if TYPE_CHECKING:
-    from dynapix.models.retriever.inputs import Retriever
+from dynapix.models.retriever.inputs import Query, Retriever, encode, model_inputs
 
 MAX_TOKEN_PAIRS = 64 * 512**2
 """Maximum entries of the attention mask of a batch of texts: 64 texts of 512 tokens, the default
 length of a response. A tokenizer may split a text into many more tokens; 64 such texts would need
 many GB."""
+
+
+class Encoder(Protocol):
+    """A loaded model. Its methods return fp32 embeddings (inputs, entries)."""
+
+    def embed_queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
+        """Embed prefixes with their questions."""
+
+    def embed_frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray: ...
+
+    def embed_texts(self, texts: list[str]) -> np.ndarray:
+        """Embed texts as queries without a prefix."""
 
 
 class JointEncoder:

@@ -100,14 +100,10 @@ def load_tower(
         config = CLIPConfig.from_dict(CLIPConfig.get_config_dict(source, revision=revision)[0])
         is_video = getattr(config.vision_config, "add_time_attn", False)
         if is_video != (kind is LanguageBindVideo):
-            has, needed, example = (
-                ("has", "an image model", "Image")
-                if is_video
-                else ("has no", "a fully fine-tuned video model", "Video_FT")
-            )
             raise UserError(
-                f"retriever.{key}={source} {has} attention over time: set {needed} of "
-                f"LanguageBind, such as LanguageBind/LanguageBind_{example}",
+                f"retriever.{key}={source} is another kind of model: set retriever.model to a "
+                "fully fine-tuned video model, such as LanguageBind/LanguageBind_Video_FT, and "
+                "retriever.image_model to LanguageBind/LanguageBind_Image",
                 code="wrong-model-type",
             )
         if is_video and (needed := config.vision_config.num_frames) != preset.frames:

@@ -48,6 +48,11 @@ log = logging.getLogger(__name__)
 
 WritePrompt = Callable[[Sample], tuple[Messages, RequestFields]]
 """Writes a sample as messages, and the fields in `extra_body` that go with them."""
+ADVICE = (
+    ": start a server with python -m teacher.serve frames=true, or correct server.url, which ends "
+    f"with /v1, or the API key in the environment variable {API_KEY_VARIABLE}"
+)
+"""What to do about a server that does not list its models."""
 CANARY_SIZE = 64
 """Width and height (px) of the blank frames of a canary: a request that any working server answers,
 sent after a failure to find out whether the server or the failed request is at fault."""
@@ -284,8 +289,8 @@ def served_origin(server: ServerConfig) -> dict[str, str | None]:
             problems[url] = error
     if not origins:
         lines = [
-            f"{url} does not list its models ({_describe(error)})"
-            f"{proxy_hint(url) or f': {_advise(error)}'}"
+            f"{url} does not list its models ({str(error.__cause__ or error).splitlines()[0]})"
+            f"{proxy_hint(url) or ADVICE}"
             for url, error in problems.items()
         ]
         raise UserError("\n".join(lines), code="no-server")
@@ -334,22 +339,3 @@ def _serves_folder(client: openai.OpenAI, name: str) -> bool:
     except openai.OpenAIError:
         return False
     return True
-
-
-def _describe(error: Exception) -> str:
-    """Describe in one line why a server did not list its models."""
-    if isinstance(error, MALFORMED_REPLY_ERRORS):
-        return f"the reply is not a list of models, {type(error).__name__}"
-    return str(error.__cause__ or error).partition("\n")[0]
-
-
-def _advise(error: Exception) -> str:
-    """Return advice for a user whose server gave an error."""
-    match error:
-        case openai.APITimeoutError() | openai.InternalServerError() | openai.RateLimitError():
-            return "run the same command again when the server accepts requests"
-        case openai.APIConnectionError():
-            return "start a server with python -m teacher.serve frames=true, or correct server.url"
-        case openai.PermissionDeniedError():
-            return f"check the API key in the environment variable {API_KEY_VARIABLE}"
-    return "check that server.url is that of an OpenAI-compatible server and ends with /v1"

@@ -7,21 +7,15 @@ or choose the right moment of a wrong future.
 
 from __future__ import annotations
 
-from bisect import bisect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from dynapix.data.checks.intervals import Interval, SceneBootstrap
-from dynapix.data.oracle.displacement import cross_scene_displacement
-from dynapix.data.records import LETTERS, Candidate, Scene, SelectionItem
+from dynapix.data.records import LETTERS, Candidate, SelectionItem
 from dynapix.evaluation.metrics.selection import horizon_of, horizon_order
-
-BAND_EDGES = (24, 48, 96)
-BANDS = ("below 24 px", "24 to 48 px", "48 to 96 px", "96 px or more")
-"""Bands of displacements (px at 336 x 336), and the displacements at which they begin and end."""
 
 
 @dataclass(frozen=True)
@@ -40,22 +34,15 @@ class FutureMoment:
 
     Attributes:
         horizons: By horizon (time from the prefix to the target), shortest first, such as "1 s".
-        future_bands: The share with the true future, by the displacement between the two futures at
-            the true moment.
-        moment_bands: The share with the true moment, by the displacement between the two moments of
-            the true future.
     """
 
     total: Shares
     horizons: dict[str, Shares]
-    future_bands: dict[str, Interval]
-    moment_bands: dict[str, Interval]
 
 
 def measure_future_moment(
     items: Sequence[SelectionItem],
     letters: Mapping[str, Mapping[str, str]],
-    scene_of: Callable[[str], Scene],
     seed: int,
 ) -> dict[str, FutureMoment]:
     """Return the shares of each model that answered all balanced time items among `items`; none if
@@ -74,8 +61,6 @@ def measure_future_moment(
     every = ["all" if item else "" for item in measured]
     horizons = [horizon_of(item) if item else "" for item in measured]
     ordered = sorted({*horizons} - {""}, key=horizon_order)
-    bands = [_bands(item, scene_of) if item else ("", "") for item in measured]
-    future_bands, moment_bands = zip(*bands, strict=True)
 
     def measure(chosen: Mapping[str, str]) -> FutureMoment:
         credits = [_credits(i, chosen[i.item_id]) if i else (0, 0, 0) for i in measured]
@@ -86,14 +71,8 @@ def measure_future_moment(
             return {name: Shares(*(part[name] for part in parts)) for name in parts[0]}
 
         by_horizon = shares(horizons)
-        by_future = scenes.group_means(future, future_bands)
-        by_moment = scenes.group_means(moment, moment_bands)
-        return FutureMoment(
-            shares(every)["all"],
-            {horizon: by_horizon[horizon] for horizon in ordered},
-            {band: by_future[band] for band in BANDS if band in by_future},
-            {band: by_moment[band] for band in BANDS if band in by_moment},
-        )
+        ordered_shares = {horizon: by_horizon[horizon] for horizon in ordered}
+        return FutureMoment(shares(every)["all"], ordered_shares)
 
     return {
         name: measure(chosen)
@@ -117,16 +96,3 @@ def _credits(item: SelectionItem, letters: str) -> np.ndarray:
     """Return the credit (3,) of the chosen letters for the target, the future and the moment."""
     shown = [_shows(item, item.candidates[LETTERS.index(letter)]) for letter in letters]
     return np.mean([(all(s), *s) for s in shown] or [(0, 0, 0)], axis=0)
-
-
-def _bands(item: SelectionItem, scene_of: Callable[[str], Scene]) -> tuple[str, str]:
-    """Return the bands of the displacements from the target to the other future at its moment, and
-    to the other moment of its future."""
-    by_shown = {_shows(item, candidate): candidate for candidate in item.candidates}
-    own = scene_of(item.scene_id)
-    displacements = (
-        cross_scene_displacement(own, item.target_frame, scene_of(other.scene_id), other.frame)
-        for other in (by_shown[False, True], by_shown[True, False])
-    )
-    other_future, other_moment = (BANDS[bisect(BAND_EDGES, d)] for d in displacements)
-    return other_future, other_moment

@@ -8,11 +8,11 @@ measure is its mean over all orders of these frames, so that constant scores giv
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
 from dynapix.conf.errors import UserError
-from dynapix.evaluation.metrics.arrays import to_array
 
 
 def target_scores(scores: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -140,3 +140,21 @@ def rank_metrics(
 
 def _average(measure: str) -> Callable[[np.ndarray], float]:
     return np.median if measure == "median_rank" else np.mean
+
+
+def to_array(values: Any, dtype: Any = None) -> np.ndarray:
+    """Return numbers as an array: those of an array, of a tensor on any device, also with gradients
+    or in bf16, or of nested lists of them. Raises the errors of numpy and of torch."""
+    try:
+        return np.asarray(values, dtype)
+    except (RuntimeError, TypeError, ValueError):
+        return np.asarray(_detach(values), dtype)
+
+
+def _detach(values: Any) -> Any:
+    if isinstance(values, list | tuple):
+        return [_detach(value) for value in values]
+    if not hasattr(values, "detach"):
+        return values
+    tensor = values.detach().cpu()
+    return (tensor.double() if tensor.is_floating_point() else tensor).numpy()

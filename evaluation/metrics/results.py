@@ -10,11 +10,9 @@ import numpy as np
 
 from dynapix.data.checks.intervals import Interval, SceneBootstrap
 from dynapix.data.records import FAMILIES, RetrievalQuery
-from dynapix.evaluation.metrics.calibration import Calibration, PositionBias
-from dynapix.evaluation.metrics.pairs import PairScores
 from dynapix.evaluation.metrics.ranking import query_metrics
 from dynapix.evaluation.metrics.reasons import ReasonSummary
-from dynapix.evaluation.metrics.significance import PairedComparison
+from dynapix.evaluation.metrics.significance import PairedComparison, PairScores
 
 if TYPE_CHECKING:
     from dynapix.evaluation.retrieval.exact_search import Ranks
@@ -123,9 +121,8 @@ class SelectionReport:
         build: Hash that identifies the benchmark's build.
         controls: Comparisons of the unchanged items with each control. For matched-anchor items,
             also comparisons of the event question with the time question of each pair.
-        subtypes, readings, positions, calibration: Details by `SelectionResult.key`. `readings`
-            has the numbers of parsed responses, of valid records, and of responses that could not
-            be parsed for each reason.
+        subtypes, readings: Details by `SelectionResult.key`. `readings` has the numbers of parsed
+            responses, of valid records, and of responses that could not be parsed for each reason.
         reasons: What the rationales claim, by `SelectionResult.key`, for reasoning modes.
         pairs: Scores of pairs about interventions, by `SelectionResult.key`.
         asked: The mode and the control of each variant, and the `key` of its lines in
@@ -137,8 +134,6 @@ class SelectionReport:
     controls: list[PairedComparison]
     subtypes: dict[str, dict[str, Interval]]
     readings: dict[str, dict[str, int]]
-    positions: dict[str, PositionBias]
-    calibration: dict[str, Calibration]
     reasons: dict[str, ReasonSummary] = field(default_factory=dict)
     asked: list[tuple[str, str | None, str]] = field(default_factory=list)
     pairs: dict[str, list[PairScores]] = field(default_factory=dict)
@@ -216,14 +211,6 @@ class MajorityVote(Accuracy):
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """A coefficient of agreement over some items; its value is None where it is undefined."""
-
-    value: float | None
-    items: int
-
-
-@dataclass(frozen=True)
 class StudyReport:
     """report.json of evaluation.study.export.
 
@@ -233,10 +220,9 @@ class StudyReport:
         annotators: Annotators with votes.
         depth: Number of items by number of votes.
         accuracy: Accuracy by annotator.
-        fleiss_kappa: Over the items that all annotators with votes answered.
-        krippendorff_alpha: Over the items with two votes or more.
-        seconds: Median decision times by family: by the server's clock, by the client's clock, and
-            the number of votes that were timed.
+        fleiss_kappa: Over the `kappa_items` items that all annotators with votes answered; None
+            where it is undefined.
+        seconds: Median decision times by family.
     """
 
     benchmark: str
@@ -247,9 +233,9 @@ class StudyReport:
     depth: dict[str, int]
     accuracy: dict[str, Accuracy]
     majority: MajorityVote | None
-    fleiss_kappa: Agreement
-    krippendorff_alpha: Agreement
-    seconds: dict[str, dict[str, float]]
+    fleiss_kappa: float | None
+    kappa_items: int
+    seconds: dict[str, float]
 
 
 @dataclass(frozen=True)

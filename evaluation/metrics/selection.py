@@ -15,12 +15,6 @@ from dynapix.data.checks.intervals import Interval, SceneBootstrap
 from dynapix.data.items.controls import pair_items
 from dynapix.data.items.recipes import TIME_CELLS
 from dynapix.data.records import LETTERS, SelectionItem
-from dynapix.evaluation.metrics.calibration import (
-    Calibration,
-    measure_calibration,
-    measure_position_bias,
-)
-from dynapix.evaluation.metrics.pairs import PairScores, score_pairs
 from dynapix.evaluation.metrics.reasons import ReasonSummary
 from dynapix.evaluation.metrics.results import (
     BASELINE,
@@ -29,7 +23,13 @@ from dynapix.evaluation.metrics.results import (
     SelectionResult,
     accuracy_by_family,
 )
-from dynapix.evaluation.metrics.significance import PairedComparison, compare_anchors, compare_runs
+from dynapix.evaluation.metrics.significance import (
+    PairedComparison,
+    PairScores,
+    compare_anchors,
+    compare_runs,
+    score_pairs,
+)
 
 if TYPE_CHECKING:
     from dynapix.evaluation.generators.response_log import Answer
@@ -98,16 +98,13 @@ def build_selection_report(
     scenes = SceneBootstrap([i.scene_id for i in items], seed)
     results = [_selection_result(c, items, scenes, benchmark, suite) for c in choices]
     by_key = {result.key: c for result, c in zip(results, choices, strict=True)}
-    subtypes, letters = [f"{i.family}/{i.subtype}" for i in items], [i.letter for i in items]
-    calibrations = {key: _calibrate(c.answers) for key, c in by_key.items()}
+    subtypes = [f"{i.family}/{i.subtype}" for i in items]
     return SelectionReport(
         build,
         results,
         controls=_compare_controls(by_key, items, seed),
         subtypes={key: scenes.group_means(c.credits, subtypes) for key, c in by_key.items()},
         readings={key: count_readings(c.answers) for key, c in by_key.items() if c.answers},
-        positions={key: measure_position_bias(c.letters, letters) for key, c in by_key.items()},
-        calibration={key: of for key, of in calibrations.items() if of},
         reasons={**reasons},
         asked=[*asked],
         pairs=_score_interventions(by_key, items, seed),
@@ -177,12 +174,6 @@ def count_readings(answers: Sequence[Answer]) -> dict[str, int]:
         counts["  in a valid record"] = sum(a.valid for a in answers)
     reasons = Counter(f"without: {a.reason}" for a in answers if a.letter is None)
     return counts | dict(reasons.most_common())
-
-
-def _calibrate(answers: Sequence[Answer]) -> Calibration | None:
-    """Return the calibration of the confidences in valid records; None without valid records."""
-    valid = [answer for answer in answers if answer.valid]
-    return measure_calibration([a.record.confidence for a in valid], [a.right for a in valid])
 
 
 def _compare_controls(

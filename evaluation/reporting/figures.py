@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
 import numpy as np
 
 from dynapix.data.checks.figures import COLORS, GRID, INK, create_figure, legend_above
 from dynapix.data.checks.intervals import Interval
-from dynapix.evaluation.metrics.future_moment import FutureMoment
 from dynapix.evaluation.metrics.results import RECALLS, UNTRAINED, RetrievalResult
 from dynapix.evaluation.reporting.reference import COT_STUDENT, cot_student
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 GRAY = "#999999"
 """Color of untrained retrievers."""
-CHANCE = {"accuracy": 25, "future": 50, "moment": 50}
-"""Shares (%) of random choices among the candidates of balanced time items."""
 
 
 def plot_accuracies(
@@ -84,53 +78,16 @@ def plot_recalls(rows: Iterable[tuple[str, RetrievalResult]], file: Path | IO[by
             recalls = [r.measures[f"recall@{k}"] for r in by_width]
             widths, untrained = [r.width for r in by_width], name.startswith(UNTRAINED)
             color = GRAY if untrained else COLORS[i % len(COLORS)]
-            _plot_line(axes, widths, recalls, color, name, "--o" if untrained else "-o")
+            style = "--o" if untrained else "-o"
+            value, low, high = 100 * np.array([(r.value, r.low, r.high) for r in recalls]).T
+            axes.fill_between(widths, low, high, color=color, alpha=0.14, linewidth=0)
+            axes.plot(widths, value, style, color=color, markersize=4, label=name)
         axes.set_xscale("log", base=2)
         axes.xaxis.set_major_formatter("{x:.0f}")
         axes.set(xlabel="Embedding width", ylim=(0, None))
-        _style_panel(axes, f"Recall@{k}")
+        axes.set_title(f"Recall@{k}", fontsize=11)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", color=GRID)
     panels[0].set_ylabel("Queries (%)")
     legend_above(figure, panels[0])
     figure.savefig(file)
-
-
-def plot_future_moment(models: Mapping[str, FutureMoment], file: Path | IO[bytes]) -> None:
-    """Plot the accuracy on balanced time items, and its split into future and moment (%), over the
-    time from the prefix to the target, with 95% intervals as bands.
-
-    Args:
-        models: The shares of each model, by the model's label.
-    """
-    figure = create_figure(9, 3.8)
-    panels = figure.subplots(1, 3, sharey=True)
-    for axes, (name, chance) in zip(panels, CHANCE.items(), strict=True):
-        for i, (label, of_model) in enumerate(models.items()):
-            seconds = [float(horizon.split()[0]) for horizon in of_model.horizons]
-            shares = [getattr(shares, name) for shares in of_model.horizons.values()]
-            _plot_line(axes, seconds, shares, COLORS[i % len(COLORS)], label)
-        axes.axhline(chance, color=INK, linestyle="--", linewidth=1, zorder=0, label="chance")
-        axes.set(xlabel="Seconds after the prefix", ylim=(0, 104))
-        _style_panel(axes, name.capitalize())
-    panels[0].set_ylabel("Items (%)")
-    legend_above(figure, panels[0])
-    figure.savefig(file)
-
-
-def _plot_line(
-    axes: Axes,
-    xs: Sequence[float],
-    intervals: Sequence[Interval],
-    color: str,
-    label: str,
-    style: str = "-o",
-) -> None:
-    """Plot values (%) as a line, with their 95% intervals as a band."""
-    value, low, high = 100 * np.array([(i.value, i.low, i.high) for i in intervals]).T
-    axes.fill_between(xs, low, high, color=color, alpha=0.14, linewidth=0)
-    axes.plot(xs, value, style, color=color, markersize=4, label=label)
-
-
-def _style_panel(axes: Axes, title: str) -> None:
-    axes.set_title(title, fontsize=11)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(axis="y", color=GRID)

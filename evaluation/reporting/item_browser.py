@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from dynapix.conf.errors import UserError
 from dynapix.conf.schema.benchmark import PAIRED
-from dynapix.data.checks.intervals import Interval, SceneBootstrap
+from dynapix.data.checks.intervals import Interval
 from dynapix.data.checks.observer import SIMULATES, load_observers
 from dynapix.data.checks.observer_curve import CEILING_ERROR, ObserverCurve, observer_curves
 from dynapix.data.frames.frame_cache import FrameReader
@@ -26,7 +26,6 @@ from dynapix.evaluation.metrics.baselines import baseline_results
 from dynapix.evaluation.metrics.future_moment import FutureMoment, measure_future_moment
 from dynapix.evaluation.metrics.reasons import item_predicates, read_reasons
 from dynapix.evaluation.metrics.results import SelectionResult
-from dynapix.evaluation.metrics.selection import accuracy_by_horizon
 from dynapix.evaluation.metrics.significance import PairedComparison
 from dynapix.evaluation.reporting.measurements import (
     Measurement,
@@ -39,8 +38,6 @@ from dynapix.teacher.cited_rationales import list_facts
 from dynapix.teacher.reading.claims import Claim
 from dynapix.teacher.sections import SECTIONS
 
-SHOWN_ERRORS = (1.0, 4.0, 16.0)
-"""Errors (px) of the observers whose accuracy by horizon is plotted."""
 PREFIX_FRAMES = 6
 """Number of frames of the prefix that are shown, evenly spread."""
 FRAME_WIDTH = 160
@@ -62,8 +59,6 @@ class ItemBrowser:
         baselines: Results of the baselines on the same items, by `Measurement.group`.
         observers: Curves of the observers on the same items, by `Measurement.item_set`; empty for
             items that no observer has seen.
-        observer_horizons: Accuracies by horizon of observers that simulate, by
-            `Measurement.item_set` and label.
         future_moment: By `Measurement.group` and label of a model: the shares of its answers that
             show the true future and the true moment of balanced time items.
     """
@@ -77,7 +72,6 @@ class ItemBrowser:
     )
     baselines: dict[str, list[SelectionResult]] = field(default_factory=dict)
     observers: dict[str, dict[str, ObserverCurve]] = field(default_factory=dict)
-    observer_horizons: dict[str, dict[str, dict[str, Interval]]] = field(default_factory=dict)
     future_moment: dict[str, dict[str, FutureMoment]] = field(default_factory=dict)
 
     def add_group(
@@ -107,7 +101,7 @@ class ItemBrowser:
         if standard:
             self.baselines[name] = baseline_results(standard, store, seed)
             letters = {label: {k: a.letters for k, a in r.items()} for label, r in by_label.items()}
-            self.future_moment[name] = measure_future_moment(standard, letters, store.scene, seed)
+            self.future_moment[name] = measure_future_moment(standard, letters, seed)
         ceilings = self._add_observers(store, models, items, seed)
         shown = choose_items(answered, by_label, limit, seed)
         entries = page_entries(shown, by_label, store, name, ceilings)
@@ -145,12 +139,6 @@ class ItemBrowser:
             own = [items[name] for name in m.responses if name in seen]
             if len(own) == m.result.n and m.item_set not in self.observers:
                 self.observers[m.item_set] = observer_curves(results, own, seed)
-                scenes = SceneBootstrap([item.scene_id for item in own], seed)
-                shares = results[SIMULATES].loc[[item.item_id for item in own]]
-                self.observer_horizons[m.item_set] = {
-                    f"observer with {error:g} px": accuracy_by_horizon(own, shares[error], scenes)
-                    for error in SHOWN_ERRORS
-                }
         return seen
 
 

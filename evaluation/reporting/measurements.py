@@ -131,6 +131,12 @@ class Measurement:
         return bool({benchmark.get("simulator"), benchmark.get("recipe")} & {*TRANSFER_SUITES})
 
     @property
+    def source(self) -> tuple:
+        """The benchmark, its build and its suite."""
+        suite = self.result.suite if isinstance(self.result, SelectionResult) else None
+        return self.benchmark, self.run.report.build, suite
+
+    @property
     def row_key(self) -> tuple:
         """Key of the result's row in a table; results with equal keys need different names."""
         result = self.result
@@ -140,7 +146,7 @@ class Measurement:
 
 
 def read_measurements(runs: Iterable[FinishedRun], kinds: Sequence[str]) -> list[Measurement]:
-    """Return the results of the runs of some kinds."""
+    """Return the results of the runs of some kinds, each once and with a unique name."""
     measurements = []
     for run in runs:
         if run.kind in kinds:
@@ -149,10 +155,34 @@ def read_measurements(runs: Iterable[FinishedRun], kinds: Sequence[str]) -> list
                 is_trained = not row.name.startswith((UNTRAINED, SCENE_ALONE))
                 trained = run.training if is_trained else None
                 measurements.append(Measurement(row, run, row.name, trained))
-    return measurements
+    return _deduplicate(_distinguish_item_sets(measurements))
 
 
-def deduplicate(measurements: Iterable[Measurement]) -> list[Measurement]:
+def _distinguish_item_sets(measurements: Sequence[Measurement]) -> list[Measurement]:
+    """Label each result that is not on the main build of its benchmark, or not on its main items.
+
+    The main build of a benchmark is that of its most recent run, because two builds can have other
+    items and queries with the same ids. The main items of a build are the largest set that a run
+    answered; `limit=` gives smaller ones.
+    """
+    by_time = sorted(measurements, key=lambda m: m.run.started)
+    builds = {m.benchmark: m.run.report.build for m in by_time}
+    main: dict[tuple, Responses] = {}
+    for m in measurements:
+        main[m.source] = max(main.get(m.source, {}), m.responses, key=len)
+    distinguished = []
+    for m in measurements:
+        parts = []
+        if m.run.report.build != builds[m.benchmark]:
+            parts.append(f"build {m.run.report.build[:8]}")
+        if m.responses and m.responses.keys() != main[m.source].keys():
+            digest = hashlib.sha256("\n".join(sorted(m.responses)).encode()).hexdigest()[:4]
+            parts.append(f"{len(m.responses)} items ({digest})")
+        distinguished.append(replace(m, distinction=", ".join(parts)))
+    return distinguished
+
+
+def _deduplicate(measurements: Sequence[Measurement]) -> list[Measurement]:
     """Drop repeated results, and give the others unique names.
 
     Retrievers with the same base each report the results of that base. If different results have
@@ -167,20 +197,6 @@ def deduplicate(measurements: Iterable[Measurement]) -> list[Measurement]:
         replace(m, name=f"{m.result.name}, {m.run.name}") if counts[m.row_key] > 1 else m
         for m in kept
     ]
-
-
-def shared_names(measurements: Iterable[Measurement]) -> list[str]:
-    """Return a name for each result. Results of a model on several item sets get the same name.
-
-    If a model has several results on an item set, only the first gets that name. The others get
-    their unique names, which contain the names of their runs.
-    """
-    used: set[tuple] = set()
-    names = []
-    for m in measurements:
-        names.append(m.name if m.row_key[1:] in used else m.result.name)
-        used.add(m.row_key[1:])
-    return names
 
 
 def group_by_item_set(measurements: Iterable[Measurement]) -> dict[str, list[Measurement]]:
@@ -210,39 +226,6 @@ def widest_results(measurements: Iterable[Measurement]) -> list[Measurement]:
         if m.result.builder is None:
             widest.setdefault((m.run.folder, m.name), m)
     return sorted(widest.values(), key=lambda m: m.trained)
-
-
-def distinguish_item_sets(measurements: Iterable[Measurement]) -> list[Measurement]:
-    """Label each result that is not on the main build of its benchmark, or not on its main items.
-
-    The main build of a benchmark is that of its most recent run, because two builds can have other
-    items and queries with the same ids. The main items of a build are the largest set that a run
-    answered; `limit=` gives smaller ones.
-    """
-    measurements = list(measurements)
-    builds: dict[str, str] = {}
-    for m in sorted(measurements, key=lambda m: m.run.started):
-        builds[m.benchmark] = m.run.report.build
-    items_of = [frozenset(m.responses) for m in measurements]
-    main: dict[tuple, frozenset[str]] = {}
-    for m, items in zip(measurements, items_of, strict=True):
-        key = _build_and_suite(m)
-        main[key] = max(main.get(key, frozenset()), items, key=len)
-    distinguished = []
-    for m, items in zip(measurements, items_of, strict=True):
-        parts = []
-        if m.run.report.build != builds[m.benchmark]:
-            parts.append(f"build {m.run.report.build[:8]}")
-        if items and items != main[_build_and_suite(m)]:
-            digest = hashlib.sha256("\n".join(sorted(items)).encode()).hexdigest()[:4]
-            parts.append(f"{len(items)} items ({digest})")
-        distinguished.append(replace(m, distinction=", ".join(parts)))
-    return distinguished
-
-
-def _build_and_suite(m: Measurement) -> tuple:
-    suite = m.result.suite if isinstance(m.result, SelectionResult) else None
-    return m.benchmark, m.run.report.build, suite
 
 
 def compare_models(

@@ -1,10 +1,9 @@
 """The overview that `evaluation.report` prints: the accuracy of the student that was evaluated last
-and of each trained retriever, and example responses."""
+and of each trained retriever."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from textwrap import indent
 
 from dynapix.data.checks.intervals import Interval
 from dynapix.evaluation.metrics.baselines import TITLES
@@ -12,8 +11,6 @@ from dynapix.evaluation.metrics.results import TWIN_ABOVE, RetrievalResult
 from dynapix.evaluation.reporting.item_browser import ItemBrowser
 from dynapix.evaluation.reporting.measurements import Measurement, widest_results
 
-EXAMPLES = 5
-"""Number of responses that are shown."""
 CHANCE = 25.0
 """Accuracy of random choices among four candidates, in percent."""
 
@@ -43,8 +40,6 @@ def write_overview(
                 else "Its responses make no claims that the oracle can check."
             )
     lines += _describe_retriever(retrievals)
-    if main is not None:
-        lines += _show_responses(main, browser)
     return "\n".join(lines)
 
 
@@ -83,21 +78,3 @@ def _describe_retriever(retrievals: Sequence[Measurement]) -> Iterator[str]:
             f"{m.name} finds the {m.result.pool} frame among the first 10 of {m.result.frames:,} "
             f"in {percent(m.result.recall_10)} of {m.result.queries:,} queries{beside}.{above}"
         )
-
-
-def _show_responses(main: Measurement, browser: ItemBrowser) -> Iterator[str]:
-    """Yield responses of a student: first to items that it solves, then to others."""
-    shown = [
-        (entry, response)
-        for entry in browser.entries
-        for response in entry["responses"]
-        if entry["benchmark"] == main.group and response["model"] == main.label
-    ]
-    solved = [pair for pair in shown if pair[1]["verdict"] == "correct"]
-    others = [pair for pair in shown if pair[1]["verdict"] != "correct"]
-    for entry, response in [*solved[: EXAMPLES - EXAMPLES // 2], *others[: EXAMPLES // 2]]:
-        yield (
-            f"\nItem {entry['id']}: {entry['question']} The target is {entry['answer']}; the "
-            f"response is {response['verdict']}."
-        )
-        yield indent(response["text"], "    ")

@@ -151,7 +151,7 @@ def build_ablation(selections: Results) -> Section:
         return Section("Ablation")
     rows.sort(key=lambda m: list(REGIMES).index(m.regime))
     table = summary_tables.overall_table(
-        "ablation", rows, lambda m, name: f"{REGIMES[m.regime]} ({name})"
+        "ablation", rows, lambda m: f"{REGIMES[m.regime]} ({m.name})"
     )
     return Section("Ablation", [table])
 
@@ -161,9 +161,7 @@ def build_transfer(selections: Results, transfers: Container[str], browser: Item
     section = Section("Transfer")
     models = {(m.result.name, m.result.mode) for m in selections if m.benchmark in transfers}
     if measured := [m for m in selections if (m.result.name, m.result.mode) in models]:
-        table = summary_tables.overall_table(
-            "transfer", measured, lambda m, name: f"{name} ({m.result.mode})"
-        )
+        table = summary_tables.overall_table("transfer", measured, lambda m: m.label)
         section.tables.append(table)
     for rows in group_by_item_set(selections).values():
         if rows[0].benchmark in transfers:
@@ -219,7 +217,6 @@ def build_selection_details(
     for benchmark, rows in group_by_item_set(selections).items():
         if horizons := {m.label: m.result.horizons for m in rows if m.result.horizons}:
             plot = partial(figures.plot_accuracies, with_paper=rows[0].benchmark not in transfers)
-            horizons |= browser.observer_horizons.get(benchmark, {})
             caption = f"Accuracy by horizon on {benchmark}."
             section.figures.append(
                 Figure(file_stem(f"horizons-{benchmark}"), caption, plot, horizons)
@@ -230,13 +227,7 @@ def build_selection_details(
             name = file_stem(f"observer-{benchmark}")
             section.figures.append(Figure(name, caption, plot, curves))
         if split := browser.future_moment.get(benchmark):
-            section.tables += [
-                _name_table(table, benchmark) for table in tables.future_moment_tables(split)
-            ]
-            name, caption = f"future-moment-{benchmark}", f"Future and moment on {benchmark}."
-            section.figures.append(
-                Figure(file_stem(name), caption, figures.plot_future_moment, split)
-            )
+            section.tables.append(_name_table(tables.future_moment_table(split), benchmark))
         details = tables.detail_tables({m.label: (m.result.key, m.run.report) for m in rows})
         section.tables += [_name_table(replace(t, folded=True), benchmark) for t in details]
     return section

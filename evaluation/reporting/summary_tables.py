@@ -17,7 +17,6 @@ from dynapix.evaluation.reporting.measurements import (
     TRANSFER_SUITES,
     Measurement,
     SeededResult,
-    shared_names,
 )
 from dynapix.evaluation.reporting.reference import table_with_paper
 from dynapix.evaluation.reporting.table import Row, Table, file_stem
@@ -140,20 +139,20 @@ def seed_tables(
 
 
 def overall_table(
-    name: str, rows: Sequence[Measurement], label: Callable[[Measurement, str], str]
+    name: str, rows: Sequence[Measurement], label: Callable[[Measurement], str]
 ) -> Table:
     """Return a table of the accuracies over all items of a benchmark, with a row for each model and
     a column for each benchmark.
 
     Args:
         name: Key below `tables` in `reference.yaml`.
-        label: Returns the name of a result's row from the result and the name of its model.
+        label: Returns the name of a result's row.
     """
-    names, benchmarks = shared_names(rows), _benchmark_columns(rows)
+    benchmarks = _benchmark_columns(rows)
     columns = list(dict.fromkeys(["In domain", *TRANSFER_SUITES.values(), *benchmarks]))
     by_label: dict[str, dict[str, Any]] = {}
-    for m, model, column in zip(rows, names, benchmarks, strict=True):
-        empty = {"name": label(m, model), **dict.fromkeys(columns)}
+    for m, column in zip(rows, benchmarks, strict=True):
+        empty = {"name": label(m), **dict.fromkeys(columns)}
         by_label.setdefault(empty["name"], empty)[column] = m.result.micro
     notes = (INTERVAL_NOTE, BEST_NOTE)
     table = table_with_paper(name, name, columns, {"": [*by_label.values()]}, notes)

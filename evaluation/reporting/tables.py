@@ -7,10 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from dynapix.data.checks.intervals import Interval
-from dynapix.data.records import FAMILIES, LETTERS
-from dynapix.evaluation.metrics.calibration import Calibration, PositionBias
-from dynapix.evaluation.metrics.future_moment import BANDS, FutureMoment
-from dynapix.evaluation.metrics.pairs import PairScores
+from dynapix.data.records import FAMILIES
+from dynapix.evaluation.metrics.future_moment import FutureMoment
 from dynapix.evaluation.metrics.reasons import ReasonSummary
 from dynapix.evaluation.metrics.results import (
     MEASURES,
@@ -24,7 +22,7 @@ from dynapix.evaluation.metrics.results import (
     SelectionResult,
     StudyReport,
 )
-from dynapix.evaluation.metrics.significance import PairedComparison, adjust_holm
+from dynapix.evaluation.metrics.significance import PairedComparison, PairScores, adjust_holm
 from dynapix.evaluation.reporting.reference import SUITE, reference, table_with_paper
 from dynapix.evaluation.reporting.table import DETAIL, Row, Table
 
@@ -92,17 +90,14 @@ def detail_tables(reports: Mapping[str, tuple[str, SelectionReport]]) -> list[Ta
         rows = [{**row, "Items": counts[row["name"]]} for row in rows_by_label(subtypes)]
         caption = "Selection accuracy by subtype (%)"
         tables.append(Table("subtypes", caption, [*subtypes, "Items"], {"": rows}))
-    makers = {
-        "readings": parsing_table, "reasons": reason_table, "positions": position_table,
-        "calibration": calibration_table,
-    }  # fmt: skip
+    makers = {"readings": parsing_table, "reasons": reason_table}
     return [*tables, *(make(found) for name, make in makers.items() if (found := details(name)))]
 
 
-def future_moment_tables(models: Mapping[str, FutureMoment]) -> list[Table]:
-    """Return the tables of the accuracy on balanced time items, split into future and moment: over
-    the time from the prefix to the target, and within bands of displacement."""
-    rows, bands = [], []
+def future_moment_table(models: Mapping[str, FutureMoment]) -> Table:
+    """Return a table of the accuracy on balanced time items, split into future and moment, over the
+    time from the prefix to the target."""
+    rows = []
     for label, of_model in models.items():
         every = {label: of_model.total, **{f"{DETAIL}{h}": s for h, s in of_model.horizons.items()}}
         rows += [
@@ -112,34 +107,14 @@ def future_moment_tables(models: Mapping[str, FutureMoment]) -> list[Table]:
             }
             for name, shares in every.items()
         ]  # fmt: skip
-        bands.append({"name": label})
-        for band in BANDS:
-            future, moment = of_model.future_bands.get(band), of_model.moment_bands.get(band)
-            counts = {
-                "Items by future": future and future.n,
-                "Items by moment": moment and moment.n,
-            }
-            bands.append({"name": f"{DETAIL}{band}", "Future": future, "Moment": moment, **counts})
     note = (
         f"{SELECTION_NOTE} Future: answers that show the true future, at the right moment or a "
         "wrong one; moment: answers that show the right moment, of the true future or another one. "
         "Chance is 50% for each, and 25% for the accuracy."
     )
-    by_band = (
-        f"{note} The displacement, px at 336 x 336, is for the future that between both futures at "
-        "the right moment, and for the moment that between both moments of the true future."
-    )
-    columns = ["Future", "Items by future", "Moment", "Items by moment"]
-    return [
-        Table(
-            "future-moment", "Balanced time items: future and moment (%)",
-            ["Accuracy", "Future", "Moment", "Items"], {"": rows}, (note,),
-        ),
-        Table(
-            "future-moment-bands", "Balanced time items: future and moment by displacement (%)",
-            columns, {"": bands}, (by_band,), folded=True,
-        ),
-    ]  # fmt: skip
+    columns = ["Accuracy", "Future", "Moment", "Items"]
+    caption = "Balanced time items: future and moment (%)"
+    return Table("future-moment", caption, columns, {"": rows}, (note,))
 
 
 def rows_by_label(values: Mapping[str, Mapping[str, Any]]) -> list[Row]:
@@ -189,36 +164,6 @@ def reason_table(reasons: Mapping[str, ReasonSummary]) -> Table:
         "prediction picks the target.",
     )
     return Table("reasons", "Claims and reasons of rationales (%)", columns, {"": rows}, notes)
-
-
-def position_table(positions: Mapping[str, PositionBias]) -> Table:
-    """Return a table with three rows for each label: how often each letter was chosen, how often it
-    was correct, and how often it was chosen where it was correct."""
-    rows: list[Row] = []
-    for label, bias in positions.items():
-        chosen, total = sum(bias.chosen.values()), sum(bias.right.values())
-        for name, counts, totals, answers in (
-            ("chosen", bias.chosen, dict.fromkeys(LETTERS, chosen), chosen),
-            ("correct", bias.right, dict.fromkeys(LETTERS, total), total),
-            ("accuracy", bias.hits, bias.right, total),
-        ):
-            shares = {x: counts[x] / totals[x] if totals[x] else None for x in LETTERS}
-            rows.append({"name": f"{label}: {name}", **shares, "Answers": answers})
-    caption = "Chosen and correct letters (%)"
-    return Table("positions", caption, [*LETTERS, "Answers"], {"": rows})
-
-
-def calibration_table(calibrations: Mapping[str, Calibration]) -> Table:
-    """Return a table of the calibration of the confidences in valid records, by label."""
-    columns = ["Confidence", "Accuracy", "Calibration error", "Brier score", "Records"]
-    rows = [
-        {
-            "name": label, "Confidence": c.confidence, "Accuracy": c.accuracy,
-            "Calibration error": f"{c.ece:.3f}", "Brier score": f"{c.brier:.3f}", "Records": c.n,
-        }
-        for label, c in calibrations.items()
-    ]  # fmt: skip
-    return Table("calibration", "Calibration of the reported confidence", columns, {"": rows})
 
 
 def paired_table(comparisons: Iterable[PairedComparison]) -> Table:
@@ -346,10 +291,8 @@ def human_table(study: StudyReport) -> Table:
     rows = [human_row(name, accuracy) for name, accuracy in study.accuracy.items()]
     if study.majority:
         rows.append(human_row("Majority vote", study.majority))
-    for clock in ("server", "client"):
-        times = {f: study.seconds.get(f, {}).get(clock) for f in FAMILIES}
-        cells = {f.capitalize(): time and f"{time:.1f}" for f, time in times.items()}
-        rows.append({"name": f"Median seconds, {clock}", **cells})
+    times = {f.capitalize(): f"{seconds:.1f}" for f, seconds in study.seconds.items()}
+    rows.append({"name": "Median seconds", **dict.fromkeys(FAMILY_COLUMNS), **times})
     columns = [*FAMILY_COLUMNS, "Macro", "Micro", "Items"]
     return table_with_paper("human", "human", columns, {"": rows}, _human_notes(study))
 
@@ -362,7 +305,7 @@ def human_row(name: str, accuracy: Accuracy) -> Row:
 
 def _human_notes(study: StudyReport) -> tuple[str, ...]:
     depth = [f"{items} with {votes}" for votes, items in study.depth.items()]
-    kappa, alpha = study.fleiss_kappa, study.krippendorff_alpha
+    kappa = "undefined" if study.fleiss_kappa is None else f"{study.fleiss_kappa:.2f}"
     undecided = study.majority.undecided if study.majority else 0
     return (
         INTERVAL_NOTE,
@@ -370,18 +313,11 @@ def _human_notes(study: StudyReport) -> tuple[str, ...]:
         f"of judgments: {', '.join(depth)}.",
         f"A majority is more than half of an item's votes; {undecided} items have no majority and "
         "count as wrong.",
-        f"Fleiss' kappa: {_agreement(kappa.value)} on the {kappa.items} items that all "
+        f"Fleiss' kappa: {kappa} on the {study.kappa_items} items that all "
         f"{len(study.annotators)} annotators answered (paper: {reference('human_kappa'):.2f} "
         "on 19 items).",
-        f"Krippendorff's alpha: {_agreement(alpha.value)} on the {alpha.items} items with "
-        "two votes or more.",
-        "Median seconds: over items whose page was loaded only once. The server's clock includes "
-        "time in which the server was down.",
+        "Median seconds: over items whose page was loaded only once.",
     )
-
-
-def _agreement(value: float | None) -> str:
-    return "undefined" if value is None else f"{value:.2f}"
 
 
 def _width(width: int | None) -> str:

@@ -1,17 +1,19 @@
 """Exact ranks: every frame of a database is scored for every query, at every width, in blocks.
 
-The score at a width is the cosine of the first entries of two embeddings, as fp32. It is
-bit-identical in any block and at any position. Equal frames therefore tie, and a target never ranks
-below itself. Sums of floating-point numbers depend on the order of the additions, which changes
-with the shape of a block. Here the sums over entries are exact (see `GridEmbeddings`).
+The score is the cosine of the first entries of two embeddings, or for a multi-vector retriever a
+sum of cosines, as fp32. It is bit-identical in any block and at any position. Equal frames
+therefore tie, and a target never ranks below itself. Sums of floating-point numbers depend on the
+order of the additions, which changes with the shape of a block. Here the entries of unit vectors
+are rounded to multiples of a step. In these steps, all products and sums are integers below 2^53,
+which float64 represents exactly.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +23,11 @@ from dynapix.data.parallel import batched
 from dynapix.data.records import RetrievalQuery
 from dynapix.evaluation.metrics.ranking import count_above_and_equal, share_above
 
-GRID = 2.0**26
-"""Entries of unit vectors are rounded to multiples of 1 / GRID."""
-BLOCK_QUERIES, BLOCK_FRAMES = 256, 1024
-"""Size of a block, whose scores fit in the cache of a core while they are counted."""
+GRID, LATE_GRID = 2.0**26, 2.0**20
+"""Steps of length 1. With the second, sums over up to 8,000 vectors stay below 2^53; it changes a
+cosine by about 2^-20."""
+BLOCK_VECTORS, BLOCK_PRODUCTS = 2**12, 2**21
+"""Maximum numbers of frame vectors in a block, and of their products with query vectors."""
 
 
 @dataclass(frozen=True)
@@ -86,87 +89,13 @@ def write_ranks(
     write_json_lines(folder / "ranks.jsonl", rows)
 
 
-class GridEmbeddings:
-    """Embeddings that are split at the widths into pieces, which are rounded to a grid.
-
-    Each piece is scaled to length 1 and stored as integers that count steps of 1 / `GRID`. By
-    Cauchy-Schwarz, the products of the entries of two pieces add up to little more than 2^52 in any
-    order. float64 represents every integer up to 2^53, so that the dot product of two pieces is
-    exact. The rounding changes a cosine by about 2^-27, less than the resolution of fp32.
-
-    Attributes:
-        pieces: For each piece, from the first entries to the last, (rows, entries) in float64.
-        lengths: (pieces, rows) length of each piece before it is scaled, divided by `GRID`.
-        norms: (pieces, rows) length of all entries up to the piece's end; 1 if they are all zero.
-    """
-
-    def __init__(self, embeddings: np.ndarray, widths: Sequence[int]) -> None:
-        self.pieces, squares = [], []
-        for start, stop in pairwise([0, *sorted(widths)]):
-            piece = embeddings[:, start:stop].astype(np.float64)
-            square = row_sums(np.square(piece))
-            piece *= (GRID / np.sqrt(np.where(square > 0, square, 1)))[:, None]
-            self.pieces.append(np.rint(piece, out=piece))
-            squares.append(square)
-        norms = np.sqrt(np.cumsum(squares, axis=0))
-        self.norms = np.where(norms > 0, norms, 1)
-        self.lengths = np.sqrt(squares) / GRID
-
-    def __len__(self) -> int:
-        return len(self.pieces[0])
-
-    def __getitem__(self, rows: slice | np.ndarray) -> GridEmbeddings:
-        part = object.__new__(GridEmbeddings)
-        part.pieces = [piece[rows] for piece in self.pieces]
-        part.lengths, part.norms = self.lengths[:, rows], self.norms[:, rows]
-        return part
-
-
-def row_sums(values: np.ndarray) -> np.ndarray:
-    """Return the sums of the rows (rows,) and overwrite `values`.
-
-    The halves of the rows are added repeatedly, so that a sum does not depend on other rows.
-    """
-    while (width := values.shape[1]) > 1:
-        half = (width + 1) // 2
-        values[:, : width - half] += values[:, half:]
-        values = values[:, :half]
-    return values[:, 0]
-
-
-def block_scores(queries: GridEmbeddings, frames: GridEmbeddings) -> Iterator[np.ndarray]:
-    """Yield the fp32 scores (queries, frames) of all pairs at each width, narrowest width first."""
-    products = (a @ b.T for a, b in zip(queries.pieces, frames.pieces, strict=True))
-    return _cosines(products, queries.lengths[..., None], queries.norms[..., None], frames)
-
-
-def pair_scores(queries: GridEmbeddings, frames: GridEmbeddings) -> Iterator[np.ndarray]:
-    """Yield the fp32 scores (rows,) of each query and the frame in the same row at each width,
-    narrowest width first. They are bit-identical to the scores of `block_scores`."""
-    products = (
-        np.einsum("ij,ij->i", a, b) for a, b in zip(queries.pieces, frames.pieces, strict=True)
-    )
-    return _cosines(products, queries.lengths, queries.norms, frames)
-
-
-def _cosines(
-    products: Iterable[np.ndarray], lengths: np.ndarray, norms: np.ndarray, frames: GridEmbeddings
-) -> Iterator[np.ndarray]:
-    """Add the exact products of the pieces, in the order of the pieces, and divide by the norms."""
-    total = None
-    for k, product in enumerate(products):
-        product *= lengths[k]
-        product *= frames.lengths[k]
-        total = product if total is None else np.add(total, product, out=total)
-        yield (total / (norms[k] * frames.norms[k])).astype(np.float32)
-
-
 def exact_ranks(
     queries: np.ndarray,
     targets: np.ndarray,
     database: Iterable[np.ndarray],
     widths: Sequence[int],
     twins: np.ndarray | None = None,
+    late: bool = False,
 ) -> Ranks:
     """Count, for every query and width, the frames that score above its target or tie with it.
 
@@ -174,25 +103,89 @@ def exact_ranks(
         queries: (queries, entries) finite fp32 embeddings.
         targets: (queries, entries) embeddings of each query's target, which is in the database.
         database: Parts (frames, entries) in any order; only one of them is in memory at a time.
-        widths: Embedding widths, widest first; None for a baseline without embeddings.
+        widths: Embedding widths, widest first.
         twins: (queries, entries) embeddings of the factual twins of counterfactual queries.
+        late: Whether a row holds several vectors of the only width, see `late_scores`.
     """
     began = time.perf_counter()
-    grid = GridEmbeddings(queries, widths)
-    target_scores = list(pair_scores(grid, GridEmbeddings(targets, widths)))
+    target_scores = [pair_scores(queries, targets, width, late) for width in widths]
     counts = np.zeros((2, len(widths), len(queries)), np.int64)
-    frames = 0
-    blocks = (rows for part in database for rows in batched(part, BLOCK_FRAMES))
-    for block in (GridEmbeddings(rows, widths) for rows in blocks):
-        frames += len(block)
-        for start in range(0, len(queries), BLOCK_QUERIES):
-            rows = slice(start, start + BLOCK_QUERIES)
-            for k, scores in enumerate(block_scores(grid[rows], block)):
+    frames = vectors = 0
+    for part in database:
+        # The number of vectors per row may differ between parts.
+        per_frame = part.shape[1] // widths[0] if late else 1
+        per_query = queries.shape[1] // widths[0] if late else 1
+        for block in batched(part, max(1, BLOCK_VECTORS // per_frame)):
+            frames += len(block)
+            vectors += count_vectors(block, widths[0]) if late else len(block)
+            step = max(1, BLOCK_PRODUCTS // (len(block) * per_frame * per_query))
+            for start, k in product(range(0, len(queries), step), range(len(widths))):
+                rows = slice(start, start + step)
+                scores = score(queries[rows], block, widths[k], late)
                 counts[:, k, rows] += count_above_and_equal(scores, target_scores[k][rows])
     twin_above = None
     if twins is not None:
-        pairs = zip(pair_scores(grid, GridEmbeddings(twins, widths)), target_scores, strict=True)
-        twin_above = np.array([share_above(*pair) for pair in pairs])[::-1]
-    # The scores begin with the narrowest width, the ranks with the widest.
+        twin_scores = [pair_scores(queries, twins, width, late) for width in widths]
+        twin_above = share_above(np.array(twin_scores), np.array(target_scores))
     seconds = time.perf_counter() - began
-    return Ranks.from_counts(widths, counts[:, ::-1], frames, frames, seconds, twin_above)
+    return Ranks.from_counts(widths, counts, frames, vectors, seconds, twin_above)
+
+
+def score(queries: np.ndarray, frames: np.ndarray, width: int, late: bool) -> np.ndarray:
+    """Return the fp32 scores (queries, frames) at a width."""
+    return late_scores(queries, frames, width) if late else cosines(queries, frames, width)
+
+
+def pair_scores(
+    queries: np.ndarray, frames: np.ndarray, width: int, late: bool = False
+) -> np.ndarray:
+    """Return the fp32 scores (rows,) of each query and the frame in the same row. They are
+    bit-identical to those of `score`."""
+    pairs = zip(queries[:, None], frames[:, None], strict=True)
+    return np.array([score(query, frame, width, late)[0, 0] for query, frame in pairs])
+
+
+def cosines(queries: np.ndarray, frames: np.ndarray, width: int) -> np.ndarray:
+    """Return the cosines of the first `width` entries of embeddings.
+
+    By Cauchy-Schwarz, the products of the entries of two vectors on the grid add up to little more
+    than 2^52. The rounding to the grid changes a cosine by about 2^-27, less than fp32 resolves.
+    """
+    products = _to_grid(queries[:, :width]) @ _to_grid(frames[:, :width]).T
+    return (products / GRID**2).astype(np.float32)
+
+
+def _to_grid(rows: np.ndarray) -> np.ndarray:
+    """Return rows in float64, scaled to length 1 and rounded to steps of the grid."""
+    rows = np.array(rows, np.float64, order="C")
+    lengths = np.sqrt(np.square(rows).sum(axis=1, keepdims=True))
+    return np.rint(rows * (GRID / np.where(lengths > 0, lengths, 1)))
+
+
+def late_scores(queries: np.ndarray, frames: np.ndarray, width: int) -> np.ndarray:
+    """Return the scores of multi-vector embeddings by late interaction.
+
+    A row holds unit vectors one after the other, padded with vectors of zeros. The score is the
+    sum, over the query's vectors, of the maximum cosine between the query's vector and any of the
+    frame's vectors.
+    """
+    import torch
+
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+
+    def to_vectors(rows: np.ndarray) -> torch.Tensor:
+        vectors = torch.from_numpy(rows).to(device, torch.float64).unflatten(1, (-1, width))
+        return (vectors * LATE_GRID).round_()
+
+    one, other = to_vectors(queries), to_vectors(frames)
+    # Padding is replaced by copies of a frame's first vector, which change no maximum.
+    other = torch.where(other.any(dim=-1, keepdim=True), other, other[:, :1])
+    products = one.flatten(0, 1) @ other.flatten(0, 1).T
+    best = products.unflatten(1, other.shape[:2]).amax(dim=-1)
+    total = best.unflatten(0, one.shape[:2]).sum(dim=1)
+    return (total / LATE_GRID**2).float().cpu().numpy()
+
+
+def count_vectors(rows: np.ndarray, width: int) -> int:
+    """Count the vectors in rows of a multi-vector retriever, without the padding."""
+    return int(rows.reshape(-1, width).any(axis=1).sum())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from dynapix.conf.files import write_text
-from dynapix.conf.schema import RetrieverConfig
 from dynapix.data.checks.baselines import count_frames_of_scene
 from dynapix.data.checks.queries import check_test, read_queries
 from dynapix.data.records import FrameRef, RetrievalQuery
@@ -25,7 +24,7 @@ from dynapix.data.store import Store
 from dynapix.evaluation.metrics.results import SCENE_ALONE, RetrievalResult, retrieval_results
 from dynapix.evaluation.reporting import figures, tables
 from dynapix.evaluation.reporting.table import Table
-from dynapix.evaluation.retrieval.exact_search import Ranks, exact_ranks
+from dynapix.evaluation.retrieval.exact_search import Ranks
 
 log = logging.getLogger(__name__)
 
@@ -36,21 +35,6 @@ def load_test(store: Store, pool: str = "future") -> tuple[list[RetrievalQuery],
     queries, database = read_queries(store, "test", pool), store.ranked_frames("test", pool)
     check_test(store, queries, database)
     return queries, database
-
-
-def rank_targets(
-    preset: RetrieverConfig,
-    queries: np.ndarray,
-    targets: np.ndarray,
-    database: Iterable[np.ndarray],
-    twins: np.ndarray | None = None,
-) -> Ranks:
-    """Rank with `late_ranks` if the preset is a multi-vector retriever, else with `exact_ranks`."""
-    if preset.late is not None:
-        from dynapix.evaluation.retrieval.late_interaction import late_ranks
-
-        return late_ranks(queries, targets, database, preset.late.width, twins)
-    return exact_ranks(queries, targets, database, preset.widths, twins)
 
 
 def score_scene_alone(

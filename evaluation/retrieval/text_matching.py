@@ -29,8 +29,7 @@ from dynapix.evaluation.generators.response_log import (
     Subject,
     collect_responses,
 )
-from dynapix.evaluation.retrieval.exact_search import Ranks
-from dynapix.evaluation.retrieval.standard_test import rank_targets
+from dynapix.evaluation.retrieval.exact_search import Ranks, exact_ranks
 from dynapix.models.fingerprints import settings_key
 from dynapix.models.student.prompts import Sample
 from dynapix.models.student.response_text import strip_thought
@@ -187,7 +186,7 @@ def rank_by_text(
     target_rows = embeddings.rows([captions[target] for target in targets])
     # Frames with the same caption tie, and each of them counts.
     parts = [embeddings.rows(present)] if route.captions else embeddings.parts(present)
-    ranks = rank_targets(matcher.preset, embedded.rows(text_of), target_rows, parts)
+    ranks = exact_ranks(embedded.rows(text_of), target_rows, parts, matcher.preset.widths)
     above, tied = np.zeros((2, len(ranks.widths), len(queries)), np.int64)
     above[:, valid], tied[:, valid] = ranks.above, ranks.tied
     return replace(ranks, above=above, tied=tied, found=np.array(valid), frames=len(names))

@@ -1,4 +1,4 @@
-"""Run a human study: annotators sign in by personal links and answer selection items in a browser.
+"""Run a human study: annotators open personal links and answer selection items in a browser.
 
 The run's study.sqlite has all data. After a stop or a kill, the same command resumes the study.
 `python -m evaluation.study.export run=NAME` exports the votes with their accuracy and agreement.
@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 @command("evaluation.study", StudyCommand)
 def main(cfg: StudyCommand, run: Run) -> None:
     try:
-        from dynapix.evaluation.study import auth, routes, storage
+        from dynapix.evaluation.study import routes, storage
     except ImportError as error:
         raise UserError(
             f"the study's pages need {error.name}: pip install -e '.[study]'",
@@ -26,22 +26,17 @@ def main(cfg: StudyCommand, run: Run) -> None:
         ) from error
     from dynapix.evaluation.study import setup
 
-    path, links = run.folder / storage.DATABASE, run.folder / auth.LINKS_FILE
+    path, links = run.folder / storage.DATABASE, run.folder / storage.LINKS_FILE
     with routes.listen(cfg.host, cfg.port) as listener:
+        if not path.exists():
+            setup.create_study(cfg, path)
         db = storage.open_study(path)
-        if db is None:
-            db = setup.create_study(cfg, path)
-        else:
-            setup.check_items(cfg, db)
-        setup.add_missing_media(cfg, db, path)
-
         # Links are secrets: they go to the screen and to their file, not into the run's log.
-        for name, link in auth.write_links(db, links, cfg.address).items():
+        for name, link in storage.write_links(db, links, cfg.address).items():
             print(f"{name}  {link}")
-        log.info("a link signs in once; %s always has the current, unused links", links)
+        log.info("the links of the annotators are in %s", links)
         log.info("the study is running; stop it with Ctrl-C, resume it with the same command")
-        app = routes.build_app(db, cfg, lambda: auth.write_links(db, links, cfg.address))
-        routes.serve(app, listener)
+        routes.serve(routes.build_app(db, cfg), listener)
 
 
 if __name__ == "__main__":

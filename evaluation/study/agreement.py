@@ -15,7 +15,6 @@ from dynapix.data.checks.intervals import SceneBootstrap
 from dynapix.data.records import LETTERS
 from dynapix.evaluation.metrics.results import (
     Accuracy,
-    Agreement,
     MajorityVote,
     StudyReport,
     accuracy_by_family,
@@ -46,7 +45,6 @@ def summarize_votes(
     depth = counts.sum(axis=1)
     active = [name for name in annotators if name in set(votes.annotator)]
     complete = counts[(depth == len(active)) & (depth > 1)]
-    several = counts[depth > 1]
     items_by_depth = {0: items - len(counts), **depth.value_counts()}
     votes_of = {name: votes[votes.annotator == name] for name in active}
     accuracy = {name: _accuracy(own, list(own.right), seed) for name, own in votes_of.items()}
@@ -59,8 +57,8 @@ def summarize_votes(
         depth={str(d): int(n) for d, n in sorted(items_by_depth.items()) if n},
         accuracy=accuracy,
         majority=_majority_vote(votes, counts, seed) if len(votes) else None,
-        fleiss_kappa=Agreement(fleiss_kappa(complete), len(complete)),
-        krippendorff_alpha=Agreement(krippendorff_alpha(several), len(several)),
+        fleiss_kappa=fleiss_kappa(complete),
+        kappa_items=len(complete),
         seconds=median_seconds(votes),
     )
 
@@ -75,30 +73,13 @@ def fleiss_kappa(counts: pd.DataFrame) -> float | None:
     None if there are no items, or if all votes are for the same candidate index."""
     from statsmodels.stats.inter_rater import fleiss_kappa as kappa
 
-    return None if _is_undefined(counts) else float(kappa(counts.to_numpy()))
+    return float(kappa(counts.to_numpy())) if np.count_nonzero(counts.sum()) > 1 else None
 
 
-def krippendorff_alpha(counts: pd.DataFrame) -> float | None:
-    """Return Krippendorff's alpha for nominal data: one minus the ratio of the disagreement within
-    items to the disagreement between any two votes. All items have at least two votes. Return None
-    in the same cases as `fleiss_kappa`."""
-    if _is_undefined(counts):
-        return None
-    table = counts.to_numpy()
-    depth, total = table.sum(axis=1), table.sum(axis=0)
-    votes = total.sum()
-    # Ordered pairs of unequal votes. A pair in an item with n votes has the weight 1 / (n - 1).
-    within = ((depth**2 - (table**2).sum(axis=1)) / (depth - 1)).sum() / votes
-    between = (votes**2 - (total**2).sum()) / (votes * (votes - 1))
-    return float(1 - within / between)
-
-
-def median_seconds(votes: pd.DataFrame) -> dict[str, dict[str, float | int]]:
-    """Return median decision times by family and clock. Only votes whose page was loaded once are
-    used: if a page was loaded several times, its total viewing time is unknown."""
-    clocks = {"server": ("seconds", "median"), "client": ("client_seconds", "median")}
-    once = votes[votes.loads == 1].groupby("family")
-    return once.agg(**clocks, votes=("seconds", "size")).to_dict("index")
+def median_seconds(votes: pd.DataFrame) -> dict[str, float]:
+    """Return median decision times by family. Only votes whose page was loaded once are used: if a
+    page was loaded several times, its total viewing time is unknown."""
+    return votes[votes.loads == 1].groupby("family").seconds.median().to_dict()
 
 
 def _accuracy(items: pd.DataFrame, credits: Sequence[float], seed: int) -> Accuracy:
@@ -112,7 +93,3 @@ def _majority_vote(votes: pd.DataFrame, counts: pd.DataFrame, seed: int) -> Majo
     accuracy = _accuracy(items, list(choices == items.answer), seed)
     parts = accuracy.families, accuracy.macro, accuracy.micro
     return MajorityVote(*parts, undecided=int(choices.isna().sum()))
-
-
-def _is_undefined(counts: pd.DataFrame) -> bool:
-    return np.count_nonzero(counts.sum(axis=0)) < 2

@@ -27,14 +27,10 @@ def main(cfg: ExportStudyCommand, run: Run) -> dict[str, float]:
     studies = Path(cfg.checkpoints) / "study"
     path = studies / resolve_run_name(cfg.run, str(studies)) / storage.DATABASE
     db = storage.open_study(path)
-    if db is None:
-        raise UserError(
-            f"{path} does not exist: start a study with python -m evaluation.study",
-            code="missing-run",
-        )
     with storage.transaction(db, read_only=True):
         votes = storage.read_votes(db)
-        about, items = storage.read_about(db), len(storage.item_ids(db, practice=False))
+        about = dict(tuple(row) for row in db.execute("SELECT key, value FROM about"))
+        [(items,)] = db.execute("SELECT count(*) FROM item")
         annotators = [name for (name,) in db.execute("SELECT name FROM annotator ORDER BY rowid")]
     if votes.empty:
         raise UserError(f"{path} has no votes yet", code="no-votes")

@@ -18,8 +18,6 @@ PREFIX = -1
 """Slot of an item's prefix; the candidates have slots 0 to 3, in the item's order."""
 CRF = "12"
 """Constant rate factor (quality) of x264: the loss is not visible."""
-SEI = "6"
-"""Type of the H.264 units (SEI messages) in which x264 writes its version and settings."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +60,11 @@ def encode_media(item: SelectionItem, frames: FrameReader) -> list[Medium]:
 
 
 def encode_video(pixels: np.ndarray, fps: float) -> bytes:
-    """Encode (frames, height, width, 3) uint8 as an mp4 (H.264) without dates or an encoder's name.
+    """Encode (frames, height, width, 3) uint8 as an mp4 (H.264) without dates.
 
     The codec needs an even height and width: the last row or column of an odd size is repeated.
     """
     import av
-    from av.bitstream import BitStreamFilterContext
 
     _, height, width, _ = pixels.shape
     even = np.pad(pixels, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
@@ -77,10 +74,7 @@ def encode_video(pixels: np.ndarray, fps: float) -> bytes:
         stream = container.add_stream("libx264", rate=rate, options={"crf": CRF})
         stream.height, stream.width = even.shape[1:3]
         stream.pix_fmt = "yuv420p"
-        plain = BitStreamFilterContext(f"filter_units=remove_types={SEI}", stream)
         images = (av.VideoFrame.from_ndarray(frame, format="rgb24") for frame in even)
         for image in (*images, None):
-            for packet in stream.encode(image):
-                container.mux(plain.filter(packet))
-        container.mux(plain.filter(None))
+            container.mux(stream.encode(image))
     return target.getvalue()

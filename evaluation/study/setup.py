@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sqlite3
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,49 +15,30 @@ from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.records import FAMILIES, SelectionItem
 from dynapix.data.seeded_order import interleave, named_rng
 from dynapix.data.store import Store
-from dynapix.evaluation.study import auth, storage
+from dynapix.evaluation.study import storage
 from dynapix.evaluation.study.assignment import assign_items
 from dynapix.evaluation.study.media import encode_media
 
 
-def create_study(cfg: StudyCommand, path: Path) -> sqlite3.Connection:
-    """Create a study without media. Raises UserError if its items cannot be chosen."""
+def create_study(cfg: StudyCommand, path: Path) -> None:
+    """Create a study. Raises UserError if its items cannot be chosen or their frames be read."""
     store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
     items = choose_items(cfg, store)
-    practice = sample_items(store.selection("train"), cfg.practice, cfg.seed, "practice")
     names = [f"A{k + 1}" for k in range(cfg.annotators)]
-    assignments = [a for chosen in (items, practice) for a in assign_items(chosen, names, cfg.seed)]
-    link_tokens = {name: auth.new_token() for name in names}
     about = {"benchmark": store.name, "identity": store.identity}
-    return storage.create(path, about, items, practice, link_tokens, assignments)
-
-
-def add_missing_media(cfg: StudyCommand, db: sqlite3.Connection, path: Path) -> None:
-    """Encode the media that the study lacks. A new study lacks all media.
-
-    Raises:
-        UserError: The benchmark differs from the study's, or its frames cannot be read.
-    """
-    missing = storage.items_without_media(db)
-    if not missing:
-        return
-    store = ensure_benchmark(cfg.benchmark, Path(cfg.store), cfg.workers)
-    if store.identity != storage.read_about(db)["identity"]:
-        raise UserError(
-            f"{path} lacks the images and videos of {len(missing)} items, and {store.folder} is "
-            "another benchmark than the study's: start another study with run=NAME",
-            code="different-builds",
-        )
-    by_id = {i.item_id: i for i in store.selection() + store.selection(suite=MATCHED_ANCHOR)}
     frames = FrameReader(store)
-    for item_id in tqdm(missing, desc="encoding items", unit="item"):
-        storage.add_media(db, item_id, encode_media(by_id[item_id], frames))
+    media = (
+        (item.item_id, medium)
+        for item in tqdm(items, desc="encoding items", unit="item")
+        for medium in encode_media(item, frames)
+    )
+    storage.create(path, about, items, media, names, assign_items(items, names, cfg.seed))
 
 
 def choose_items(cfg: StudyCommand, store: Store) -> list[SelectionItem]:
     """Return the test items that `cfg.items` lists, or as many as it says. Raises UserError."""
     if cfg.items.isdecimal():
-        return sample_items(store.selection("test"), int(cfg.items), cfg.seed, "items")
+        return sample_items(store.selection("test"), int(cfg.items), cfg.seed)
     pool = store.selection("test") + store.selection("test", MATCHED_ANCHOR)
     by_id = {item.item_id: item for item in pool}
     ids = read_item_ids(Path(cfg.items))
@@ -74,63 +52,36 @@ def choose_items(cfg: StudyCommand, store: Store) -> list[SelectionItem]:
     return [by_id[item_id] for item_id in ids]
 
 
-def check_items(cfg: StudyCommand, db: sqlite3.Connection) -> None:
-    """Raise UserError if the file `cfg.items` lists other items than those of the study."""
-    if cfg.items.isdecimal():
-        return
-    if read_item_ids(Path(cfg.items)) != storage.item_ids(db, practice=False):
-        raise UserError(
-            f"items={cfg.items} lists other items than those of this run's study: restore the "
-            "file, or start another study with run=NAME",
-            code="different-items",
-        )
-
-
 def read_item_ids(path: Path) -> list[str]:
-    """Return the item ids in a file. A line is an id, or a JSON object with an item_id.
-
-    Raises:
-        UserError: The file cannot be read, lists no item, or lists an item twice.
-    """
+    """Return the item ids in a file, one in each line. Raises UserError if it cannot be read."""
     try:
-        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
-        ids = [str(json.loads(x)["item_id"]) if x.startswith("{") else x for x in lines]
-    except OSError as error:
+        lines = path.read_text("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
         raise UserError(
-            f"items={path}: {error.strerror}; give a number of items, or a file of item ids",
-            code="missing-file",
-        ) from error
-    except (ValueError, KeyError) as error:
-        raise UserError(
-            f"items={path} cannot be read ({error}): give one item_id, or one JSON object with an "
-            "item_id, per line",
+            f"items={path} cannot be read ({error}): give a number of items, or a file with one "
+            "item_id per line",
             code="invalid-items",
         ) from error
-    repeated = [item_id for item_id, count in Counter(ids).items() if count > 1]
-    if repeated or not ids:
-        problem = (
-            f"lists {repeated[0]} more than once: remove the repeated line"
-            if repeated
-            else "lists no item: give one item_id per line"
+    ids = list(dict.fromkeys(line.strip() for line in lines if line.strip()))
+    if not ids:
+        raise UserError(
+            f"items={path} lists no item: give one item_id per line", code="invalid-items"
         )
-        raise UserError(f"items={path} {problem}", code="invalid-items")
     return ids
 
 
-def sample_items(
-    pool: Sequence[SelectionItem], count: int, seed: int, setting: str
-) -> list[SelectionItem]:
+def sample_items(pool: Sequence[SelectionItem], count: int, seed: int) -> list[SelectionItem]:
     """Sample `count` items, spread evenly over the families, and over the subtypes of a family.
 
     The images of an item could answer another item of the same scene. An item whose scenes were
     already used is therefore sampled only if its family has no other items left.
 
     Raises:
-        UserError: `pool` has fewer than `count` items; the message names `setting`.
+        UserError: `pool` has fewer than `count` items.
     """
     if count > len(pool):
         raise UserError(
-            f"{setting}={count} is more than the {len(pool)} items of the benchmark's split: "
+            f"items={count} is more than the {len(pool)} items of the benchmark's split: "
             "lower it, or choose a larger benchmark",
             code="too-few-items",
         )

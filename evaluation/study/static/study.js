@@ -1,7 +1,7 @@
 "use strict";
 
 // A question appears when all of its media are loaded and the server has recorded this. At that
-// moment both clocks start: the server's and the browser's.
+// moment the server's clock starts.
 
 const page = document.querySelector("main.question");
 const form = document.querySelector("main form");
@@ -52,32 +52,23 @@ function play() {
 }
 
 async function show() {
-  const isOpen = "open" in page.dataset;
   try {
     await Promise.all([...page.querySelectorAll("[data-src]")].map(load));
-    if (isOpen) {
-      const response = await post("/loaded", { key: page.dataset.key });
-      if (!response.ok) throw new Error("closed");
-    }
+    const response = await post("/loaded", { key: page.dataset.key });
+    if (!response.ok) throw new Error("closed");
   } catch (error) {
     status.textContent = "This page is outdated. Please reload it.";
     return;
   }
-  const start = performance.now();
   status.textContent = "";
   page.classList.remove("loading");
   play();
-  if (isOpen) answer(start);
-}
-
-function answer(start) {
   form.querySelector("fieldset").disabled = false;
   form.addEventListener("change", () => {
     form.querySelector("button").disabled = false;
   });
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
-    form.elements.seconds.value = ((performance.now() - start) / 1000).toFixed(3);
     const fields = new FormData(form);
     form.querySelector("fieldset").disabled = true;
     form.querySelector("button").disabled = true;
@@ -91,7 +82,7 @@ function onKey(event) {
   const key = event.key.toUpperCase();
   if (key === "R" && video) {
     play();
-  } else if (/^[A-D1-4]$/.test(key) && page && "open" in page.dataset) {
+  } else if (/^[A-D1-4]$/.test(key) && page) {
     const choice = form.querySelectorAll("input[type=radio]")["ABCD1234".indexOf(key) % 4];
     choice.focus();
     choice.click();

@@ -25,7 +25,7 @@ from dynapix.data.items.pickers import CellInputs, fill_quota
 from dynapix.data.records import Candidate, Scene, SelectionItem
 from dynapix.data.sim.physics import Branch, shared_simulator
 from dynapix.data.store import load_scene, scene_path
-from dynapix.evaluation.metrics.pairs import score_pairs
+from dynapix.evaluation.metrics.significance import score_pairs
 from tests.data.simulated import CLEVRER, simulate_scene
 
 MASSES = replace(

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from dynapix.conf.entry import Run
 from dynapix.conf.schema import (
@@ -24,6 +22,7 @@ from dynapix.data.store import Store
 from dynapix.models import loading
 from dynapix.models.retriever import embedder
 from dynapix.train.student import dataset
+from tests.evaluation.reporting.measured import finish
 from tests.tiny_models import SMALL
 
 NO_LORA = {"quantization": "none", "lora": LoraConfig(rank=0)}
@@ -33,13 +32,6 @@ STUDENT = StudentConfig(
 RETRIEVER = RetrieverConfig(
     name="small", architecture=SMALL, image_size=96, widths=[64, 32], **NO_LORA
 )
-
-
-def finish(folder: Path, settings: object, metrics: dict | None = None) -> None:
-    """Write the files that `conf.entry` writes into the folder of a finished run."""
-    OmegaConf.save(OmegaConf.structured(settings), folder / "config.yaml")
-    (folder / "metrics.json").write_text(json.dumps(metrics or {}))
-    (folder / "run.json").write_text('{"started": "2026-01-01", "earlier_starts": []}')
 
 
 def new_run(folder: Path, *overrides: str) -> Run:
@@ -88,7 +80,7 @@ def trained_student(tmp_path_factory, micro, micro_store) -> Path:
     )
     loading.save_student(model, processor, folder / "student", "bf16")
     settings = SftCommand(benchmark=micro, teacher=TeacherConfig(name="template"), student=STUDENT)
-    finish(folder, settings, {"answer_loss": 1.0, "answer_loss_at_start": 2.0})
+    finish(folder, settings, metrics={"answer_loss": 1.0, "answer_loss_at_start": 2.0})
     return folder
 
 

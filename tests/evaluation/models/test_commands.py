@@ -6,9 +6,11 @@ import json
 import shutil
 from dataclasses import replace
 
+import jsonschema
 import pytest
 from omegaconf import OmegaConf
 
+from dynapix.conf.files import read_json_lines
 from dynapix.conf.schema import (
     ContrastiveCommand,
     EmbedderConfig,
@@ -19,14 +21,16 @@ from dynapix.conf.schema import (
 )
 from dynapix.evaluation import report, select
 from dynapix.evaluation.generators.response_log import ResponseLog
+from dynapix.evaluation.generators.response_schema import build_record_schema
+from dynapix.models.student.answer_parser import parse_choice
 from dynapix.models.trained_runs import check_unseen, read_trained_settings, resolve_model
 from tests.evaluation.models.conftest import (
     STUDENT,
     check_resumed,
-    finish,
     new_run,
     tear,
 )
+from tests.evaluation.reporting.measured import finish
 from tests.user_errors import raises_user_error
 
 
@@ -41,7 +45,7 @@ def test_a_student_is_measured_resumed_and_reported(
     )  # fmt: skip
     run = new_run(tmp_path / "select" / "run")
     metrics = select.main.__wrapped__(cfg, run)
-    finish(run.folder, cfg, metrics)
+    finish(run.folder, cfg, metrics=metrics)
     first = (run.folder / "report.json").read_text()
     (reasoning, answer) = json.loads(first)["rows"]
     assert (reasoning["n"], answer["n"]) == (8, 8)
@@ -97,6 +101,39 @@ def test_sampled_records_of_a_base_are_the_same_after_a_kill(
     select.main.__wrapped__(replace(cfg, batch=2), run)
     check_resumed(log, complete, torn)
     assert len({json.loads(line)["text"] for line in complete.splitlines()[1:]}) == 8
+
+
+@pytest.mark.slow
+def test_constrained_decoding_yields_records_only(micro, micro_store, tmp_path) -> None:
+    student = replace(STUDENT, max_new_tokens=900, temperature=1)
+    cfg = SelectCommand(
+        benchmark=micro, student=student, store=str(micro_store.folder.parent), limit=4, batch=3
+    )
+    metrics = select.main.__wrapped__(cfg, new_run(tmp_path))
+    assert metrics["constrained_parse_rate"] == 1 > metrics["record_parse_rate"]
+    rows = list(read_json_lines(tmp_path / "answers.jsonl"))
+    constrained = [row for row in rows if row["mode"] == "constrained" and "text" in row]
+    assert len(constrained) == 4
+    for row in constrained:
+        assert parse_choice(row["text"]).letter == row["letter"]
+        # A model with random weights may write texts up to the token limit, which cuts the record,
+        # and control characters, which `strict` would refuse.
+        if not row["truncated"]:
+            record = json.loads(row["text"], strict=False)
+            jsonschema.validate(record, build_record_schema())
+            assert list(record) == list(build_record_schema()["properties"])
+
+
+def test_the_log_is_append_only(micro_store, tmp_path) -> None:
+    path, items = tmp_path / "answers.jsonl", micro_store.selection("test")[:2]
+    ResponseLog(path, {"answer": {"seed": 0}}, items)
+    torn = path.read_bytes() + b'{"item_id": "to'
+    path.write_bytes(torn)
+    ResponseLog(path, {"answer": {"seed": 1}}, items)
+    assert path.read_bytes().startswith(torn + b"\n{")
+    before = path.read_bytes()
+    ResponseLog(path, {"answer": {"seed": 0}}, items)
+    assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize(

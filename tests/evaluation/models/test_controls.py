@@ -17,7 +17,7 @@ from dynapix.evaluation import select
 from dynapix.evaluation.generators.response_log import score_response
 from dynapix.evaluation.metrics.results import SelectionResult, from_json
 from dynapix.evaluation.metrics.selection import Choices, build_selection_report
-from dynapix.evaluation.reporting.selection_report import write_report
+from dynapix.evaluation.select import write_report
 from dynapix.models.student.responses import GeneratedText
 from tests.user_errors import raises_user_error
 

@@ -22,7 +22,6 @@ from dynapix.conf.schema import (
     RetrieveCommand,
     RetrieverConfig,
     SelectCommand,
-    SimilarityCommand,
     TwoStageCommand,
 )
 from dynapix.data.store import Store
@@ -92,7 +91,6 @@ def clip(tmp_path: Path) -> RetrieverConfig:
     ("command", "written"),
     [
         ("retrieve", {"query", "frame", "ranks.jsonl"}),
-        ("similarity", {"query", "frame", "scores.jsonl"}),
         ("two_stage", {"text", "frame", "texts.jsonl", "matched.jsonl"}),
     ],
 )
@@ -111,7 +109,6 @@ def test_two_ranks_embed_what_one_process_embeds(
     shared = {"benchmark": micro, "batch": 5}
     cfg = {
         "retrieve": RetrieveCommand(**shared, retriever=clip, model=str(trained_retriever)),
-        "similarity": SimilarityCommand(**shared, retriever=clip, limit=9),
         "two_stage": TwoStageCommand(
             **shared, model=str(trained_student),
             # With random weights, greedy decoding gives every response the same text.

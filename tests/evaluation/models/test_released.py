@@ -21,18 +21,16 @@ from dynapix.conf.files import read_json_lines
 from dynapix.conf.schema import (
     ContrastiveTrainConfig,
     LoraConfig,
-    RetrieveCommand,
     RetrieverConfig,
     SimilarityCommand,
 )
 from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.records import FPS, FRAMES, LETTERS, FrameRef, sample_prefix_frames
-from dynapix.evaluation import retrieve, similarity
+from dynapix.evaluation import similarity
 from dynapix.evaluation.embedders.dual_encoder import unit_rows
 from dynapix.evaluation.embedders.embedder import EMBEDDINGS
 from dynapix.evaluation.embedders.joint_encoder import load_encoder
 from dynapix.evaluation.embedders.languagebind import LanguageBindVideo, spread
-from dynapix.evaluation.metrics.results import SCENE_ALONE
 from dynapix.evaluation.metrics.selection import choose_letters, credit_choices
 from tests.evaluation.models import released
 from tests.user_errors import raises_user_error
@@ -223,8 +221,6 @@ def test_the_nearest_candidate_is_chosen_and_embeddings_are_computed_once(
         in_family = [item.family == family for item in items]
         assert accuracy["value"] == pytest.approx(right[in_family].mean())
     assert set(report["subtypes"]["clip"]) == {f"{i.family}/{i.subtype}" for i in items}
-    chosen = report["positions"]["clip"]["chosen"]
-    assert chosen == {x: int((scores.argmax(1) == k).sum()) for k, x in enumerate(LETTERS)}
     stored = list(read_json_lines(tmp_path / "first" / "scores.jsonl"))
     assert [row["item_id"] for row in stored] == [item.item_id for item in items]
     assert np.array([row["scores"] for row in stored]) == pytest.approx(scores, abs=1e-5)
@@ -234,13 +230,6 @@ def test_the_nearest_candidate_is_chosen_and_embeddings_are_computed_once(
     # A second evaluation loads no model: without config.json, the model could not be loaded.
     (tmp_path / "clip" / "config.json").unlink()
     assert measure(similarity, SimilarityCommand, preset, "second") == report
-
-
-def test_a_released_model_is_measured_by_retrieval(measure, presets) -> None:
-    report = measure(retrieve, RetrieveCommand, presets["vlm2vec"], "ranked")
-    row, baseline = [r for r in report["rows"] if r["builder"] is None]
-    assert (row["name"], row["width"]) == ("vlm2vec", 32)
-    assert (baseline["name"], baseline["width"]) == (SCENE_ALONE, None)
 
 
 def test_tied_candidates_share_the_credit() -> None:
@@ -272,7 +261,6 @@ def drop_weight(folder: Path) -> None:
     ("damage", "codes"),
     [
         (delete_file("model.safetensors"), ["unloadable-model"]),
-        (delete_file("config.json"), ["unloadable-model"]),
         (delete_file("tokenizer.json"), ["unloadable-model", "incomplete-model"]),
         (delete_file("processor_config.json"), ["unloadable-model", "incomplete-model"]),
         (drop_weight, ["incomplete-model"]),
@@ -294,11 +282,9 @@ def test_an_incomplete_model_is_refused(damage, codes, presets, tmp_path) -> Non
         ("clip", {"model": "languagebind"}, "unloadable-model", "retriever.model="),
         ("clip", {"image_size": 28}, "wrong-image-size", "set retriever.image_size=56"),
         ("clip", {"model": "no/such-model"}, "missing-model", "no/such-model"),
-        ("clip", {"model": "./no/such"}, "missing-model", "retriever.model=./no/such"),
         ("vlm2vec", {"model": "clip"}, "wrong-model-type", "VLM2Vec"),
         ("languagebind", {"model": "clip"}, "wrong-model-type", "retriever.model="),
         ("languagebind", {"frames": 12}, "wrong-frame-count", "set retriever.frames=4"),
-        ("languagebind", {"image_model": "no/such"}, "missing-model", "image_model=no/such"),
         ("languagebind", {"image_model": "siglip2"}, "incomplete-model", "image_model="),
         ("languagebind", {"image_model": "languagebind"}, "wrong-model-type", "image_model="),
     ],

@@ -226,14 +226,9 @@ def test_the_key_of_embeddings_depends_on_all_of_their_inputs(
 
 @pytest.mark.parametrize(
     ("name", "changes_key"),
-    [
-        ("config.json", False),
-        ("tokenizer.json", True),
-        ("tokenizer_config.json", True),
-        ("processor_config.json", True),
-        ("chat_template.jinja", True),
-    ],
-)
+    [("config.json", False), ("tokenizer.json", True), ("processor_config.json", True),
+     ("chat_template.jinja", True)],
+)  # fmt: skip
 def test_an_edited_processor_changes_the_key(
     micro_store, trained_retriever, tmp_path, name, changes_key
 ) -> None:

@@ -7,8 +7,6 @@ import io
 import json
 from dataclasses import replace
 from functools import partial
-from http.server import BaseHTTPRequestHandler, HTTPServer
-from threading import Thread
 
 import numpy as np
 import pytest
@@ -94,6 +92,9 @@ def test_requests_contain_the_frames_and_times_of_a_sample(
         assert (clip["fps"], clip["total_num_frames"], clip["num_frames"]) == (25.0, 128, -1)
         assert request["mm_processor_kwargs"]["videos_kwargs"]["do_sample_frames"] is False
         assert (request["temperature"], request["max_tokens"]) == (0, 40)
+        # No penalty of the model's generation config applies.
+        assert (request["repetition_penalty"], request["min_p"]) == (1.0, 0.0)
+        assert (request["presence_penalty"], request["frequency_penalty"]) == (0.0, 0.0)
         assert "seed" not in request
         assert "response_format" not in request
 
@@ -130,11 +131,6 @@ def test_constrained_requests_have_the_schema_and_a_seed_per_item(
         respond = responder(config_of(misfiled), frames, THINKING, "constrained")
         respond(items[:1], (kept := []).extend)
         assert [score_response(item, "constrained", text).letter for item, text in kept] == [letter]
-
-    # Sampling without top_p and top_k is requested explicitly.
-    unlimited = replace(STUDENT, temperature=0.7, top_p=1.0, top_k=0)
-    responder(config_of(server), frames, unlimited)(items[:1], lambda _: None)
-    assert (server.requests[-1]["top_p"], server.requests[-1]["top_k"]) == (1.0, -1)
 
 
 @pytest.mark.parametrize(
@@ -227,127 +223,73 @@ def test_a_server_that_refuses_clips_gets_their_frames_as_images(
         assert "media_io_kwargs" not in request
 
 
-def test_a_server_that_refuses_images_is_named(items, frames, start_server) -> None:
-    reason = "served is not a multimodal model"
-
-    def refuse(request):
-        content = request["messages"][0]["content"]
-        texts = isinstance(content, str) or all(p["type"] == "text" for p in content)
-        return "Hello." if texts else {"status": 400, "message": reason}
-
-    server = start_server(refuse)
-    with raises_user_error("server-refuses", contains=(server.url, reason)):
-        responder(config_of(server), frames)(items, lambda _: None)
+def is_long(request) -> bool:
+    """Whether a request is for an item: the frames of a canary are small and blank."""
+    return len(json.dumps(request)) > 10_000
 
 
-def test_a_server_that_refuses_an_item_is_reported(items, frames, start_server) -> None:
-    # The request for an item is much longer than a canary, whose frames are small and blank.
-    def refuse(request):
-        long = len(json.dumps(request)) > 10_000
-        return {"status": 400, "message": "prompt is too long"} if long else "Hello."
-
-    server = start_server(refuse)
-    with raises_user_error("no-response", contains="prompt is too long"):
-        responder(config_of(server, concurrency=1), frames)(items, lambda _: None)
-
-
-def test_a_server_that_ignores_the_schema_is_not_measured_in_constrained_mode(
-    items, frames, start_server
-) -> None:
-    server = start_server(lambda _: FULL)
-    server.constrains = False
-    with raises_user_error("no-constraint", contains="does not apply the JSON schema"):
-        responder(config_of(server), frames, mode="constrained")(items, lambda _: None)
-
-
-def test_requests_ask_for_no_penalty(items, frames, start_server) -> None:
-    server = start_server(lambda _: FULL)
-    for student in (STUDENT, THINKING):
-        responder(config_of(server), frames, student)(items[:1], lambda _: None)
-        request = server.requests[-1]
-        assert (request["repetition_penalty"], request["min_p"]) == (1.0, 0.0)
-        assert (request["presence_penalty"], request["frequency_penalty"]) == (0.0, 0.0)
-
-
-@pytest.fixture(scope="module")
-def tiny_student(micro_store, tmp_path_factory) -> StudentConfig:
-    """A student whose base is in a folder."""
-    folder = tmp_path_factory.mktemp("base")
-    built = replace(STUDENT, architecture=SMALL, model=None)
-    corpus = partial(dataset.tokenizer_corpus, micro_store, [])
-    loading.save_student(*loading.load_base(built, "fp32", corpus), folder, "fp32")
-    return replace(STUDENT, model=str(folder))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("is_same", [True, False])
-def test_prompts_that_a_server_reads_differently_are_named_once(
-    items, frames, start_server, caplog, tiny_student, is_same
-) -> None:
-    _, processor = loading.load_base(tiny_student, "fp32", list)
-    sample = item_sample("cot", frames, tiny_student, None, "record", items[0])
-    ids = encode(sample, processor, None).input_ids
-    served = ids if is_same else [*ids[:3], 7, *ids[3:]]
-
-    def reply(request):
-        return {"content": FULL, "prompt_ids": served if "return_token_ids" in request else []}
-
-    server = start_server(reply)
-    responder(config_of(server, concurrency=1), frames, tiny_student)(items[:4], lambda *_, **__: 0)
-    assert sum("return_token_ids" in request for request in server.requests) == 1
-    assert caplog.text.count("reads prompts differently") == (not is_same)
-    words = (
-        f"at token 3 of the first prompt, this process has {processor.tokenizer.decode(ids[3])!r}"
-    )
-    assert is_same or (
-        words in caplog.text and f"({len(ids)} and {len(ids) + 1} tok" in caplog.text
-    )
-
-
-def test_a_server_reports_the_origin_of_its_models(start_server) -> None:
-    server = start_server(lambda _: FULL)
-    assert served_origin(config_of(server)) == {"root": "weights", "parent": None}
-    adapter = replace(config_of(server), model="adapter")
-    assert served_origin(adapter) == {"root": "lora", "parent": "weights"}
-    with raises_user_error("unknown-model", contains=("server.model=other", "served, adapter")):
-        served_origin(replace(config_of(server), model="other"))
-    server.stop()
-    with raises_user_error("no-server", contains=("http://127", "teacher.serve")):
-        served_origin(config_of(server))
+def has_media(request) -> bool:
+    content = request["messages"][0]["content"]
+    return not isinstance(content, str) and any(p["type"] != "text" for p in content)
 
 
 @pytest.mark.parametrize(
-    ("status", "body", "advice"),
+    ("refuses", "constrains", "mode", "code", "contains"),
     [
-        (200, "<html>\nWelcome</html>", ("not a list of models", "ends with /v1")),
-        (403, "{}", "OPENAI_API_KEY"),
-        (404, "{}", "ends with /v1"),
-        (429, "{}", "run the same command again"),
-        (503, "{}", "run the same command again"),
+        (has_media, True, "record", "server-refuses", "too much"),
+        (is_long, True, "record", "no-response", "too much"),
+        (lambda _: False, False, "constrained", "no-constraint", "does not apply the JSON schema"),
     ],
+    ids=["images", "an item", "the schema"],
 )
-def test_what_to_do_about_a_server_depends_on_its_error(status, body, advice) -> None:
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(status)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body.encode())
-
-        def log_message(self, *args: object) -> None:
-            pass
-
-    with HTTPServer(("127.0.0.1", 0), Handler) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        cfg = ServerConfig(url=[f"http://127.0.0.1:{server.server_port}/v1"], model="any")
-        with raises_user_error("no-server", contains=advice):
-            served_origin(cfg)
-        server.shutdown()
-
-
-def test_a_revision_identifies_weights_that_a_server_does_not_describe(
-    start_server, caplog
+def test_what_a_server_refuses_is_named(
+    items, frames, start_server, refuses, constrains, mode, code, contains
 ) -> None:
+    refusal = {"status": 400, "message": "too much"}
+    server = start_server(lambda request: refusal if refuses(request) else FULL)
+    server.constrains = constrains
+    with raises_user_error(code, contains=contains):
+        responder(config_of(server, concurrency=1), frames, mode=mode)(items, lambda _: None)
+
+
+@pytest.mark.slow
+def test_prompts_that_a_server_reads_differently_are_named_once(
+    items, frames, start_server, caplog, micro_store, tmp_path
+) -> None:
+    built = replace(STUDENT, architecture=SMALL, model=None)
+    corpus = partial(dataset.tokenizer_corpus, micro_store, [])
+    loading.save_student(*loading.load_base(built, "fp32", corpus), tmp_path, "fp32")
+    student = replace(STUDENT, model=str(tmp_path))
+    _, processor = loading.load_base(student, "fp32", list)
+    sample = item_sample("cot", frames, student, None, "record", items[0])
+    ids = encode(sample, processor, None).input_ids
+    for served, warnings in ((ids, 0), ([*ids[:3], 7, *ids[3:]], 1)):
+        reply = {"content": FULL, "prompt_ids": served}
+        server = start_server(lambda request, r=reply: r if "return_token_ids" in request else FULL)
+        responder(config_of(server, concurrency=1), frames, student)(items[:4], lambda *_, **__: 0)
+        assert sum("return_token_ids" in request for request in server.requests) == 1
+        assert caplog.text.count("reads prompts differently") == warnings
+    token = processor.tokenizer.decode(ids[3])
+    assert f"at token 3 of the first prompt, this process has {token!r}" in caplog.text
+
+
+def test_a_server_reports_the_origin_of_its_models(start_server, tmp_path) -> None:
+    one, same, other = (start_server(lambda _: FULL) for _ in range(3))
+    cfg = config_of(one)
+    assert served_origin(cfg) == {"root": "weights", "parent": None}
+    assert served_origin(replace(cfg, model="adapter")) == {"root": "lora", "parent": "weights"}
+    with raises_user_error("unknown-model", contains=("server.model=other", "served, adapter")):
+        served_origin(replace(cfg, model="other"))
+    other.root = "others"
+    assert served_origin(replace(cfg, url=[one.url, same.url])) == served_origin(cfg)
+    with raises_user_error("different-models", contains=(one.url, other.url)):
+        served_origin(replace(cfg, url=[one.url, same.url, other.url]))
+    one.stop()
+    with raises_user_error("no-server", contains=("http://127", "teacher.serve")):
+        served_origin(cfg)
+
+
+def test_a_student_and_its_base_are_not_confused(start_server, tmp_path, caplog) -> None:
     caplog.set_level("INFO")
     cfg = SelectCommand(student=STUDENT, server=config_of(start_server(lambda _: FULL)))
     unpinned, pinned = (
@@ -355,53 +297,30 @@ def test_a_revision_identifies_weights_that_a_server_does_not_describe(
     )
     assert unpinned != pinned
     assert "student.revision=COMMIT" in caplog.text
-
-
-def test_requests_carry_the_api_key(items, frames, start_server, tmp_path, monkeypatch) -> None:
-    server = start_server(lambda _: FULL)
-    server.key = "secret"
-    log = open_log(tmp_path, items)
-    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
-    for request in (
-        lambda: served_origin(config_of(server)),
-        lambda: collect_responses(items, "record", responder(config_of(server), frames), log),
-    ):
-        with raises_user_error("invalid-api-key", contains=(server.url, "OPENAI_API_KEY")):
-            request()
-    monkeypatch.setenv("OPENAI_API_KEY", "sec\rret")
-    with raises_user_error("invalid-api-key", contains="OPENAI_API_KEY"):
-        served_origin(config_of(server))
-    monkeypatch.setenv("OPENAI_API_KEY", "secret\n")
-    assert served_origin(config_of(server))["root"] == "weights"
-    answers = collect_responses(items, "record", responder(config_of(server), frames), log)
-    assert [a.letter for a in answers] == ["C"] * 8
-
-
-def test_a_student_and_its_base_are_not_confused(start_server, tmp_path) -> None:
-    server = start_server(lambda _: FULL)
-    cfg = SelectCommand(server=replace(config_of(server), model=None), student=STUDENT)
     with raises_user_error("missing-server-model", contains="server.model=NAME"):
-        ServedModel(cfg, tmp_path, STUDENT)
-    adapter = replace(cfg, server=replace(config_of(server), model="adapter"))
+        ServedModel(replace(cfg, server=replace(cfg.server, model=None)), tmp_path, STUDENT)
+    adapter = replace(cfg, server=replace(cfg.server, model="adapter"))
     with raises_user_error("adapter-without-run", contains="model=RUN"):
         ServedModel(adapter, None, STUDENT)
-
-
-def test_adapters_over_an_unquantised_base_are_warned_of(start_server, tmp_path, caplog) -> None:
-    cfg = SelectCommand(server=replace(config_of(start_server(lambda _: FULL)), model="adapter"))
-    ServedModel(cfg, tmp_path, replace(STUDENT, quantization="none"))
-    assert not caplog.text
-    ServedModel(cfg, tmp_path, STUDENT)
+    ServedModel(adapter, tmp_path, replace(STUDENT, quantization="none"))
+    assert "NF4" not in caplog.text
+    ServedModel(adapter, tmp_path, STUDENT)
     assert "NF4" in caplog.text
 
 
-def test_servers_of_two_models_with_one_name_are_refused(start_server) -> None:
-    one, same, other = (start_server(lambda _: FULL) for _ in range(3))
-    server = replace(config_of(one), url=[one.url, same.url])
-    assert served_origin(server) == served_origin(config_of(one))
-    other.root = "others"
-    with raises_user_error("different-models", contains=(one.url, other.url)):
-        served_origin(replace(server, url=[one.url, same.url, other.url]))
+def test_requests_carry_the_api_key(items, frames, start_server, monkeypatch) -> None:
+    server = start_server(lambda _: FULL)
+    server.key = "secret"
+    for key in (None, "sec\rret"):
+        if key is None:
+            monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+        else:
+            monkeypatch.setenv("OPENAI_API_KEY", key)
+        with raises_user_error("invalid-api-key", contains="OPENAI_API_KEY"):
+            served_origin(config_of(server))
+    monkeypatch.setenv("OPENAI_API_KEY", "secret\n")
+    responder(config_of(server), frames)(items, (kept := []).extend)
+    assert len(kept) == len(items)
 
 
 def test_the_key_of_a_response_depends_on_all_of_its_inputs() -> None:
@@ -442,5 +361,3 @@ def test_the_command_measures_a_served_model(micro, micro_store, start_server, t
     assert report["readings"]["record"] == {
         "with a letter": 0, "  in a valid record": 0, "without: refusal": 6,
     }  # fmt: skip
-    assert report["calibration"]["constrained"]["n"] == 6
-    assert report["positions"]["constrained"]["chosen"]["C"] == 6

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
-from transformers import CLIPVisionModel
 
 from dynapix.conf.schema import (
     ContrastiveTrainConfig,
@@ -25,7 +24,6 @@ from dynapix.conf.schema import (
 from dynapix.data.store import Store, open_store
 from dynapix.evaluation import two_stage
 from dynapix.evaluation.embedders.embedder import Embedder, open_embedders
-from dynapix.evaluation.embedders.joint_encoder import load_encoder
 from dynapix.evaluation.metrics.ranking import query_metrics
 from dynapix.evaluation.metrics.results import SCENE_ALONE, retrieval_results
 from dynapix.evaluation.retrieval.exact_search import Ranks
@@ -140,12 +138,6 @@ def test_a_text_is_matched_to_the_caption_with_the_same_words(rank, store) -> No
     missing = rank("predict_caption", texts, captions)
     assert missing.found.tolist() == [text != texts[0] for text in texts]
     assert missing.frames == len(database)
-
-
-def test_a_matcher_without_a_text_tower_is_refused(clip, tmp_path) -> None:
-    CLIPVisionModel.from_pretrained(clip.model).save_pretrained(tmp_path / "vision")
-    with raises_user_error("wrong-model-type", contains="clip_vision_model"):
-        load_encoder(replace(clip, model=str(tmp_path / "vision")), "fp32", None)
 
 
 @pytest.fixture

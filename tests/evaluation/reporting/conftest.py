@@ -39,6 +39,14 @@ def measured(tmp_path_factory, micro, micro_store) -> Path:
     return root
 
 
+@pytest.fixture(scope="session")
+def unchanged(measured, micro_store, tmp_path_factory) -> Path:
+    """The report on `measured`, with 12 items."""
+    root = tmp_path_factory.mktemp("unchanged") / "checkpoints"
+    shutil.copytree(measured, root)
+    return run_report(root, micro_store.folder.parent, items=12)
+
+
 @pytest.fixture
 def runs(measured, tmp_path) -> Path:
     """A copy of `measured` that a test may change."""

@@ -36,10 +36,8 @@ from dynapix.evaluation.metrics.selection import (
     choose_letters,
     credit_choices,
 )
-from dynapix.evaluation.reporting.selection_report import write_report
-from dynapix.evaluation.retrieval import candidate_similarity
 from dynapix.evaluation.retrieval.exact_search import Ranks
-from dynapix.evaluation.select import limit_items
+from dynapix.evaluation.select import limit_items, write_report
 from dynapix.models.student.responses import GeneratedText
 
 STUDENT = StudentConfig(name="small")
@@ -144,7 +142,8 @@ def similarity_run(
         credits = credit_choices(by_item, answers)
         letters = choose_letters(by_item)
         choices.append(Choices(title, SIMILARITY, None, credits, letters))
-        rows += candidate_similarity.score_rows(title, items, by_item)
+        for item, own in zip(items, by_item.tolist(), strict=True):
+            rows.append({"by": title, "item_id": item.item_id, "scores": own})
     folder = root / "similarity" / (model or name)
     finish(folder, settings)
     report = build_selection_report(choices, items, store.name, store.identity, 0)

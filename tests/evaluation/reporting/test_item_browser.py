@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dynapix.conf.errors import UserError
-from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.records import LETTERS
 from dynapix.evaluation.metrics.reasons import item_predicates, read_reasons
 from dynapix.evaluation.reporting import item_browser
@@ -76,23 +74,6 @@ def test_every_shown_frame_is_encoded_as_a_small_image(micro_store, items):
         assert len(content) < 12_000
     target = f"{micro_store.name}/{few[0].scene_id}/{few[0].target_frame}"
     assert entries[0]["candidates"][few[0].answer]["frame"] == target
-
-
-def test_missing_frames_are_reported_and_the_others_are_encoded(micro_store, items, monkeypatch):
-    lost = items[0].scene_id
-    read = FrameReader.stack
-
-    def read_unless_lost(self, scene_id, frames):
-        if scene_id == lost:
-            raise UserError(f"the video of {scene_id} is missing")
-        return read(self, scene_id, frames)
-
-    monkeypatch.setattr(FrameReader, "stack", read_unless_lost)
-    few = [items[0], next(i for i in items if i.scene_id != lost and i.family == "time")]
-    frames, errors = item_browser.encode_frames(few, micro_store)
-    assert errors == [f"the video of {lost} is missing"]
-    assert frames
-    assert not [name for name in frames if f"/{lost}/" in name]
 
 
 @pytest.mark.parametrize(

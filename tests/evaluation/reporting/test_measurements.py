@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,32 +20,21 @@ from tests.evaluation.study.test_agreement import summarize, vote
 pytestmark = pytest.mark.slow
 
 
-def change_first_row(report: Path, **row: object) -> None:
-    """Change fields of the first result in a report.json."""
-    content = json.loads(report.read_text())
-    content["rows"][0] |= row
-    report.write_text(json.dumps(content))
-
-
 def test_results_of_a_model_on_two_benchmarks_share_a_row(runs):
-    # The second run of the model on the same items has another interval, as with another seed.
-    shutil.copytree(runs / "select" / "cot", runs / "select" / "again")
-    macro = {"value": 1.0, "low": 0.9, "high": 1.0, "n": 8}
-    change_first_row(runs / "select" / "again" / "report.json", macro=macro)
     shutil.copytree(runs / "select" / "cot", runs / "select" / "elsewhere")
-    change_first_row(runs / "select" / "elsewhere" / "report.json", benchmark="elsewhere")
+    report = runs / "select" / "elsewhere" / "report.json"
+    report.write_text(report.read_text().replace('"micro"', '"elsewhere"', 1))
     folder = run_report(runs, runs, items=1)
     for name, line in (("transfer", "cot (reasoning)"), ("ablation", "full student (cot)")):
         table = read_table(folder, name)
         [row] = [row for row in table.splitlines() if row.startswith(f"| {line} |")]
-        assert "100.0" in row.split("|")[2]
-        assert "cot, cot" in table
+        assert row.count("100.0") == 2
 
 
 def test_trainings_with_several_seeds_are_compared(runs, micro, micro_store, report):
     right, wrong = measured.right, measured.always_a
     for name, regime, respond in (("ours", "cot", right), ("plain", "cot_no_match_layout", wrong)):
-        for seed in range(3):
+        for seed in range(2):
             run = f"{name}-{seed}"
             measured.trained_student(runs, micro, run, regime, seed)
             measured.select_run(runs, micro_store, micro, run, respond, model=run)
@@ -62,7 +50,7 @@ def test_trainings_with_several_seeds_are_compared(runs, micro, micro_store, rep
     [plain] = [row for row in table.splitlines() if row.startswith("| plain (answer) |")]
     assert ours.split("|")[5].strip() == "100.0"
     assert plain.split("|")[5].strip() == f"{share:.1f}"
-    assert plain.split("|")[6].strip() == " ".join([f"{share:.1f}"] * 3)
+    assert plain.split("|")[6].strip() == " ".join([f"{share:.1f}"] * 2)
     # Markdown escapes the underscores of a regime's name.
     asked = r"ours (reasoning, cot\_no\_match\_layout)"
     [other] = [row for row in table.splitlines() if row.startswith(f"| {asked} |")]
@@ -112,7 +100,7 @@ def test_the_majority_vote_on_the_same_build_has_a_row_that_is_not_bold(runs, mi
     cells = " | ".join(["100.0"] * 5)
     row = f"| Majority vote, pilot | {cells} | - | 6 |"
     assert row in read_table(folder, "selection-micro")
-    for other in ({"benchmark": "elsewhere"}, {"build": "before"}):
-        (runs / "export_study" / "pilot" / "report.json").write_text(json.dumps({**found, **other}))
-        folder = report(items=0)
-        assert "Majority vote, pilot" not in read_table(folder, "selection-micro")
+    other = {**found, "build": "before"}
+    (runs / "export_study" / "pilot" / "report.json").write_text(json.dumps(other))
+    folder = report(items=0)
+    assert "Majority vote, pilot" not in read_table(folder, "selection-micro")

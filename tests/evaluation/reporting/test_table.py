@@ -6,8 +6,8 @@ import html
 import re
 
 from dynapix.data.checks.intervals import Interval
+from dynapix.evaluation.report import render_page
 from dynapix.evaluation.reporting.item_browser import ItemBrowser
-from dynapix.evaluation.reporting.page import render_page
 from dynapix.evaluation.reporting.sections import Section
 from dynapix.evaluation.reporting.table import Table
 

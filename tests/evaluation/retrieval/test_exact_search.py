@@ -1,21 +1,30 @@
-"""Exact ranks equal those of a score matrix, in any order and blocks of the database."""
+"""Exact ranks equal those of a score matrix, in any order and blocks of the database: for one
+vector per frame, and for several vectors by late interaction."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
+from sentence_transformers.util.similarity import maxsim
 
+from dynapix.evaluation.embedders.cache import pad_rows
 from dynapix.evaluation.retrieval import exact_search
 from dynapix.evaluation.retrieval.exact_search import (
-    GridEmbeddings,
-    block_scores,
+    LATE_GRID,
+    Ranks,
+    _to_grid,
     exact_ranks,
     pair_scores,
-    row_sums,
+    score,
 )
 from tests.evaluation.metrics.reference import count_ranks
 
 WIDTHS = (96, 48, 20, 7)
+LATE_WIDTH = 24
+QUERIES, FRAMES = 40, 300
+TARGETS = np.arange(QUERIES) * 7
 
 
 def embeddings(rows: int, seed: int = 0) -> np.ndarray:
@@ -26,7 +35,51 @@ def embeddings(rows: int, seed: int = 0) -> np.ndarray:
     return values.astype(np.float32)
 
 
-def cosines(queries: np.ndarray, database: np.ndarray, width: int) -> np.ndarray:
+def random_vectors(rows: int, most: int, seed: int) -> list[np.ndarray]:
+    """Random unit vectors: for each row, from one to `most` of them."""
+    rng = np.random.default_rng(seed)
+    vectors = [rng.standard_normal((rng.integers(1, most + 1), LATE_WIDTH)) for _ in range(rows)]
+    return [(v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32) for v in vectors]
+
+
+def rows_of(vectors: list[np.ndarray], more: int = 0) -> np.ndarray:
+    """Stack the vectors of each row, padded by `more` vectors beyond the longest row."""
+    rows = pad_rows([v.ravel() for v in vectors])
+    return np.pad(rows, ((0, 0), (0, more * LATE_WIDTH)))
+
+
+@dataclass
+class Case:
+    """Rows of queries and frames, in which every third frame equals the first."""
+
+    queries: np.ndarray
+    frames: np.ndarray
+    widths: tuple[int, ...]
+    late: bool
+
+    def ranks(self, frames: np.ndarray, targets: np.ndarray, size: int = FRAMES) -> Ranks:
+        """Rank frames in parts of a size. `targets` are their indices of the targets."""
+        parts = [frames[k : k + size] for k in range(0, len(frames), size)]
+        return exact_ranks(self.queries, frames[targets], parts, self.widths, late=self.late)
+
+
+@pytest.fixture(params=["single", "late"])
+def case(request) -> Case:
+    if request.param == "single":
+        queries, frames = embeddings(QUERIES), embeddings(FRAMES, 1)
+        frames[::3] = frames[0]
+        return Case(queries, frames, WIDTHS, late=False)
+    vectors = random_vectors(FRAMES, 9, 1)
+    vectors = [vectors[0] if k % 3 == 0 else v for k, v in enumerate(vectors)]
+    queries = rows_of(random_vectors(QUERIES, 20, 0))
+    return Case(queries, rows_of(vectors), (LATE_WIDTH,), late=True)
+
+
+def same(one: Ranks, two: Ranks) -> bool:
+    return np.array_equal(one.above, two.above) and np.array_equal(one.tied, two.tied)
+
+
+def exact_cosines(queries: np.ndarray, database: np.ndarray, width: int) -> np.ndarray:
     """Cosines (queries, frames) by their definition, in double precision."""
     units = [
         a[:, :width].astype(float) / np.linalg.norm(a[:, :width].astype(float), axis=1)[:, None]
@@ -35,33 +88,54 @@ def cosines(queries: np.ndarray, database: np.ndarray, width: int) -> np.ndarray
     return units[0] @ units[1].T
 
 
-def split(database: np.ndarray, size: int) -> list[np.ndarray]:
-    return [database[k : k + size] for k in range(0, len(database), size)]
+@pytest.mark.parametrize(("size", "block", "cells"), [(1, 9, 1), (7, 64, 2**10), (299, 1, 2**23)])
+def test_blocks_do_not_change_ranks(monkeypatch, case, size, block, cells) -> None:
+    expected = case.ranks(case.frames, TARGETS)
+    monkeypatch.setattr(exact_search, "BLOCK_VECTORS", block)
+    monkeypatch.setattr(exact_search, "BLOCK_PRODUCTS", cells)
+    assert same(case.ranks(case.frames, TARGETS, size), expected)
 
 
-def same(one: exact_search.Ranks, two: exact_search.Ranks) -> bool:
-    return (
-        np.array_equal(one.above, two.above)
-        and np.array_equal(one.tied, two.tied)
-        and one.frames == two.frames
-    )
+def test_the_order_of_the_database_does_not_change_ranks(case) -> None:
+    places = np.random.default_rng(3).permutation(FRAMES)
+    moved = case.ranks(case.frames[places], np.argsort(places)[TARGETS], 13)
+    assert same(moved, case.ranks(case.frames, TARGETS))
 
 
-def test_scores_are_cosines_to_fp32() -> None:
+def test_equal_frames_tie(case) -> None:
+    found = case.ranks(case.frames, TARGETS)
+    copies = TARGETS % 3 == 0
+    assert (found.tied[:, copies] == FRAMES // 3 - 1).all()
+    assert not found.tied[:, ~copies].any()
+    # Each copy of the database adds as many frames above a target.
+    double = case.ranks(np.concatenate([case.frames, case.frames[::-1]]), TARGETS, 101)
+    assert np.array_equal(double.above, 2 * found.above)
+
+
+def test_scores_of_pairs_and_of_blocks_are_bit_identical(case) -> None:
+    frames = case.frames[TARGETS]
+    for width in case.widths:
+        block = score(case.queries, frames, width, case.late)
+        assert block.dtype == np.float32
+        pairs = pair_scores(case.queries, frames, width, case.late)
+        assert np.array_equal(pairs, np.diagonal(block))
+        for rows in (slice(3, 4), slice(9, 22), np.array([5, 38, 2])):
+            part = score(case.queries[rows], frames, width, case.late)
+            assert np.array_equal(part, block[rows])
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_scores_are_cosines_to_fp32(width) -> None:
     queries, database = embeddings(30), embeddings(50, 1)
-    for k, scores in enumerate(
-        block_scores(GridEmbeddings(queries, WIDTHS), GridEmbeddings(database, WIDTHS))
-    ):
-        assert scores.dtype == np.float32
-        np.testing.assert_allclose(scores, cosines(queries, database, WIDTHS[::-1][k]), atol=6e-8)
+    scores = score(queries, database, width, late=False)
+    np.testing.assert_allclose(scores, exact_cosines(queries, database, width), atol=6e-8)
 
 
 def test_ranks_equal_those_of_a_score_matrix() -> None:
-    queries, database = embeddings(40), embeddings(300, 1)
-    targets = np.random.default_rng(2).integers(300, size=40)
-    found = exact_ranks(queries, database[targets], [database], WIDTHS)
+    queries, database = embeddings(QUERIES), embeddings(FRAMES, 1)
+    found = exact_ranks(queries, database[TARGETS], [database], WIDTHS)
     for k, width in enumerate(WIDTHS):
-        above, tied = count_ranks(cosines(queries, database, width), targets)
+        above, tied = count_ranks(exact_cosines(queries, database, width), TARGETS)
         # A few frames tie with the target in fp32 but not in double precision.
         assert np.abs(found.above[k] - above).max() <= 1
         assert (found.above[k] + found.tied[k] >= above).all()
@@ -69,109 +143,36 @@ def test_ranks_equal_those_of_a_score_matrix() -> None:
     assert found.tied.sum() < 5
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 7, 64, 255, 299, 300])
-@pytest.mark.parametrize("block", [1, 5, 37, 1024])
-def test_blocks_of_the_database_do_not_change_ranks(monkeypatch, size, block) -> None:
-    queries, database = embeddings(23), embeddings(300, 1)
-    database[::3] = database[0]
-    targets = np.arange(23) * 11
-    expected = exact_ranks(queries, database[targets], [database], WIDTHS)
-    monkeypatch.setattr(exact_search, "BLOCK_FRAMES", block)
-    monkeypatch.setattr(exact_search, "BLOCK_QUERIES", 1 + block % 9)
-    assert same(exact_ranks(queries, database[targets], split(database, size), WIDTHS), expected)
-
-
-def test_the_order_of_the_database_and_of_the_queries_does_not_change_ranks() -> None:
-    queries, database = embeddings(40), embeddings(333, 1)
-    database[100:200] = database[:100]
-    targets = np.arange(40) * 8
-    expected = exact_ranks(queries, database[targets], [database], WIDTHS)
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        order, moved_queries = rng.permutation(333), rng.permutation(40)
-        moved = exact_ranks(
-            queries[moved_queries],
-            database[targets[moved_queries]],
-            split(database[order], 101),
-            WIDTHS,
-        )
-        assert np.array_equal(moved.above, expected.above[:, moved_queries])
-        assert np.array_equal(moved.tied, expected.tied[:, moved_queries])
-
-
-@pytest.mark.parametrize("size", [1, 13, 64, 129])
-def test_equal_frames_tie_at_any_position(size) -> None:
-    """The database has three copies of every frame, in different blocks and at different positions
-    in a block."""
-    queries, frames = embeddings(64), embeddings(129, 1)
-    database = np.concatenate([frames, frames[::-1], np.roll(frames, 17, axis=0)])
-    targets = np.arange(64)
-    distinct = exact_ranks(queries, frames[targets], [frames], WIDTHS)
-    assert not distinct.tied.any()
-    found = exact_ranks(queries, database[targets], split(database, size), WIDTHS)
-    assert (found.tied == 2).all()
-    assert np.array_equal(found.above, 3 * distinct.above)
-
-
 def test_twins_are_compared_with_targets_at_each_width() -> None:
     queries, database = embeddings(400), embeddings(800, 1)
     targets, twins = database[:400], database[400:]
 
     def share(rows: np.ndarray) -> np.ndarray:
-        found = exact_ranks(rows, targets, [database], WIDTHS, twins)
-        assert same(found, exact_ranks(rows, targets, [database], WIDTHS))
-        return found.twin_above
+        return exact_ranks(rows, targets, [database], WIDTHS, twins).twin_above
 
     assert (share(targets) == 0).all(), "embeddings of the counterfactual frames"
     assert (share(twins) == 1).all(), "embeddings of the factual frames"
     assert (share(np.zeros_like(queries)) == 0.5).all()
-    assert share(queries).mean(axis=1) == pytest.approx([0.5] * len(WIDTHS), abs=0.1)
     for k, width in enumerate(WIDTHS):
-        scores = cosines(queries, database, width)
+        scores = exact_cosines(queries, database, width)
         clear = np.abs(gap := np.diagonal(scores[:, 400:]) - np.diagonal(scores)) > 1e-6
         assert np.array_equal(share(queries)[k][clear], (gap > 0)[clear])
     assert exact_ranks(queries, targets, [database], WIDTHS).twin_above is None
 
 
-def test_scores_of_pairs_and_of_blocks_are_bit_identical() -> None:
-    rng = np.random.default_rng(0)
-    queries = rng.standard_normal((70, 1024), np.float32)
-    database = rng.standard_normal((70, 1024), np.float32)
-    query_grid, frame_grid = (
-        GridEmbeddings(queries, [1024, 256]),
-        GridEmbeddings(database, [1024, 256]),
-    )
-    blocks = list(block_scores(query_grid, frame_grid))
-    for pairs, block in zip(pair_scores(query_grid, frame_grid), blocks, strict=True):
-        assert np.array_equal(pairs, np.diagonal(block))
-    for rows in (slice(3, 4), slice(9, 22), np.array([5, 68, 2])):
-        for part, block in zip(block_scores(query_grid[rows], frame_grid), blocks, strict=True):
-            assert np.array_equal(part, block[rows])
-
-
-def test_products_of_pieces_are_exact() -> None:
+def test_products_on_the_grid_are_exact() -> None:
     """The products equal those of Python's integers, also if all products of entries are
     positive."""
     rng = np.random.default_rng(0)
     rows = rng.standard_normal((4, 4096))
     rows[1], rows[2] = 1.0, np.abs(rows[2])
     rows[3, 1:] = 0
-    (piece,) = GridEmbeddings(rows.astype(np.float32), [4096]).pieces
-    products = piece @ piece.T
-    integers = [[int(x) for x in row] for row in piece.tolist()]
+    grid = _to_grid(rows.astype(np.float32))
+    products = grid @ grid.T
+    integers = [[int(x) for x in row] for row in grid.tolist()]
     for i, a in enumerate(integers):
         for j, b in enumerate(integers):
             assert int(products[i, j]) == sum(x * y for x, y in zip(a, b, strict=True))
-
-
-@pytest.mark.parametrize("width", [1, 2, 3, 7, 64, 100])
-def test_the_sum_of_a_row_is_independent_of_other_rows(width) -> None:
-    values = np.random.default_rng(0).random((50, width))
-    sums = row_sums(values.copy())
-    np.testing.assert_allclose(sums, values.sum(1))
-    for k in range(50):
-        assert row_sums(values[k : k + 1].copy()) == sums[k]
-        assert row_sums(np.asfortranarray(values)[k:].copy(order="F"))[0] == sums[k]
 
 
 def test_an_embedding_of_zeros_ties_with_all_frames() -> None:
@@ -180,3 +181,26 @@ def test_an_embedding_of_zeros_ties_with_all_frames() -> None:
     found = exact_ranks(np.zeros((1, 96), np.float32), database[:1], [database], WIDTHS)
     assert (found.above == 0).all()
     assert (found.tied == 9).all()
+
+
+def test_late_scores_agree_with_the_librarys_in_any_order_of_the_vectors() -> None:
+    queries, frames = random_vectors(20, 60, 0), random_vectors(120, 9, 1)
+    found = score(rows_of(queries), rows_of(frames), LATE_WIDTH, late=True)
+    np.testing.assert_allclose(found, maxsim([*queries], [*frames]).numpy(), rtol=1e-6, atol=1e-5)
+    rng = np.random.default_rng(2)
+    moved = [rows_of([rng.permutation(v) for v in side], 5) for side in (queries, frames)]
+    assert np.array_equal(score(*moved, LATE_WIDTH, late=True), found)
+    padded = exact_ranks(moved[0], moved[1][:20], [moved[1]], [LATE_WIDTH], late=True)
+    assert padded.vectors == sum(map(len, frames)), "padding is not counted"
+
+
+def test_sums_of_up_to_8000_vectors_are_exact() -> None:
+    """All vectors are equal, which gives the largest possible sum."""
+    vector = np.full((1, LATE_WIDTH), LATE_WIDTH**-0.5, np.float32)
+    steps = np.rint(vector.astype(np.float64) * LATE_GRID).astype(object)
+    for count in (1, 7999, 8000):
+        query = np.repeat(vector, count, axis=0).reshape(1, -1)
+        (found,) = pair_scores(query, vector, LATE_WIDTH, late=True)
+        exact = count * int((steps * steps).sum())
+        assert exact < 2**53
+        assert found == np.float32(exact / 2**40)

@@ -17,15 +17,13 @@ SMALL = 4
 
 
 def prepare(micro, micro_store, root: Path, items: int) -> Path:
-    """Create a study with its media, and return its run folder."""
+    """Create a study, and return its run folder."""
     cfg = StudyCommand(
         benchmark=micro, store=str(micro_store.folder.parent), items=str(items), annotators=3
     )
     folder = root / "study" / str(items)
     folder.mkdir(parents=True)
-    db = setup.create_study(cfg, folder / storage.DATABASE)
-    setup.add_missing_media(cfg, db, folder)
-    db.close()
+    setup.create_study(cfg, folder / storage.DATABASE)
     return folder
 
 
@@ -68,5 +66,5 @@ def small(serve, prepared_small):
 
 @pytest.fixture
 def visitor(small) -> Visitor:
-    """The annotator A1, signed in with a new link in each test."""
+    """The annotator A1, signed in."""
     return Visitor(small.port).sign_in(small.links()["A1"])

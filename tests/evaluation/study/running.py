@@ -50,10 +50,9 @@ class Server:
         self.process.wait(timeout=60)
 
     def links(self) -> dict[str, str]:
-        """Return the token in each annotator's unused link, by name."""
-        lines = (self.folder / "links.txt").read_text().splitlines()
-        pairs = [line.split() for line in lines if not line.startswith("#")]
-        return {name: link.rpartition("/")[2] for name, link in pairs}
+        """Return the path of each annotator's link, by name."""
+        pairs = map(str.split, (self.folder / "links.txt").read_text().splitlines())
+        return {name: link.partition(f":{self.port}")[2] for name, link in pairs}
 
 
 @dataclass(frozen=True)
@@ -120,32 +119,19 @@ class Visitor:
         return self.request("GET", "/")
 
     def sign_in(self, link: str) -> Visitor:
-        assert self.request("POST", "/link", {"link": link}).status == 303
+        assert self.request("GET", link).status == 303
         return self
 
     def load(self, page: Reply) -> Reply:
         return self.request("POST", "/loaded", key_of(page))
 
-    def answer(self, page: Reply, letter: str, seconds: float = 1.5) -> Reply:
-        return self.request(
-            "POST", "/answer", key_of(page) | {"choice": letter, "seconds": seconds}
-        )
-
-    def leave(self, page: Reply) -> Reply:
-        """Leave a page that has no open question."""
-        return self.request("POST", "/continue", key_of(page))
+    def answer(self, page: Reply, letter: str) -> Reply:
+        return self.request("POST", "/answer", key_of(page) | {"choice": letter})
 
     def to_question(self) -> Reply:
-        """Leave the pages before the first item, practice included, and return the item's page."""
-        while True:
-            page = self.home()
-            if page.action != "/answer":
-                self.leave(page)
-            elif "Practice" in page.text:
-                self.load(page)
-                self.answer(page, "A")
-            else:
-                return page
+        """Agree to take part, and return the page of the open item."""
+        self.request("POST", "/consent", {})
+        return self.home()
 
 
 def key_of(page: Reply) -> dict[str, str]:
@@ -159,22 +145,18 @@ class Annotator:
     visitor: Visitor
     choose: Callable[[int], str]
     answers: dict[str, str] = field(default_factory=dict)
-    rests: int = 0
 
     def take_part(self) -> None:
         """Answer all items."""
-        while (page := self.visitor.home()).action is not None:
-            if page.action != "/answer":
-                self.rests += "Time for a break" in page.text
-                self.visitor.leave(page)
-                continue
+        page = self.visitor.to_question()
+        while page.action == "/answer":
             for path in page.media():
                 assert self.visitor.request("GET", path).status in (200, 404)
             self.visitor.load(page)
             letter = self.choose(len(self.answers))
             assert self.visitor.answer(page, letter).status == 303
-            if "Practice" not in page.text:
-                self.answers[page.hidden("key")] = letter
+            self.answers[page.hidden("key")] = letter
+            page = self.visitor.home()
 
 
 def rows(server, query: str, *values) -> list[sqlite3.Row]:

@@ -1,13 +1,12 @@
-"""A complete study over HTTP."""
+"""A complete study over HTTP: what the server shows, stores and refuses."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import io
 import json
 import re
-import sqlite3
+import stat
 import time
 from collections import Counter
 from threading import Thread
@@ -18,12 +17,11 @@ import pytest
 from PIL import Image
 
 from dynapix.conf.entry import Run
-from dynapix.conf.schema import ExportStudyCommand, StudyCommand
+from dynapix.conf.schema import ExportStudyCommand
 from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.records import LETTERS
-from dynapix.evaluation.study import auth, export, storage
-from dynapix.evaluation.study.auth import HEADERS
-from dynapix.evaluation.study.routes import build_app
+from dynapix.evaluation.study import export, storage
+from dynapix.evaluation.study.routes import HEADERS
 from tests.evaluation.study.conftest import ITEMS, SMALL
 from tests.evaluation.study.running import Annotator, Visitor, key_of, rows
 
@@ -42,34 +40,27 @@ def test_a_study_survives_kills_with_three_concurrent_annotators(serve, prepared
     threads = [Thread(target=a.take_part, daemon=True) for a in annotators]
     for thread in threads:
         thread.start()
-    for killed_after in (40, 100):
-        while sum(len(a.answers) for a in annotators) < killed_after:
-            assert all(thread.is_alive() for thread in threads)
-            time.sleep(0.02)
-        server.kill()
-        server.start()
+    while sum(len(a.answers) for a in annotators) < ITEMS:
+        assert all(thread.is_alive() for thread in threads)
+        time.sleep(0.02)
+    server.kill()
+    server.start()
     for thread in threads:
         thread.join(timeout=300)
     assert [len(a.answers) for a in annotators] == [ITEMS] * 3
-    assert [a.rests for a in annotators] == [2] * 3
-    stored = rows(
-        server, "SELECT token, letter FROM turn JOIN item USING (item_id) WHERE NOT practice"
-    )
+    stored = rows(server, "SELECT token, letter FROM turn")
     assert dict(map(tuple, stored)) == {k: v for a in annotators for k, v in a.answers.items()}
 
-    run = Run("x", tmp_path)
     cfg = ExportStudyCommand(run=server.folder.name, checkpoints=str(server.folder.parents[1]))
-    export.main.__wrapped__(cfg, run)
+    export.main.__wrapped__(cfg, Run("x", tmp_path))
     text = (tmp_path / export.VOTES_FILE).read_text()
     votes = [json.loads(line) for line in text.splitlines()]
     assert Counter(v["annotator"] for v in votes) == {"A1": ITEMS, "A2": ITEMS, "A3": ITEMS}
     assert len({(v["annotator"], v["item_id"]) for v in votes}) == 3 * ITEMS
     assert all(v["right"] == (v["choice"] == v["answer"]) for v in votes)
-    secrets = [r["link"] for r in rows(server, "SELECT link FROM annotator")]
-    assert not any(secret in text for secret in secrets)
+    assert not any(link.rpartition("/")[2] in text for link in server.links().values())
     found = json.loads((tmp_path / "report.json").read_text())
-    assert found["depth"] == {"3": ITEMS}
-    assert found["fleiss_kappa"]["items"] == ITEMS
+    assert (found["depth"], found["kappa_items"]) == ({"3": ITEMS}, ITEMS)
     # Each of the three annotators saw the correct candidate of an item at another letter.
     places = Counter((v["item_id"], _place_of_answer(server, v)) for v in votes)
     assert set(places.values()) == {1}
@@ -82,37 +73,19 @@ def _place_of_answer(server, vote: dict) -> int:
     return row["shown"].index(str(vote["answer"]))
 
 
-def test_a_letter_chooses_the_candidate_that_the_page_shows_at_it(small, micro_store) -> None:
-    visitor = Visitor(small.port).sign_in(small.links()["A2"])
-    page = visitor.to_question()
-    images = [visitor.request("GET", path).body for path in page.media()[1:]]
-    visitor.load(page)
-    visitor.answer(page, "C", seconds=3.25)
-    [turn] = rows(small, "SELECT * FROM turn WHERE token = ?", page.hidden("key"))
-    item = next(i for i in micro_store.selection("test") if i.item_id == turn["item_id"])
-    chosen = item.candidates[turn["choice"]]
-    pixels = FrameReader(micro_store).array(chosen.scene_id, chosen.frame)
-    assert np.array_equal(np.asarray(Image.open(io.BytesIO(images[2]))), pixels)
-    assert turn["client_seconds"] == 3.25
-    assert turn["opened"] <= turn["loaded"] <= turn["answered"]
-
-
-def test_no_response_reveals_the_correct_answer(small, micro_store) -> None:
+def test_no_response_reveals_the_correct_answer(serve, prepared_small, micro_store) -> None:
     """The page of an item depends only on its question, its media and random tokens."""
+    server = serve(prepared_small)
     items = {i.item_id: i for i in micro_store.selection()}
-    visitor = Visitor(small.port).sign_in(small.links()["A3"])
-    answers, places, names = [], [], []
-    for k in range(SMALL + 3):
-        while (page := visitor.home()).action != "/answer":
-            visitor.leave(page)
-        [turn] = rows(
-            small,
-            "SELECT * FROM turn JOIN plan USING (annotator, item_id) WHERE token = ?",
-            page.hidden("key"),
-        )
-        item = items[turn["item_id"]]
-        paths = page.media()
+    frames = FrameReader(micro_store)
+    visitor = Visitor(server.port).sign_in(server.links()["A3"])
+    places, names, page = [], [], visitor.to_question()
+    query = "SELECT * FROM turn JOIN plan USING (annotator, item_id) WHERE token = ?"
+    for k in range(SMALL):
+        [turn] = rows(server, query, page.hidden("key"))
+        item, paths = items[turn["item_id"]], page.media()
         names += paths
+        places.append(turn["shown"].index(str(item.answer)))
         replies = [visitor.request("GET", path) for path in paths]
         assert {r.status for r in replies} == {200}
         for text in (page.text, *(str(r.headers) for r in replies), *paths):
@@ -120,58 +93,25 @@ def test_no_response_reveals_the_correct_answer(small, micro_store) -> None:
                 word in text
                 for word in (item.item_id, item.scene_id, item.family, item.subtype, "target")
             )
-        markup = page.text.split("<main")[1]
-        assert not re.search(r'same_|cross_|oracle|class="correct|· correct|right', markup)
-        candidates = replies[1:]
-        heads = [{k: v for k, v in r.headers.items() if k != "date"} for r in candidates]
+        markup = page.text.split("<main")[1].replace(item.question, "")
+        assert not re.search(r"same_|cross_|oracle|correct|right", markup)
+        heads = [{k: v for k, v in r.headers.items() if k != "date"} for r in replies[1:]]
         assert all(head == heads[0] for head in heads)
         assert set(heads[0]) == {"content-length", "content-type"} | {h.lower() for h in HEADERS}
-        # Conditional and range requests get the whole content.
-        again = visitor.request("GET", paths[1], **{"If-None-Match": "*", "Range": "bytes=0-9"})
-        assert (again.status, again.body) == (200, candidates[0].body)
-        places.append(turn["shown"].index(str(item.answer)))
-        answers.append(item.answer)
         visitor.load(page)
-        visitor.answer(page, LETTERS[k % 4])
-        if k >= 3:
-            # Answered items are not served again.
-            assert {visitor.request("GET", path).status for path in paths} == {404}
+        visitor.answer(page, LETTERS[k])
+        # A letter chooses the candidate that the page shows at it.
+        [turn] = rows(server, query, page.hidden("key"))
+        chosen = item.candidates[turn["choice"]]
+        pixels = frames.array(chosen.scene_id, chosen.frame)
+        assert np.array_equal(np.asarray(Image.open(io.BytesIO(replies[1 + k].body))), pixels)
+        assert turn["opened"] <= turn["loaded"] <= turn["answered"]
+        # Answered items are not served again.
+        assert {visitor.request("GET", path).status for path in paths} == {404}
+        page = visitor.home()
+    assert "Thank you" in page.text
     assert len(set(names)) == len(names)
-    assert sorted(places[3:]) == [0, 1, 2, 3]
-
-
-def test_an_annotator_can_sign_in_although_the_disk_is_full(small) -> None:
-    def full() -> None:
-        raise OSError("No space left on device")
-
-    db = storage.open_study(small.folder / storage.DATABASE)
-    response = post_link(build_app(db, StudyCommand(), full), small.links()["A1"])
-    auth.write_links(db, small.folder / auth.LINKS_FILE, "http://here")
-    assert response["status"] == 303
-    assert any(name == b"set-cookie" for name, _ in response["headers"])
-    # In a database without tables, every query fails.
-    broken = build_app(sqlite3.connect(":memory:"), StudyCommand(), full)
-    assert post_link(broken, "x" * 10)["status"] == 500
-
-
-def post_link(app, link: str) -> dict:
-    """Send the form of a link to an application, and return the start of the response."""
-    messages = []
-
-    async def receive() -> dict:
-        return {"type": "http.request", "body": f"link={link}".encode(), "more_body": False}
-
-    async def send(message: dict) -> None:
-        messages.append(message)
-
-    scope = {
-        "type": "http", "method": "POST", "path": "/link", "raw_path": b"/link",
-        "query_string": b"", "headers": [(b"host", b"here")], "http_version": "1.1",
-    }  # fmt: skip
-    # After an error, the application responds, and raises the error again so that it is logged.
-    with contextlib.suppress(sqlite3.Error):
-        asyncio.run(app(scope, receive, send))
-    return messages[0]
+    assert sorted(places) == [0, 1, 2, 3]
 
 
 def test_only_one_of_many_concurrent_answers_counts(small, visitor) -> None:
@@ -180,7 +120,7 @@ def test_only_one_of_many_concurrent_answers_counts(small, visitor) -> None:
     votes = len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL"))
 
     async def request(k: int) -> int:
-        body = urlencode({**key_of(page), "choice": LETTERS[k % 4], "seconds": 1})
+        body = urlencode({**key_of(page), "choice": LETTERS[k % 4]})
         head = "GET /" if k % 2 else "POST /answer"
         sent = "" if k % 2 else body
         reader, writer = await asyncio.open_connection("127.0.0.1", small.port)
@@ -194,45 +134,12 @@ def test_only_one_of_many_concurrent_answers_counts(small, visitor) -> None:
         return int(status.split()[1])
 
     async def all_at_once() -> Counter:
-        return Counter(await asyncio.gather(*(request(k) for k in range(1000))))
+        return Counter(await asyncio.gather(*(request(k) for k in range(200))))
 
-    assert asyncio.run(all_at_once()) == {200: 500, 303: 500}
+    assert asyncio.run(all_at_once()) == {200: 100, 303: 100}
     assert len(rows(small, "SELECT 1 FROM turn WHERE answered IS NOT NULL")) == votes + 1
-    assert visitor.home().status == 200
-
-
-def test_loading_a_page_opens_no_item(serve, prepared_small) -> None:
-    server = serve(prepared_small)
-    visitor = Visitor(server.port).sign_in(server.links()["A1"])
-    for _ in range(3):
-        assert visitor.home().action == "/continue"
-    assert rows(server, "SELECT * FROM turn") == []
-    visitor.to_question()
-    opened = len(rows(server, "SELECT * FROM turn"))
-    # An item that is not open, as after a restart, opens by a button only.
-    db = storage.open_study(server.folder / storage.DATABASE)
-    with storage.transaction(db):
-        db.execute("DELETE FROM turn WHERE answered IS NULL")
-    db.close()
-    page = visitor.home()
-    assert "The next question opens" in page.text
-    assert len(rows(server, "SELECT * FROM turn")) == opened - 1
-    visitor.leave(page)
-    assert visitor.home().action == "/answer"
-    assert len(rows(server, "SELECT * FROM turn")) == opened
-
-
-def test_a_session_expires(serve, prepared_small) -> None:
-    server = serve(prepared_small, "session_days=2")
-    visitor = Visitor(server.port).sign_in(server.links()["A1"])
-    assert visitor.home().status == 200
-    for hours, status in ((47, 200), (49, 401)):
-        db = storage.open_study(server.folder / storage.DATABASE)
-        with storage.transaction(db):
-            db.execute("UPDATE annotator SET signed_in = ?", (time.time() - 3600 * hours,))
-        db.close()
-        assert visitor.home().status == status
-    assert visitor.sign_in(server.links()["A1"]).home().status == 200
+    open_items = "SELECT count(*) FROM turn WHERE answered IS NULL GROUP BY annotator"
+    assert {count for (count,) in rows(small, open_items)} == {1}
 
 
 def test_withdrawal_deletes_an_annotator_and_no_one_else(serve, prepared_small) -> None:
@@ -245,15 +152,90 @@ def test_withdrawal_deletes_an_annotator_and_no_one_else(serve, prepared_small) 
     mine = rows(server, "SELECT * FROM turn WHERE annotator = 'A1'")
     theirs = rows(server, "SELECT token FROM turn WHERE annotator = 'A2'")
     assert mine
-    # The page asks first, and a form on another site is refused.
+    # The page asks first.
     assert visitors[0].request("GET", "/withdraw").action == "/withdraw"
-    foreign = {"Sec-Fetch-Site": "cross-site"}
-    assert visitors[0].request("POST", "/withdraw", {}, **foreign).status == 403
     assert rows(server, "SELECT * FROM turn WHERE annotator = 'A1'") == mine
     assert "deleted" in visitors[0].request("POST", "/withdraw", {}).text
     for table, column in (("turn", "annotator"), ("plan", "annotator"), ("annotator", "name")):
         assert rows(server, f"SELECT * FROM {table} WHERE {column} = 'A1'") == []
     assert rows(server, "SELECT token FROM turn WHERE annotator = 'A2'") == theirs
-    assert visitors[0].home().status == 401
-    assert visitors[1].home().status == 200
-    assert "A1" not in server.links()
+    assert [visitor.home().status for visitor in visitors] == [401, 200]
+
+
+def test_links_cookies_and_answers_are_private(small, visitor) -> None:
+    for name in (storage.LINKS_FILE, storage.DATABASE):
+        assert stat.S_IMODE((small.folder / name).stat().st_mode) == 0o600
+    log = (small.folder / "run.log").read_text()
+    assert not any(link.rpartition("/")[2] in log for link in small.links().values())
+    reply = visitor.request("GET", small.links()["A1"])
+    cookie = set(reply.headers["set-cookie"].lower().split("; "))
+    assert {"httponly", "samesite=lax", "path=/"} <= cookie
+    for path in ("/", "/nothing", "/static/study.css", "/static/nothing", "/link/x", "/media/x"):
+        headers = visitor.request("GET", path).headers
+        assert {name: headers[name] for name in HEADERS} == HEADERS
+        assert "server" not in headers
+    assert "unsafe" not in HEADERS["Content-Security-Policy"]
+    page = visitor.to_question()
+    for cookie in ("", "study=", "study=x", "study=' OR 1=1 --", "study=" + "x" * 4000):
+        stranger = Visitor(small.port)
+        stranger.cookie = cookie
+        assert stranger.home().status == stranger.load(page).status == 401
+        assert {stranger.request("GET", path).status for path in page.media()} == {401}
+
+
+def test_repeated_early_and_forged_answers_change_nothing(small, visitor) -> None:
+    page = visitor.to_question()
+    turn = "SELECT * FROM turn WHERE token = ?"
+    visitor.answer(page, "A")
+    [early] = rows(small, turn, page.hidden("key"))
+    assert early["answered"] is None, "answered before the page was loaded"
+    visitor.load(page)
+    visitor.answer(page, "B")
+    [kept] = map(tuple, rows(small, turn, page.hidden("key")))
+    for letter in LETTERS:
+        assert visitor.answer(page, letter).status == 303
+    assert visitor.load(page).status == 409
+    assert [kept] == [*map(tuple, rows(small, turn, page.hidden("key")))]
+
+    # An annotator cannot answer an item that is open for another annotator.
+    other = Visitor(small.port).sign_in(small.links()["A2"])
+    theirs = other.to_question()
+    other.load(theirs)
+    assert visitor.load(theirs).status == 409
+    visitor.answer(theirs, "A")
+    [forged] = rows(small, turn, theirs.hidden("key"))
+    assert (forged["answered"], forged["loads"]) == (None, 1)
+    assert {visitor.request("GET", path).status for path in theirs.media()} == {404}
+
+
+@pytest.mark.parametrize(
+    ("changes", "status"),
+    [
+        ({"choice": "E"}, 400),
+        ({"choice": "<script>alert(1)</script>"}, 400),
+        ({"choice": ""}, 400),
+        ({"key": "' OR 1=1 --"}, 303),
+        ({"key": "\x00\ud7ff"}, 303),
+        ({"key": "x" * 5000}, 413),
+        ({f"f{k}": "" for k in range(50)}, 400),
+    ],
+)
+def test_hostile_fields_change_nothing(small, visitor, changes, status) -> None:
+    page = visitor.to_question()
+    visitor.load(page)
+    before = [*map(tuple, rows(small, "SELECT count(*), count(answered) FROM turn"))]
+    reply = visitor.request("POST", "/answer", {**key_of(page), "choice": "A", **changes})
+    assert reply.status == status
+    assert "<script>alert" not in reply.text
+    assert before == [*map(tuple, rows(small, "SELECT count(*), count(answered) FROM turn"))]
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/static/../app.py", "/static/%2e%2e/app.py", "/media/../study.sqlite", "/study.sqlite",
+     "/links.txt", "//etc/passwd", "/link/%ff%fe", "/votes.jsonl"],
+)  # fmt: skip
+def test_hostile_paths_are_not_found(visitor, path) -> None:
+    reply = visitor.request("GET", path)
+    assert reply.status in (401, 404)
+    assert "Traceback" not in reply.text
