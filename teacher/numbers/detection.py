@@ -2,7 +2,7 @@
 
 Counts, ordinals, fractions, multiples, quantities, measured times and lengths in terms of objects
 are numbers. Pronouns, adverbs and idioms are not: "the other one", "it first rests", "once struck",
-"one another", "second nature". docs/teacher.md has the whole policy.
+"one another", "second nature". docs/teacher.md has the policy.
 
 The text is normalized (see `normalization`) and split into words. Most words are never numbers,
 some always are, and a rule of lexicon.yaml reads the phrases around each of the others.
