@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection
 from operator import attrgetter
 from pathlib import Path
@@ -32,6 +33,8 @@ QWEN_FIELDS = {
     "video_token_id": "video_token_id",
 }
 """Fields of a processor of Qwen, and those of the model's configuration that they must equal."""
+SINGLE_VECTOR_MODULES = ("Transformer", "Pooling", "Normalize")
+"""Types of the modules of a single-vector retriever, of which only the first has weights."""
 
 
 def check_family(model: str, config: PreTrainedConfig) -> None:
@@ -99,13 +102,26 @@ def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
     return None
 
 
-def check_late_base(source: str, config: PreTrainedConfig) -> None:
+def check_late_base(source: str, config: PreTrainedConfig, revision: str | None) -> None:
     """Raise UserError if a model cannot be the base of a multi-vector retriever: it is no Qwen3-VL,
-    by whose tokens the scored tokens are found."""
+    by whose tokens the scored tokens are found, or it is a saved retriever with modules after its
+    backbone whose weights would be lost."""
+    from sentence_transformers.util import load_file_path
+
     if config.model_type != "qwen3_vl":
         raise UserError(
             f"retriever.model={source} is a {config.model_type}, but late interaction finds the "
             "tokens to score in Qwen3-VL only: set retriever.late=null, or give a Qwen3-VL",
+            code="unsupported-model",
+        )
+    path = load_file_path(source, "modules.json", revision=revision)
+    modules = json.loads(Path(path).read_text()) if path else []
+    kinds = [module["type"].rpartition(".")[2] for module in modules]
+    if lost := [kind for kind in kinds if kind not in SINGLE_VECTOR_MODULES]:
+        raise UserError(
+            f"{source} has modules after its backbone that would be lost if it were used as a base "
+            f"({', '.join(lost)}): give another base, or evaluate the run that trained it "
+            "(model=RUN)",
             code="unsupported-model",
         )
 

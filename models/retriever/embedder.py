@@ -148,7 +148,7 @@ def _load_base(cfg: RetrieverConfig, source: str, precision: str) -> Retriever:
     if cfg.late is None:
         pooling = Pooling(backbone.get_embedding_dimension(), pooling_mode="lasttoken")
         return SentenceTransformer(modules=[backbone, pooling, Normalize()], **options)
-    check_late_base(source, backbone.config)
+    check_late_base(source, backbone.config, cfg.revision)
     model = MultiVectorEncoder(modules=multi_vector_modules(backbone, cfg.late), **options)
     keep_head_fp32(model)
     return model
