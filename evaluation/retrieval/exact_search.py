@@ -13,8 +13,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,11 +23,15 @@ from dynapix.data.parallel import batched
 from dynapix.data.records import RetrievalQuery
 from dynapix.evaluation.metrics.ranking import count_above_and_equal, share_above
 
+if TYPE_CHECKING:
+    import torch
+
 GRID, LATE_GRID = 2.0**26, 2.0**20
 """Steps of length 1. With the second, sums over up to 8,000 vectors stay below 2^53; it changes a
 cosine by about 2^-20."""
-BLOCK_VECTORS, BLOCK_PRODUCTS = 2**12, 2**21
-"""Maximum numbers of frame vectors in a block, and of their products with query vectors."""
+BLOCK_ENTRIES, BLOCK_PRODUCTS = 2**21, 2**21
+"""Maximum numbers of entries in a block of frames, and of the products of its vectors with query
+vectors. Blocks that are larger take longer to allocate than to compute."""
 
 
 @dataclass(frozen=True)
@@ -105,9 +109,10 @@ def exact_ranks(
         database: Parts (frames, entries) in any order; only one of them is in memory at a time.
         widths: Embedding widths, widest first.
         twins: (queries, entries) embeddings of the factual twins of counterfactual queries.
-        late: Whether a row holds several vectors of the only width, see `late_scores`.
+        late: Whether a row holds several vectors of the only width, see `to_grid`.
     """
     began = time.perf_counter()
+    asked = [to_grid(queries, width, late) for width in widths]
     target_scores = [pair_scores(queries, targets, width, late) for width in widths]
     counts = np.zeros((2, len(widths), len(queries)), np.int64)
     frames = vectors = 0
@@ -115,14 +120,16 @@ def exact_ranks(
         # The number of vectors per row may differ between parts.
         per_frame = part.shape[1] // widths[0] if late else 1
         per_query = queries.shape[1] // widths[0] if late else 1
-        for block in batched(part, max(1, BLOCK_VECTORS // per_frame)):
+        for block in batched(part, max(1, BLOCK_ENTRIES // part.shape[1])):
             frames += len(block)
             vectors += count_vectors(block, widths[0]) if late else len(block)
             step = max(1, BLOCK_PRODUCTS // (len(block) * per_frame * per_query))
-            for start, k in product(range(0, len(queries), step), range(len(widths))):
-                rows = slice(start, start + step)
-                scores = score(queries[rows], block, widths[k], late)
-                counts[:, k, rows] += count_above_and_equal(scores, target_scores[k][rows])
+            for k, width in enumerate(widths):
+                seen = to_grid(block, width, late)
+                for start in range(0, len(queries), step):
+                    rows = slice(start, start + step)
+                    scores = score(asked[k][rows], seen)
+                    counts[:, k, rows] += count_above_and_equal(scores, target_scores[k][rows])
     twin_above = None
     if twins is not None:
         twin_scores = [pair_scores(queries, twins, width, late) for width in widths]
@@ -131,58 +138,51 @@ def exact_ranks(
     return Ranks.from_counts(widths, counts, frames, vectors, seconds, twin_above)
 
 
-def score(queries: np.ndarray, frames: np.ndarray, width: int, late: bool) -> np.ndarray:
-    """Return the fp32 scores (queries, frames) at a width."""
-    return late_scores(queries, frames, width) if late else cosines(queries, frames, width)
-
-
 def pair_scores(
     queries: np.ndarray, frames: np.ndarray, width: int, late: bool = False
 ) -> np.ndarray:
     """Return the fp32 scores (rows,) of each query and the frame in the same row. They are
     bit-identical to those of `score`."""
-    pairs = zip(queries[:, None], frames[:, None], strict=True)
-    return np.array([score(query, frame, width, late)[0, 0] for query, frame in pairs])
+    asked, seen = to_grid(queries, width, late), to_grid(frames, width, late)
+    pairs = zip(asked[:, None], seen[:, None], strict=True)
+    return np.array([score(query, frame)[0, 0] for query, frame in pairs])
 
 
-def cosines(queries: np.ndarray, frames: np.ndarray, width: int) -> np.ndarray:
-    """Return the cosines of the first `width` entries of embeddings.
+def to_grid(rows: np.ndarray, width: int, late: bool = False) -> np.ndarray | torch.Tensor:
+    """Return embeddings in float64, in steps of the grid.
 
-    By Cauchy-Schwarz, the products of the entries of two vectors on the grid add up to little more
-    than 2^52. The rounding to the grid changes a cosine by about 2^-27, less than fp32 resolves.
+    The first `width` entries of a row are scaled to length 1; the result is (rows, width). With
+    `late`, a row holds unit vectors one after the other, padded with vectors of zeros; the result
+    is a tensor (rows, vectors, width), on the GPU if there is one.
     """
-    products = _to_grid(queries[:, :width]) @ _to_grid(frames[:, :width]).T
-    return (products / GRID**2).astype(np.float32)
+    if late:
+        import torch
 
-
-def _to_grid(rows: np.ndarray) -> np.ndarray:
-    """Return rows in float64, scaled to length 1 and rounded to steps of the grid."""
-    rows = np.array(rows, np.float64, order="C")
-    lengths = np.sqrt(np.square(rows).sum(axis=1, keepdims=True))
-    return np.rint(rows * (GRID / np.where(lengths > 0, lengths, 1)))
-
-
-def late_scores(queries: np.ndarray, frames: np.ndarray, width: int) -> np.ndarray:
-    """Return the scores of multi-vector embeddings by late interaction.
-
-    A row holds unit vectors one after the other, padded with vectors of zeros. The score is the
-    sum, over the query's vectors, of the maximum cosine between the query's vector and any of the
-    frame's vectors.
-    """
-    import torch
-
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-
-    def to_vectors(rows: np.ndarray) -> torch.Tensor:
+        device = "cuda" if torch.cuda.is_available() else "cpu"
         vectors = torch.from_numpy(rows).to(device, torch.float64).unflatten(1, (-1, width))
         return (vectors * LATE_GRID).round_()
+    rows = np.array(rows[:, :width], np.float64, order="C")
+    lengths = np.sqrt(np.square(rows).sum(axis=1, keepdims=True))
+    rows *= GRID / np.where(lengths > 0, lengths, 1)
+    return np.rint(rows, out=rows)
 
-    one, other = to_vectors(queries), to_vectors(frames)
+
+def score(queries: np.ndarray | torch.Tensor, frames: np.ndarray | torch.Tensor) -> np.ndarray:
+    """Return the fp32 scores (queries, frames) of rows of `to_grid`.
+
+    The score of two vectors is their cosine. By Cauchy-Schwarz, the products of the entries of two
+    vectors on the grid add up to little more than 2^52. The rounding to the grid changes a cosine
+    by about 2^-27, less than fp32 resolves. The score of two rows of vectors is that of late
+    interaction: the sum, over the query's vectors, of the maximum cosine between the query's vector
+    and any of the frame's vectors.
+    """
+    if isinstance(queries, np.ndarray):
+        return (queries @ frames.T / GRID**2).astype(np.float32)
     # Padding is replaced by copies of a frame's first vector, which change no maximum.
-    other = torch.where(other.any(dim=-1, keepdim=True), other, other[:, :1])
-    products = one.flatten(0, 1) @ other.flatten(0, 1).T
-    best = products.unflatten(1, other.shape[:2]).amax(dim=-1)
-    total = best.unflatten(0, one.shape[:2]).sum(dim=1)
+    frames = frames.where(frames.any(dim=-1, keepdim=True), frames[:, :1])
+    products = queries.flatten(0, 1) @ frames.flatten(0, 1).T
+    best = products.unflatten(1, frames.shape[:2]).amax(dim=-1)
+    total = best.unflatten(0, queries.shape[:2]).sum(dim=1)
     return (total / LATE_GRID**2).float().cpu().numpy()
 
 

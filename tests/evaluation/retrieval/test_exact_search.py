@@ -14,10 +14,10 @@ from dynapix.evaluation.retrieval import exact_search
 from dynapix.evaluation.retrieval.exact_search import (
     LATE_GRID,
     Ranks,
-    _to_grid,
     exact_ranks,
     pair_scores,
     score,
+    to_grid,
 )
 from tests.evaluation.metrics.reference import count_ranks
 
@@ -91,7 +91,7 @@ def exact_cosines(queries: np.ndarray, database: np.ndarray, width: int) -> np.n
 @pytest.mark.parametrize(("size", "block", "cells"), [(1, 9, 1), (7, 64, 2**10), (299, 1, 2**23)])
 def test_blocks_do_not_change_ranks(monkeypatch, case, size, block, cells) -> None:
     expected = case.ranks(case.frames, TARGETS)
-    monkeypatch.setattr(exact_search, "BLOCK_VECTORS", block)
+    monkeypatch.setattr(exact_search, "BLOCK_ENTRIES", block * case.frames.shape[1])
     monkeypatch.setattr(exact_search, "BLOCK_PRODUCTS", cells)
     assert same(case.ranks(case.frames, TARGETS, size), expected)
 
@@ -112,22 +112,28 @@ def test_equal_frames_tie(case) -> None:
     assert np.array_equal(double.above, 2 * found.above)
 
 
+def score_rows(
+    queries: np.ndarray, frames: np.ndarray, width: int, late: bool = False
+) -> np.ndarray:
+    return score(to_grid(queries, width, late), to_grid(frames, width, late))
+
+
 def test_scores_of_pairs_and_of_blocks_are_bit_identical(case) -> None:
     frames = case.frames[TARGETS]
     for width in case.widths:
-        block = score(case.queries, frames, width, case.late)
+        block = score_rows(case.queries, frames, width, case.late)
         assert block.dtype == np.float32
         pairs = pair_scores(case.queries, frames, width, case.late)
         assert np.array_equal(pairs, np.diagonal(block))
         for rows in (slice(3, 4), slice(9, 22), np.array([5, 38, 2])):
-            part = score(case.queries[rows], frames, width, case.late)
+            part = score_rows(case.queries[rows], frames, width, case.late)
             assert np.array_equal(part, block[rows])
 
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_scores_are_cosines_to_fp32(width) -> None:
     queries, database = embeddings(30), embeddings(50, 1)
-    scores = score(queries, database, width, late=False)
+    scores = score_rows(queries, database, width, late=False)
     np.testing.assert_allclose(scores, exact_cosines(queries, database, width), atol=6e-8)
 
 
@@ -167,7 +173,7 @@ def test_products_on_the_grid_are_exact() -> None:
     rows = rng.standard_normal((4, 4096))
     rows[1], rows[2] = 1.0, np.abs(rows[2])
     rows[3, 1:] = 0
-    grid = _to_grid(rows.astype(np.float32))
+    grid = to_grid(rows.astype(np.float32), 4096)
     products = grid @ grid.T
     integers = [[int(x) for x in row] for row in grid.tolist()]
     for i, a in enumerate(integers):
@@ -185,11 +191,11 @@ def test_an_embedding_of_zeros_ties_with_all_frames() -> None:
 
 def test_late_scores_agree_with_the_librarys_in_any_order_of_the_vectors() -> None:
     queries, frames = random_vectors(20, 60, 0), random_vectors(120, 9, 1)
-    found = score(rows_of(queries), rows_of(frames), LATE_WIDTH, late=True)
+    found = score_rows(rows_of(queries), rows_of(frames), LATE_WIDTH, late=True)
     np.testing.assert_allclose(found, maxsim([*queries], [*frames]).numpy(), rtol=1e-6, atol=1e-5)
     rng = np.random.default_rng(2)
     moved = [rows_of([rng.permutation(v) for v in side], 5) for side in (queries, frames)]
-    assert np.array_equal(score(*moved, LATE_WIDTH, late=True), found)
+    assert np.array_equal(score_rows(*moved, LATE_WIDTH, late=True), found)
     padded = exact_ranks(moved[0], moved[1][:20], [moved[1]], [LATE_WIDTH], late=True)
     assert padded.vectors == sum(map(len, frames)), "padding is not counted"
 
