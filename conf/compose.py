@@ -155,17 +155,26 @@ def compose_config(command: str, overrides: list[str], mode: RunMode = RunMode.R
 
     Raises:
         SettingsError: The value of a group of presets is not a name, or a key is inside a group
-            that is null. Hydra's own errors in these two cases explain nothing.
+            that is null. Hydra's errors for these two cases name no key.
     """
     hydra = GlobalHydra.instance().hydra
     try:
         return hydra.compose_config(config_name(command), overrides, mode, from_shell=False)
     except UnicodeDecodeError as error:
         raise SettingsError(f"a file of settings is no UTF-8 text: {error}") from error
-    except (ValueError, AssertionError, AttributeError) as error:
+    except ValueError as error:
+        parts = {o: o.lstrip("+").partition("=") for o in overrides}
+        unnamed = " ".join(
+            override
+            for override, (key, _, value) in parts.items()
+            if hydra.config_loader.get_group_options(key)
+            and not isinstance(yaml.safe_load(value), str)
+        )
+        raise SettingsError(f"{unnamed}: give the name of a preset") from error
+    except (AssertionError, AttributeError) as error:
+        nested = " ".join(o for o in overrides if "." in o.partition("=")[0])
         raise SettingsError(
-            f"{' '.join(overrides)}: give a group of presets the name of one, and set no key "
-            "inside a group that is null"
+            f"{nested}: the group above one of these keys is null; choose a preset that sets it"
         ) from error
 
 

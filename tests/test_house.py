@@ -35,7 +35,7 @@ COMMANDS = sorted(
 )
 LONGEST_HELP = 50
 """Maximum number of lines of a command's help."""
-LARGEST_FOLDER = 14
+LARGEST_FOLDER = 12
 """Maximum number of modules in a folder."""
 
 
