@@ -94,7 +94,7 @@ def read_trained_settings(
     """
     record, config = folder / "run.json", settings_file(folder)
     command = read_json(record).get("command", "train.") if record.exists() else "train."
-    saved = _read_settings(config) if config.exists() and command.startswith("train.") else {}
+    saved = read_settings(config) if config.exists() and command.startswith("train.") else {}
     if product not in saved:
         raise UserError(
             f"{key}={folder} is no run that trained a {product}, and no export of one: give a "
@@ -108,13 +108,13 @@ def read_trained_settings(
             f"{key}={folder} is not finished: run its command again to resume it",
             code="unfinished-run",
         )
-    settings = _read_settings(config, schema)
+    settings = read_settings(config, schema)
     setattr(settings, product, with_resolved_commit(folder, getattr(settings, product)))
     settings.train.precision = read_resolved(folder).get("precision", settings.train.precision)
     return settings
 
 
-def _read_settings(config: Path, schema: type | None = None, group: str | None = None) -> Any:
+def read_settings(config: Path, schema: type | None = None, group: str | None = None) -> Any:
     """Return a file of settings as a dict, which is empty if the file has another form; or, with a
     schema, the whole or one `group` as an instance of the schema."""
     try:
@@ -175,9 +175,9 @@ def resolve_model(
 def _check_base_unseen(base: str | None, tested: BenchmarkConfig) -> None:
     """As `check_unseen`, for a base whose folder records the settings of its training."""
     config = Path(base or "") / "config.yaml"
-    if base is None or not config.exists() or "benchmark" not in _read_settings(config):
+    if base is None or not config.exists() or "benchmark" not in read_settings(config):
         return
-    trained = _read_settings(config, BenchmarkConfig, "benchmark")
+    trained = read_settings(config, BenchmarkConfig, "benchmark")
     check_unseen(f"the base {base}", trained, tested)
 
 

@@ -40,7 +40,7 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
     from dynapix.models.checks import ADAPTER_WEIGHTS
     from dynapix.models.resolved_settings import RESOLVED
     from dynapix.models.trained_runs import EXPORT, read_export_record, settings_file
-    from dynapix.train.common.model_card import CARD, build_model_card
+    from dynapix.train.common.model_card import CARD, build_model_card, find_evaluations
 
     name, run_folder, settings = find_run(cfg.run, cfg.product, cfg.checkpoints)
     saved, folder = run_folder / cfg.product, run.folder / cfg.product
@@ -68,7 +68,8 @@ def main(cfg: ExportModelCommand, run: Run) -> dict[str, float]:
             shutil.copy(run_folder / file_name, partial)
         shutil.copy(settings_file(run_folder), partial / "config.yaml")
         metrics = read_json(run_folder / "metrics.json")
-        card = build_model_card(name, settings, run_folder, folder, cfg.format, metrics)
+        results = find_evaluations(Path(cfg.checkpoints), run_folder)
+        card = build_model_card(name, settings, run_folder, folder, cfg.format, metrics, results)
         card.save(partial / CARD)
         write_json(partial / EXPORT, {"run": name, "format": cfg.format, "weights": weights})
     log.info("the exported %s is in %s", cfg.product, folder)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import yaml
-from huggingface_hub import ModelCard, ModelCardData, try_to_load_from_cache
+from huggingface_hub import EvalResult, ModelCard, ModelCardData, try_to_load_from_cache
 from transformers import Qwen3VLProcessor
 
 from dynapix.conf.files import read_json, read_json_if_valid
@@ -18,9 +19,11 @@ from dynapix.models.fingerprints import is_hub_model
 from dynapix.models.resolved_settings import read_resolved
 from dynapix.models.student.chat_format import TIMED_PROCESSORS
 from dynapix.models.student.prompts import choose_instruction, write_time
-from dynapix.models.trained_runs import modes_of_regime
+from dynapix.models.trained_runs import modes_of_regime, read_settings
 
 CARD = "README.md"
+EVALUATIONS = ("select", "similarity", "retrieve")
+"""Folders below checkpoints/ of the evaluations whose results a card shows."""
 TIMES = {
     "video": (
         "true times, from the frame rate and the indices of the frames; a processor of Qwen3-VL "
@@ -30,6 +33,30 @@ TIMES = {
     "separate": "none: a clip is the mean of its frames",
 }
 """Times of a clip, by the form of the input (`models.retriever.inputs`)."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The result of a command of `EVALUATIONS` for a model, on a benchmark's test items."""
+
+    command: str
+    benchmark: str
+    metrics: dict[str, float]
+
+
+def find_evaluations(checkpoints: Path, run: Path) -> list[Evaluation]:
+    """Return the finished evaluations below `checkpoints` of the model that a run has trained, on
+    all items and without a control."""
+    found = []
+    for command in EVALUATIONS:
+        for metrics in sorted(checkpoints.glob(f"{command}/**/metrics.json")):
+            settings = read_settings(metrics.parent / "config.yaml")
+            if not settings.get("model") or Path(settings["model"]).resolve() != run.resolve():
+                continue
+            if settings.get("limit") is None and settings.get("control") is None:
+                benchmark = settings["benchmark"]["name"]
+                found.append(Evaluation(f"evaluation.{command}", benchmark, read_json(metrics)))
+    return found
 
 
 def write_run_card(
@@ -50,6 +77,7 @@ def build_model_card(
     location: Path,
     format: str,
     metrics: dict[str, float],
+    evaluations: Sequence[Evaluation] = (),
 ) -> ModelCard:
     """Return the card of a trained student or retriever.
 
@@ -60,6 +88,7 @@ def build_model_card(
         location: Folder from which the card's code loads the model.
         format: bf16, fp32, adapter, or whole for a model all of whose weights were trained.
         metrics: Metrics of the run.
+        evaluations: Results on test items, which the hub shows beside the card.
     """
     student = isinstance(settings, SftCommand)
     product = "student" if student else "retriever"
@@ -95,6 +124,20 @@ def build_model_card(
             library_name="peft" if format == "adapter" else merged_library,
             pipeline_tag="image-text-to-text" if student else "sentence-similarity",
             tags=["dynapix", train.regime if student else "retriever"],
+            model_name=name if evaluations else None,
+            eval_results=[
+                EvalResult(
+                    task_type="image-text-to-text" if student else "sentence-similarity",
+                    dataset_type=f"dynapix-{each.benchmark}",
+                    dataset_name=f"DynaPix {each.benchmark}",
+                    dataset_split="test",
+                    metric_type=metric,
+                    metric_value=value,
+                    metric_name=f"{metric}, {each.command}",
+                )
+                for each in evaluations
+                for metric, value in each.metrics.items()
+            ],
         ),
         template_path=str(Path(__file__).with_suffix(".md")),
         name=name,
@@ -118,6 +161,7 @@ def build_model_card(
         settings=yaml.safe_dump({product: asdict(preset), "train": asdict(train)}, sort_keys=False),
         items="items" if student else "queries",
         metrics=metrics,
+        evaluations=evaluations,
         at_start=AT_START_SUFFIX,
     )
 
