@@ -333,7 +333,9 @@ def _serves_folder(client: openai.OpenAI, name: str) -> bool:
     if not Path(name).is_dir():
         return False
     try:
-        client.with_options(timeout=60).chat.completions.create(
+        # The server closes the connection after it has failed to list its models, and a request on
+        # this connection may be lost.
+        client.with_options(timeout=60, max_retries=1).chat.completions.create(
             model=name, messages=[message], max_tokens=1
         )
     except openai.OpenAIError:

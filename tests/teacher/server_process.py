@@ -10,8 +10,6 @@ import time
 import urllib.request
 from pathlib import Path
 
-from huggingface_hub import constants
-
 from tests.local import free_port
 
 ROOT = Path(__file__).parents[2]
@@ -81,8 +79,6 @@ def llama_server(model: Path, folder: Path, slots: int) -> ServerProcess:
 
 def transformers_server(model: Path, folder: Path) -> ServerProcess:
     """Return `transformers serve` with a model, which it serves under the name of its folder."""
-    # It lists models only if the hub's cache exists.
-    Path(constants.HF_HUB_CACHE).mkdir(parents=True, exist_ok=True)
     port = free_port()
     arguments = [str(Path(sys.executable).parent / "transformers"), "serve", str(model)]
     arguments += ["--host", "127.0.0.1", "--port", str(port), "--device", "cpu"]
