@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from torch import nn
 from transformers import (
     AutoConfig,
@@ -263,16 +263,27 @@ def load_trainable(
     Raises:
         UserError: As `load_trained`; or `folder` contains a merged export, which has no adapters.
     """
-    import peft
-
     if not cfg.lora.rank:
         return load_student(replace(cfg, model=str(folder), architecture=None), precision, list)
     check_safetensors(folder)
     base, processor = load_base(cfg, precision, list)
     prepare_for_training(base)
-    with explain_damage(folder):
-        model = peft.PeftModel.from_pretrained(base, folder, is_trainable=True)
+    model = load_adapters(base, folder, is_trainable=True)
     return name_base(without_embeddings(model), cfg), processor
+
+
+def load_adapters(base: nn.Module, folder: Path, is_trainable: bool = False) -> nn.Module:
+    """Load the adapters in a folder over a base. Raises UserError if they are damaged, or those of
+    another model: peft would leave layers without adapters."""
+    import peft
+
+    with explain_damage(folder):
+        with safe_open(folder / ADAPTER_WEIGHTS, "pt") as file:
+            saved = set(file.keys())
+        model = peft.PeftModel.from_pretrained(base, folder, is_trainable=is_trainable)
+        if others := saved ^ set(peft.get_peft_model_state_dict(model)):
+            raise ValueError(f"its adapters are those of another model: {min(others)}")
+    return model
 
 
 def without_embeddings(model: nn.Module) -> nn.Module:
@@ -316,13 +327,10 @@ def load_trained(
     Raises:
         UserError: `folder` contains no student or is damaged, or the base cannot be loaded.
     """
-    import peft
-
     if (folder / ADAPTER_CONFIG).exists():
         check_safetensors(folder)
         base, processor = load_base(cfg, precision, list)
-        with explain_damage(folder):
-            model = peft.PeftModel.from_pretrained(base, folder)
+        model = load_adapters(base, folder)
         if merge and precision == "fp32" and cfg.quantization == "none":
             # A forward pass takes 0.87 times as long. In bf16, the sum of the weights is rounded.
             model = model.merge_and_unload()
@@ -368,12 +376,10 @@ def merge_adapters(
     Merging into the 4-bit weights would round most of the training away. The weights before
     quantisation lack the quantisation errors with which the adapters were trained.
     """
-    import peft
-
     dtype = DTYPES[precision]
     if quantization == "nf4":
         base = base.dequantize(dtype)
-    return peft.PeftModel.from_pretrained(base.to(dtype), adapters).merge_and_unload()
+    return load_adapters(base.to(dtype), adapters).merge_and_unload()
 
 
 def for_inference(model: nn.Module) -> nn.Module:
@@ -462,10 +468,15 @@ def explain_damage(folder: Path) -> Iterator[None]:
     """Turn errors of loading a trained or exported model in the block into a UserError."""
     try:
         yield
-    except LOAD_ERRORS as error:
+    except (*LOAD_ERRORS, RuntimeError) as error:
+        # A lack of memory is a RuntimeError, too.
+        if isinstance(error, RuntimeError) and "size mismatch" not in str(error):
+            raise
         exported = (folder / EXPORT).exists()
+        shapes = "its weights have other shapes than its base or its config.json"
+        reason = shapes if isinstance(error, RuntimeError) else first_line(error)
         raise UserError(
-            f"{folder} is damaged and cannot be read ({first_line(error)}): "
+            f"{folder} is damaged and cannot be read ({reason}): "
             f"{'delete it and export' if exported else 'delete the run and train'} again",
             code="damaged-file",
         ) from error

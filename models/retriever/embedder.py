@@ -190,11 +190,9 @@ def load_adapters(model: Retriever, folder: Path) -> None:
 
     weights = load_file(folder / ADAPTER_WEIGHTS)
     adapters = {name.removeprefix(PEFT_PREFIX): weight for name, weight in weights.items()}
-    loaded = peft.set_peft_model_state_dict(model[0].model, adapters)
-    if loaded.unexpected_keys:
-        raise ValueError(
-            f"{folder} has adapters for layers that the model lacks: {loaded.unexpected_keys[:2]}"
-        )
+    if others := set(adapters) ^ set(peft.get_peft_model_state_dict(model[0].model)):
+        raise ValueError(f"its adapters are those of another model: {min(others)}")
+    peft.set_peft_model_state_dict(model[0].model, adapters)
     load_head(model, folder)
 
 

@@ -125,6 +125,7 @@ def build_model_card(
             pipeline_tag="image-text-to-text" if student else "sentence-similarity",
             tags=["dynapix", train.regime if student else "retriever"],
             model_name=name if evaluations else None,
+            # The hub's library reads an empty list as a damaged one.
             eval_results=[
                 EvalResult(
                     task_type="image-text-to-text" if student else "sentence-similarity",
@@ -137,7 +138,8 @@ def build_model_card(
                 )
                 for each in evaluations
                 for metric, value in each.metrics.items()
-            ],
+            ]
+            or None,
         ),
         template_path=str(Path(__file__).with_suffix(".md")),
         name=name,
