@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dynapix
 from dynapix.benchmark import preset_names
+from dynapix.conf.failures import report_failures
 
 COMMANDS = {
     "data.build": "build a benchmark: scenes, items, queries, frames",
@@ -53,4 +54,5 @@ def overview() -> str:
 
 
 if __name__ == "__main__":
-    print(overview())
+    with report_failures():
+        print(overview())
