@@ -71,10 +71,6 @@ def load_encoder(preset: RetrieverConfig, precision: str, saved: Path | None) ->
         from dynapix.evaluation.embedders.vlm2vec import load_vlm2vec
 
         return JointEncoder(load_vlm2vec(preset, precision), preset)
-    if preset.encoder == "dual":
-        from dynapix.evaluation.embedders.dual_encoder import load_dual
-
-        return load_dual(preset, precision)
     if preset.encoder == "languagebind":
         from dynapix.evaluation.embedders.languagebind import load_languagebind
 
