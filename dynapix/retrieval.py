@@ -100,10 +100,11 @@ class RetrievalScores:
             return scores[np.arange(len(queries)), [index[n] for n in names]][:, None]
 
         targets = choose([q.target.name for q in queries])
-        counts = np.stack([(scores > targets).sum(1), (scores == targets).sum(1)])[:, None]
+        above, tied = (scores > targets).sum(1)[None], (scores == targets).sum(1)[None] - 1
         twins = [t.name for q in queries if (t := q.record.factual_twin)]
         twin_above = share_above(choose(twins), targets).T if twins else None
-        ranks = Ranks.from_counts((None,), counts, len(frames), 0, 0.0, twin_above)
+        found = np.ones(len(queries), bool)
+        ranks = Ranks((None,), above, tied, found, len(frames), 0, 0.0, twin_above)
         rows = retrieval_results(benchmark.name, name, ranks, [q.record for q in queries], seed)
         return cls(rows, ranks, name, benchmark, queries, seed)
 

@@ -102,6 +102,21 @@ def _mismatch(config: PreTrainedConfig, processor: Any) -> str | None:
     return None
 
 
+def check_text_tower(model: str, config: PreTrainedConfig, tokenizer: Any) -> None:
+    """Raise UserError if a tokenizer does not fit the vocabulary of a retriever's text tower.
+
+    The library builds an almost empty tokenizer if the files are missing. A vocabulary that is
+    larger than the tokenizer is accepted up to a factor of 2, since models pad it.
+    """
+    tokens, vocabulary = len(tokenizer), config.text_config.vocab_size
+    if not vocabulary / 2 < tokens <= vocabulary:
+        raise UserError(
+            f"retriever.model={model} has a tokenizer of {tokens} tokens for a vocabulary of "
+            f"{vocabulary}: add the tokenizer's files that were released with the weights",
+            code="incomplete-model",
+        )
+
+
 def check_late_base(source: str, config: PreTrainedConfig, revision: str | None) -> None:
     """Raise UserError if a model cannot be the base of a multi-vector retriever: it is no Qwen3-VL,
     by whose tokens the scored tokens are found, or it is a saved retriever with modules after its

@@ -3,18 +3,17 @@
     store/<name>/embeddings/<kind>-<key>.sqlite
 
 A file holds the embeddings of one kind of input (frame, query or text) that were made with the same
-settings. It records these settings, and the key in its name is their hash. Each batch is committed,
-so that a killed evaluation resumes after the last batch. All files can be deleted at any time. In a
-store that this user may not write, new embeddings are kept in a temporary file. The ranks of a
-launcher share the batches, and the main rank alone has the files.
+settings; the key in its name is their hash. Each batch is committed, so that a killed evaluation
+resumes after the last batch. All files can be deleted at any time. In a store that this user may
+not write, new embeddings are kept in a temporary file. The ranks of a launcher share the batches,
+and the main rank alone has the files.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,7 +33,6 @@ log = logging.getLogger(__name__)
 SCHEMA = """
 PRAGMA page_size = 65536; -- an embedding of 4,096 entries fits in a page
 PRAGMA synchronous = OFF; -- a killed process damages nothing, a power failure only this cache
-CREATE TABLE IF NOT EXISTS about (settings TEXT PRIMARY KEY); -- JSON
 CREATE TABLE IF NOT EXISTS embedding (name TEXT UNIQUE, entries BLOB); -- fp32
 """
 PART_ROWS = 512
@@ -56,7 +54,7 @@ class EmbeddingCache:
     """
 
     def __init__(self, root: Path, kind: str, settings: Mapping[str, Any]) -> None:
-        self.kind, self._settings = kind, json.dumps(settings)
+        self.kind = kind
         self.path = root / f"{kind}-{settings_key(settings)}.sqlite"
         with self._explain_damage():
             self._db = self._connect(root)
@@ -95,7 +93,6 @@ class EmbeddingCache:
         missing = share_from_main([name for name in inputs if name not in present])
         if not missing:
             return
-        self._write("INSERT OR IGNORE INTO about VALUES (?)", [[self._settings]])
         batches = [*batched(missing, batch)]
         embedded = map_over_ranks(lambda names: embed([inputs[name] for name in names]), batches)
         bar = tqdm(
@@ -105,15 +102,12 @@ class EmbeddingCache:
         with bar:
             for names, rows in zip(batches, embedded, strict=True):
                 self._check_finite(rows, names)
-                pairs = zip(names, map(np.ndarray.tobytes, rows.astype(np.float32)), strict=True)
-                self._write("INSERT OR REPLACE INTO embedding VALUES (?, ?)", pairs)
+                if rank() == 0:
+                    entries = map(np.ndarray.tobytes, rows.astype(np.float32))
+                    with self._explain_damage(), self._db:
+                        insert = "INSERT OR REPLACE INTO embedding VALUES (?, ?)"
+                        self._db.executemany(insert, zip(names, entries, strict=True))
                 bar.update(len(names))
-
-    def _write(self, statement: str, rows: Iterable[Sequence[Any]]) -> None:
-        """Execute a statement for each row, all in one transaction. The main rank writes."""
-        if rank() == 0:
-            with self._explain_damage(), self._db:
-                self._db.executemany(statement, rows)
 
     def parts(self, names: Sequence[str]) -> Iterator[np.ndarray]:
         """Yield the embeddings of `names` in parts (rows, entries). The order of the rows is not
@@ -150,16 +144,11 @@ class EmbeddingCache:
     def _explain_damage(self) -> Iterator[None]:
         try:
             yield
-        except sqlite3.OperationalError as error:
-            raise UserError(
-                f"{self.path} cannot be read or written ({error}): check the free space and the "
-                "permissions, and that no other command holds the file, then run this again",
-                code="unusable-cache",
-            ) from error
         except sqlite3.DatabaseError as error:
             raise UserError(
-                f"{self.path} cannot be read or written ({error}): delete it, and run this again",
-                code="damaged-file",
+                f"{self.path} cannot be read or written ({error}): if the disk is full or another "
+                "command holds the file, correct that, otherwise delete it; then run this again",
+                code="unusable-cache",
             ) from error
 
     def _check_finite(self, rows: np.ndarray, names: list[str]) -> None:

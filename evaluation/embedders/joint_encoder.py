@@ -9,17 +9,11 @@ import numpy as np
 
 from dynapix.conf.schema import RetrieverConfig
 from dynapix.data.frames.frame_cache import FrameReader
-from dynapix.data.parallel import batched
 from dynapix.data.records import FrameRef
 from dynapix.evaluation.embedders.cache import pad_rows
 from dynapix.models.compat import keep_freed_memory
 from dynapix.models.retriever.embedder import load_retriever, load_trained
 from dynapix.models.retriever.inputs import Query, Retriever, encode, model_inputs
-
-MAX_TOKEN_PAIRS = 64 * 512**2
-"""Maximum entries of the attention mask of a batch of texts: 64 texts of 512 tokens, the default
-length of a response. A tokenizer may split a text into many more tokens; 64 such texts would need
-many GB."""
 
 
 class Encoder(Protocol):
@@ -47,9 +41,7 @@ class JointEncoder:
         return self._encode(*model_inputs(self._model, refs, frames, self._preset))
 
     def embed_texts(self, texts: list[str]) -> np.ndarray:
-        longest = max(map(len, self._model.tokenizer(texts)["input_ids"]))
-        size = max(1, MAX_TOKEN_PAIRS // max(1, longest) ** 2)
-        return np.concatenate([self._encode(batch, "query") for batch in batched(texts, size)])
+        return self._encode(texts, "query")
 
     def _encode(self, inputs: list[Any], kind: str) -> np.ndarray:
         """Embed inputs of one kind, query or document. A row holds the vector of an input, or all
@@ -71,10 +63,6 @@ def load_encoder(preset: RetrieverConfig, precision: str, saved: Path | None) ->
         from dynapix.evaluation.embedders.vlm2vec import load_vlm2vec
 
         return JointEncoder(load_vlm2vec(preset, precision), preset)
-    if preset.encoder == "dual":
-        from dynapix.evaluation.embedders.dual_encoder import load_dual
-
-        return load_dual(preset, precision)
     if preset.encoder == "languagebind":
         from dynapix.evaluation.embedders.languagebind import load_languagebind
 

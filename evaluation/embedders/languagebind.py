@@ -7,6 +7,7 @@ each layer. It is implemented here with the names of the released weights.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,11 @@ from transformers.models.clip.modeling_clip import CLIPAttention, CLIPEncoderLay
 
 from dynapix.conf.errors import UserError
 from dynapix.conf.schema import RetrieverConfig
-from dynapix.evaluation.embedders.dual_encoder import (
-    DualEncoder,
-    check_size,
-    check_tokenizer,
-    image_features,
-    load_complete,
-    unit_rows,
-)
-from dynapix.models.loading import explain_unloadable
+from dynapix.data.frames.frame_cache import FrameReader
+from dynapix.data.records import FrameRef, sample_prefix_frames
+from dynapix.models.checks import check_text_tower
+from dynapix.models.loading import DTYPES, explain_unloadable, for_inference, place_weights
+from dynapix.models.retriever.inputs import IMAGES, Query
 
 
 class TemporalLayer(CLIPEncoderLayer):
@@ -64,29 +61,85 @@ class LanguageBindVideo(CLIPModel):
         self.post_init()
 
 
-def load_languagebind(preset: RetrieverConfig, precision: str) -> DualEncoder:
-    """Load the video and text towers of `model`, and the image tower of `image_model`."""
-    video = load_tower(LanguageBindVideo, preset, precision, "model", preset.revision)
-    image = load_tower(CLIPModel, preset, precision, "image_model", preset.image_revision)
-    with explain_unloadable("retriever", preset.model):
-        tokenizer = CLIPTokenizer.from_pretrained(preset.model, revision=preset.revision)
-    check_tokenizer(preset, video.config, tokenizer)
-    frame_count = preset.frames
-    size = {"height": preset.image_size, "width": preset.image_size}
-    # The released models have no processor file. Their authors preprocess images as CLIP does.
-    processor = CLIPImageProcessor(crop_size=size, size={"shortest_edge": preset.image_size})
+@dataclass
+class LanguageBind:
+    """An `Encoder`. The embedding of a query is the sum of the unit embeddings of its prefix and
+    its question, as in published baselines.
 
-    def embed_clips(clips: list[np.ndarray]) -> np.ndarray:
-        pixels = np.concatenate([clip[spread(len(clip), frame_count)] for clip in clips])
-        features = image_features(video, processor, pixels, group=frame_count)
-        return unit_rows(features.reshape(len(clips), frame_count, -1).mean(axis=1))
+    Attributes:
+        video: Embeds prefixes and texts.
+        image: Embeds frames.
+    """
 
-    return DualEncoder(preset, image, video, tokenizer, processor, embed_clips)
+    preset: RetrieverConfig
+    video: LanguageBindVideo
+    image: CLIPModel
+    tokenizer: CLIPTokenizer
+    processor: CLIPImageProcessor
+
+    def embed_queries(self, queries: list[Query], frames: FrameReader) -> np.ndarray:
+        clips = [
+            frames.stack(
+                q.scene_id, sample_prefix_frames(q.prefix_start, q.prefix_stop, self.preset.frames)
+            )
+            for q in queries
+        ]
+        return unit_rows(self.embed_clips(clips) + self.embed_texts([q.question for q in queries]))
+
+    def embed_clips(self, clips: list[np.ndarray]) -> np.ndarray:
+        """Embed clips, each (T, S, S, 3) uint8."""
+        count = self.preset.frames
+        pixels = np.concatenate([clip[spread(len(clip), count)] for clip in clips])
+        features = self._features(self.video, pixels, max(1, IMAGES // count) * count)
+        return unit_rows(features.reshape(len(clips), count, -1).mean(axis=1))
+
+    def embed_frames(self, refs: list[FrameRef], frames: FrameReader) -> np.ndarray:
+        pixels = np.stack([frames.array(f.scene_id, f.frame) for f in refs])
+        return unit_rows(self._features(self.image, pixels, IMAGES))
+
+    def embed_texts(self, texts: list[str]) -> np.ndarray:
+        """Embed texts. A text is truncated to the model's maximum length, as by its authors."""
+        length = self.video.config.text_config.max_position_embeddings
+        inputs = self.tokenizer(
+            texts, padding="max_length", max_length=length, truncation=True, return_tensors="pt"
+        )
+        with torch.inference_mode():
+            features = self.video.get_text_features(**inputs.to(self.video.device)).pooler_output
+        return unit_rows(features.float().cpu().numpy())
+
+    def _features(self, tower: CLIPModel, pixels: np.ndarray, batch: int) -> np.ndarray:
+        """Return a tower's features (images, entries) of (images, S, S, 3) uint8 pixels."""
+        features = []
+        for start in range(0, len(pixels), batch):
+            part = list(pixels[start : start + batch])
+            inputs = self.processor(part, return_tensors="pt")["pixel_values"]
+            with torch.inference_mode():
+                output = tower.get_image_features(inputs.to(tower.device, tower.dtype))
+            features.append(output.pooler_output.float().cpu().numpy())
+        return np.concatenate(features)
+
+
+def unit_rows(rows: np.ndarray) -> np.ndarray:
+    """Normalise rows to length 1, in fp32."""
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def spread(frames: int, wanted: int) -> list[int]:
     """Return `wanted` evenly spread frame indices, repeating some if there are fewer frames."""
     return [int(k) for k in np.linspace(0, frames - 1, wanted).round()]
+
+
+def load_languagebind(preset: RetrieverConfig, precision: str) -> LanguageBind:
+    """Load the video and text towers of `model`, and the image tower of `image_model`."""
+    video = load_tower(LanguageBindVideo, preset, precision, "model", preset.revision)
+    image = load_tower(CLIPModel, preset, precision, "image_model", preset.image_revision)
+    with explain_unloadable("retriever", preset.model):
+        tokenizer = CLIPTokenizer.from_pretrained(preset.model, revision=preset.revision)
+    check_text_tower(preset.model, video.config, tokenizer)
+    size = {"height": preset.image_size, "width": preset.image_size}
+    # The released models have no processor file. Their authors preprocess images as CLIP does.
+    processor = CLIPImageProcessor(crop_size=size, size={"shortest_edge": preset.image_size})
+    return LanguageBind(preset, video, image, tokenizer, processor)
 
 
 def load_tower(
@@ -98,7 +151,8 @@ def load_tower(
     with explain_unloadable("retriever", source, key):
         # CLIPConfig.from_pretrained would warn that the file has another model type.
         config = CLIPConfig.from_dict(CLIPConfig.get_config_dict(source, revision=revision)[0])
-        is_video = getattr(config.vision_config, "add_time_attn", False)
+        vision = config.vision_config
+        is_video = getattr(vision, "add_time_attn", False)
         if is_video != (kind is LanguageBindVideo):
             raise UserError(
                 f"retriever.{key}={source} is another kind of model: set retriever.model to a "
@@ -106,14 +160,30 @@ def load_tower(
                 "retriever.image_model to LanguageBind/LanguageBind_Image",
                 code="wrong-model-type",
             )
-        if is_video and (needed := config.vision_config.num_frames) != preset.frames:
+        if is_video and vision.num_frames != preset.frames:
             raise UserError(
-                f"retriever.frames={preset.frames}, but {source} needs clips of {needed} frames: "
-                f"set retriever.frames={needed}",
+                f"retriever.frames={preset.frames}, but {source} needs clips of "
+                f"{vision.num_frames} frames: set retriever.frames={vision.num_frames}",
                 code="wrong-frame-count",
             )
-        check_size(preset, config)
+        if vision.image_size != preset.image_size:
+            raise UserError(
+                f"retriever.image_size={preset.image_size}, but {source} needs images of "
+                f"{vision.image_size} px: set retriever.image_size={vision.image_size}",
+                code="wrong-image-size",
+            )
         # The released folders have pytorch_model.bin only, from which the library loads tensors but
         # no code.
-        options = {"revision": revision, "config": config, "use_safetensors": None}
-        return load_complete(kind, source, precision, key, **options)
+        model, info = kind.from_pretrained(
+            source, revision=revision, config=config, dtype=DTYPES[precision],
+            output_loading_info=True, ignore_mismatched_sizes=True, **place_weights(),
+        )  # fmt: skip
+    # The library would initialise missing weights at random.
+    mismatched = (name for name, *_ in info["mismatched_keys"])
+    if missing := sorted({*info["missing_keys"], *mismatched}):
+        raise UserError(
+            f"retriever.{key}={source} lacks the weights of {len(missing)} parameters, such as "
+            f"{missing[0]}: download the complete model, or set the model that the preset names",
+            code="incomplete-model",
+        )
+    return for_inference(model)

@@ -59,21 +59,6 @@ class Ranks:
     seconds: float
     twin_above: np.ndarray | None = None
 
-    @classmethod
-    def from_counts(
-        cls,
-        widths: Sequence[int],
-        counts: np.ndarray,
-        frames: int,
-        vectors: int,
-        seconds: float,
-        twin_above: np.ndarray | None = None,
-    ) -> Ranks:
-        """Build ranks without misses from the counts (2, widths, queries) of the frames that score
-        above the target and of the frames that score as it does, including the target itself."""
-        (above, equal), found = counts, np.ones(counts.shape[2], bool)
-        return cls(tuple(widths), above, equal - 1, found, frames, vectors, seconds, twin_above)
-
 
 def write_ranks(
     folder: Path, ranks: Mapping[str, Ranks], queries: Sequence[RetrievalQuery]
@@ -135,7 +120,9 @@ def exact_ranks(
         twin_scores = [pair_scores(queries, twins, width, late) for width in widths]
         twin_above = share_above(np.array(twin_scores), np.array(target_scores))
     seconds = time.perf_counter() - began
-    return Ranks.from_counts(widths, counts, frames, vectors, seconds, twin_above)
+    (above, equal), found = counts, np.ones(len(queries), bool)
+    # The target itself is among the frames that score as it does.
+    return Ranks(tuple(widths), above, equal - 1, found, frames, vectors, seconds, twin_above)
 
 
 def pair_scores(

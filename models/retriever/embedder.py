@@ -18,6 +18,7 @@ from safetensors.torch import load_file
 from sentence_transformers import MultiVectorEncoder, SentenceTransformer
 from sentence_transformers.sentence_transformer.modules import Normalize, Pooling, Transformer
 from sentence_transformers.util import is_sentence_transformer_model
+from tokenizers import normalizers
 from transformers import AutoConfig, AutoModel, AutoProcessor
 
 from dynapix.conf.errors import UserError
@@ -30,6 +31,7 @@ from dynapix.models.checks import (
     PEFT_PREFIX,
     check_late_base,
     check_processor,
+    check_text_tower,
 )
 from dynapix.models.compat import keep_differentiable, write_clips_as_released
 from dynapix.models.distributed import main_first, rank_device
@@ -167,11 +169,17 @@ def prepare_processor(backbone: Transformer, cfg: RetrieverConfig, source: str) 
     if "message" in backbone.modality_config:
         own = {key: PROCESSING[key] for key in ("text", "video")}
     elif text_tower := getattr(backbone.config, "text_config", None):
+        check_text_tower(source, backbone.config, backbone.tokenizer)
         # A text tower truncates texts, as by its authors.
         own = {"text": {"max_length": text_tower.max_position_embeddings}}
         if kind.startswith("siglip"):
-            # SigLIP was trained without an attention mask: it attends to the padding.
+            # SigLIP was trained without an attention mask, so it attends to the padding.
             own["text"] |= {"padding": "max_length", "return_attention_mask": False}
+            # It was trained on text in lower case. Not every tokenizer of SigLIP 2 converts to it.
+            if backbone.tokenizer.is_fast:
+                fast = backbone.tokenizer.backend_tokenizer
+                others = [] if fast.normalizer is None else [fast.normalizer]
+                fast.normalizer = normalizers.Sequence([normalizers.Lowercase(), *others])
     settings = backbone.processing_kwargs
     backbone.processing_kwargs = {
         **settings, **{key: settings.get(key, {}) | values for key, values in own.items()}

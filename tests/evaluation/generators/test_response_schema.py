@@ -1,8 +1,6 @@
 """The structured record: its parser, its instruction and its JSON schema."""
 
 import json
-import random
-import string
 from dataclasses import asdict, fields
 
 import pytest
@@ -23,39 +21,18 @@ RECORD = Record(
     {"A": 0.1, "B": 0.3, "C": 0.55, "D": 0.05},
     "B",
     "some",
-    {"A": "Too early.", "B": 'It is "B", nearly.', "C": "Answer: it fits.", "D": "{late}"},
+    {"A": "Too early.", "B": 'It is "B", nearly.', "C": "Answer: it fits.", "D": "{À\u2028中}\t"},
     "The red cube has come to rest; Option A has it moving.",
 )
 FULL = json.dumps(asdict(RECORD))
 
 
-def test_the_choice_of_any_record_is_parsed():
-    rng = random.Random(1)
-    for _ in range(300):
-        record = random_record(rng)
-        raw = json.dumps(asdict(record), indent=rng.choice([None, 1, 4]))
-        assert parse_choice(raw).letter == record.forced_choice
-        assert read_record(raw) == record
-        assert read_record(json.dumps(asdict(read_record(raw)))) == record
-        stop = rng.randrange(len(raw))
-        assert parse_choice(raw[:stop]).letter in (record.forced_choice, None)
-
-
-def random_record(rng: random.Random) -> Record:
-    def text() -> str:
-        return "".join(
-            rng.choices(string.printable + "ÀВ«»中\u2028\U0001f9ca", k=rng.randint(0, 60))
-        )
-
-    return Record(
-        rng.choice("ABCD"),
-        rng.random(),
-        {x: rng.random() for x in "ABCD"},
-        rng.choice("ABCD"),
-        rng.choice(["none", "some", "high"]),
-        {x: text() for x in "ABCD"},
-        text(),
-    )
+def test_the_choice_of_a_record_is_parsed():
+    for indent in (None, 1, 4):
+        raw = json.dumps(asdict(RECORD), indent=indent)
+        assert parse_choice(raw).letter == "C"
+        assert read_record(raw) == RECORD
+        assert {parse_choice(raw[:stop]).letter for stop in range(len(raw))} == {"C", None}
 
 
 def test_a_record_is_valid_exactly_if_its_schema_accepts_it():
@@ -67,26 +44,19 @@ def test_a_record_is_valid_exactly_if_its_schema_accepts_it():
     changed = [{**record, name: value} for name in record for value in values]
     changed += [{k: v for k, v in record.items() if k != name} for name in record]
     changed += [{**record, "note": ""}, {**record, "distribution": {"A": 1, "B": 0, "C": 0}}]
-    valid = 0
-    for value in changed:
-        raw = json.dumps(value)
-        found = read_record(raw)
-        assert (found is not None) == validator.is_valid(value)
-        assert found is None or parse_choice(raw).letter == found.forced_choice
-        valid += found is not None
-    assert 0 < valid < len(changed)
+    found = [read_record(json.dumps(value)) for value in changed]
+    assert [each is not None for each in found] == [validator.is_valid(value) for value in changed]
+    assert 0 < found.count(None) < len(changed)
 
 
 @pytest.mark.parametrize(
     "raw",
     [
         FULL.replace("0.55", "NaN", 1),
-        FULL.replace("0.55", "Infinity", 1),
         FULL.replace("0.55", "1e999", 1),
         FULL[:-1],
         FULL + FULL,
         f"<think>{FULL}",
-        "",
         '{"forced_choice": "C", "confidence": ' + "[" * 100_000,
     ],
 )
@@ -95,12 +65,7 @@ def test_a_response_without_exactly_one_json_record_is_invalid(raw):
 
 
 def test_prompt_and_schema_have_the_fields_of_the_record_in_its_order():
-    names = [f.name for f in fields(Record)]
-    assert (
-        list(FIELDS)
-        == list(build_record_schema()["properties"])
-        == build_record_schema()["required"]
-        == names
-    )
+    names, schema = [f.name for f in fields(Record)], build_record_schema()
+    assert list(FIELDS) == list(schema["properties"]) == schema["required"] == names
     positions = [write_record_instruction().index(f'"{name}"') for name in names]
     assert positions == sorted(positions)

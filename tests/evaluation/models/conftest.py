@@ -14,6 +14,7 @@ from dynapix.conf.schema import (
     ContrastiveTrainConfig,
     LoraConfig,
     RetrieverConfig,
+    ServerConfig,
     SftCommand,
     StudentConfig,
     TeacherConfig,
@@ -22,6 +23,8 @@ from dynapix.data.store import Store
 from dynapix.models import loading
 from dynapix.models.retriever import embedder
 from dynapix.train.student import dataset
+from tests.evaluation.chat_server import ChatServer
+from tests.evaluation.models import released
 from tests.evaluation.reporting.measured import finish
 from tests.tiny_models import SMALL
 
@@ -32,27 +35,19 @@ STUDENT = StudentConfig(
 RETRIEVER = RetrieverConfig(
     name="small", architecture=SMALL, image_size=96, widths=[64, 32], **NO_LORA
 )
+SERVED = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
+"""A base on a server."""
+
+
+def served_by(*servers: ChatServer, **changes: object) -> ServerConfig:
+    """Return the settings of a client of servers."""
+    settings = {"concurrency": 3, "unreachable_timeout": 5.0, "timeout": 10.0, **changes}
+    return ServerConfig(url=[s.url for s in servers], model="served", **settings)
 
 
 def new_run(folder: Path, *overrides: str) -> Run:
     folder.mkdir(parents=True, exist_ok=True)
     return Run(folder.name, folder, overrides)
-
-
-def tear(log: Path) -> tuple[str, str]:
-    """Cut off the last third of a log, as if the process had been killed while it wrote. Return the
-    complete text and the torn text."""
-    complete = log.read_text()
-    torn = complete[: len(complete) * 2 // 3]
-    log.write_text(torn)
-    return complete, torn
-
-
-def check_resumed(log: Path, complete: str, torn: str) -> None:
-    """Check that a resumed run kept the torn text of a log and appended the missing lines."""
-    assert log.read_text().startswith(f"{torn}\n")
-    lines = [*complete.splitlines(), torn.rpartition("\n")[2]]
-    assert sorted(log.read_text().splitlines()) == sorted(lines)
 
 
 def save_retriever(
@@ -90,3 +85,13 @@ def trained_retriever(tmp_path_factory, micro, micro_store) -> Path:
     return save_retriever(
         RETRIEVER, tmp_path_factory.mktemp("contrastive") / "run", micro, micro_store
     )
+
+
+@pytest.fixture(scope="session")
+def clip(tmp_path_factory) -> RetrieverConfig:
+    """An encoder of frames and texts, which is not trained."""
+    folder = released.clip(tmp_path_factory.mktemp("released") / "clip")
+    return RetrieverConfig(
+        name="clip", encoder="dual", model=str(folder), widths=[24, 12],
+        image_size=released.IMAGE_SIZE, frames=released.CLIP_FRAMES, **NO_LORA,
+    )  # fmt: skip

@@ -11,20 +11,19 @@ from pathlib import Path
 
 import peft
 import torch
-from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+from tokenizers import pre_tokenizers
 from transformers import (
     CLIPConfig,
     CLIPImageProcessor,
     CLIPModel,
     CLIPProcessor,
     CLIPTokenizer,
-    PreTrainedTokenizerFast,
+    GemmaTokenizer,
     Qwen2VLConfig,
     Qwen2VLForConditionalGeneration,
     Qwen2VLImageProcessor,
     Qwen2VLProcessor,
     Qwen2VLVideoProcessor,
-    Siglip2Tokenizer,
     SiglipConfig,
     SiglipImageProcessor,
     SiglipModel,
@@ -32,13 +31,19 @@ from transformers import (
 )
 
 from dynapix.evaluation.embedders.languagebind import LanguageBindVideo
-from dynapix.models.tiny_qwen3_vl import CHAT_TEMPLATE, SPECIAL_TOKENS
+from tests.families import (
+    IMAGE_SIZE,
+    QWEN2_5_VL_TEMPLATE,
+    QWEN_TOKENS,
+    VISION,
+    build_tokenizer,
+    media_ids,
+)
 
-IMAGE_SIZE, CLIP_FRAMES = 56, 4
+CLIP_FRAMES = 4
 TOWER = {
     "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2,
 }  # fmt: skip
-VISION = {**TOWER, "image_size": IMAGE_SIZE, "patch_size": 14}
 ALPHABET = sorted(pre_tokenizers.ByteLevel.alphabet())
 
 
@@ -70,7 +75,7 @@ def siglip2(folder: Path) -> Path:
     torch.manual_seed(0)
     tokens = ["<pad>", "<eos>", "<bos>", "<unk>", "<mask>", "▁", *map(chr, range(33, 127))]
     tokens += [f"<0x{byte:02X}>" for byte in range(256)]
-    tokenizer = Siglip2Tokenizer(vocab={token: k for k, token in enumerate(tokens)}, merges=[])
+    tokenizer = GemmaTokenizer(vocab={token: k for k, token in enumerate(tokens)}, merges=[])
     text = {**TOWER, "vocab_size": len(tokenizer), "max_position_embeddings": 64}
     SiglipModel(SiglipConfig(text_config=text, vision_config=VISION)).save_pretrained(folder)
     images = SiglipImageProcessor(size={"height": IMAGE_SIZE, "width": IMAGE_SIZE})
@@ -104,32 +109,18 @@ def languagebind(videos: Path, images: Path) -> tuple[Path, Path]:
 def vlm2vec(base: Path, adapters: Path) -> Path:
     """Write a Qwen2-VL to `base`, and adapters over it with the processor to `adapters`."""
     torch.manual_seed(0)
-    tokenizer = Tokenizer(models.BPE())
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    tokenizer.decoder = decoders.ByteLevel()
-    trainer = trainers.BpeTrainer(
-        vocab_size=len(SPECIAL_TOKENS) + len(ALPHABET), special_tokens=list(SPECIAL_TOKENS),
-        initial_alphabet=ALPHABET, show_progress=False,
-    )  # fmt: skip
-    tokenizer.train_from_iterator([], trainer)
-    fast = PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer, eos_token="<|im_end|>", pad_token="<|endoftext|>",
-        extra_special_tokens=list(SPECIAL_TOKENS[1:]),
-    )  # fmt: skip
-    ids = {token: k for k, token in enumerate(SPECIAL_TOKENS)}
+    tokenizer = build_tokenizer([], QWEN_TOKENS, end="<|im_end|>")
+    rope = {"rope_type": "default", "rope_theta": 1e6, "mrope_section": [2, 3, 3]}
     config = Qwen2VLConfig(
         text_config={
-            **TOWER, "vocab_size": len(fast), "num_key_value_heads": 2, "tie_word_embeddings": True,
-            "rope_parameters": {
-                "rope_type": "default", "rope_theta": 1e6, "mrope_section": [2, 3, 3],
-            },
+            **TOWER, "vocab_size": len(tokenizer), "num_key_value_heads": 2,
+            "tie_word_embeddings": True, "rope_parameters": rope,
         },
         vision_config={
             "depth": 2, "embed_dim": 32, "hidden_size": 32, "num_heads": 2, "patch_size": 14,
             "mlp_ratio": 2,
         },
-        image_token_id=ids["<|image_pad|>"], video_token_id=ids["<|video_pad|>"],
-        vision_start_token_id=ids["<|vision_start|>"], vision_end_token_id=ids["<|vision_end|>"],
+        **media_ids(tokenizer),
     )  # fmt: skip
     model = Qwen2VLForConditionalGeneration(config)
     model.save_pretrained(base)
@@ -140,7 +131,7 @@ def vlm2vec(base: Path, adapters: Path) -> Path:
     settings = adapters / "adapter_config.json"
     saved = json.loads(settings.read_text()) | {"base_model_name_or_path": str(base)}
     settings.write_text(json.dumps(saved))
-    Qwen2VLProcessor(
-        Qwen2VLImageProcessor(), fast, Qwen2VLVideoProcessor(), chat_template=CHAT_TEMPLATE
-    ).save_pretrained(adapters)
+    images, videos = Qwen2VLImageProcessor(), Qwen2VLVideoProcessor()
+    processor = Qwen2VLProcessor(images, tokenizer, videos, chat_template=QWEN2_5_VL_TEMPLATE)
+    processor.save_pretrained(adapters)
     return adapters

@@ -1,4 +1,4 @@
-"""evaluation.select on a small student, and which models the evaluation commands accept."""
+"""evaluation.select on a small student and on a served base, and which models are accepted."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ from dynapix.conf.schema import (
     SftCommand,
     StudentConfig,
 )
+from dynapix.conf.schema.benchmark import MATCHED_ANCHOR
+from dynapix.data.items.controls import pair_items
 from dynapix.evaluation import report, select
+from dynapix.evaluation.generators import response_schema
 from dynapix.evaluation.generators.response_log import ResponseLog
-from dynapix.evaluation.generators.response_schema import build_record_schema
+from dynapix.evaluation.metrics.results import SelectionResult, from_json
 from dynapix.models.student.answer_parser import parse_choice
 from dynapix.models.trained_runs import check_unseen, read_trained_settings, resolve_model
-from tests.evaluation.models.conftest import (
-    STUDENT,
-    check_resumed,
-    new_run,
-    tear,
-)
+from tests.evaluation.models.conftest import SERVED, STUDENT, new_run, served_by
 from tests.evaluation.reporting.measured import finish
 from tests.user_errors import raises_user_error
 
@@ -39,136 +37,169 @@ def test_a_student_is_measured_resumed_and_reported(
     trained_student, micro, micro_store, tmp_path
 ) -> None:
     store = str(micro_store.folder.parent)
+    student = StudentConfig(name="unused", model="unused", temperature=1.0, top_k=50)
     cfg = SelectCommand(
-        benchmark=micro, student=StudentConfig(name="unused", model="unused"), store=store,
-        model=str(trained_student), batch=4, limit=8,
-    )  # fmt: skip
-    run = new_run(tmp_path / "select" / "run")
+        benchmark=micro, student=student, store=store, model=str(trained_student), batch=3, limit=6
+    )
+    run = new_run(tmp_path / "select" / "run", "student.temperature=1.0", "student.top_k=50")
     metrics = select.main.__wrapped__(cfg, run)
     finish(run.folder, cfg, metrics=metrics)
     first = (run.folder / "report.json").read_text()
     (reasoning, answer) = json.loads(first)["rows"]
-    assert (reasoning["n"], answer["n"]) == (8, 8)
+    assert (reasoning["n"], answer["n"]) == (6, 6)
     assert set(answer["families"]) == {"event", "time", "window"}
     assert "paper" in (run.folder / "report.txt").read_text()
 
-    # A killed run generates only the missing responses, and its results are the same.
+    # A run that was killed while it wrote samples only the missing responses, in batches of any
+    # size, and its results are the same.
     log = run.folder / "answers.jsonl"
-    complete, torn = tear(log)
-    headers = [json.loads(line) for line in complete.splitlines()[:2]]
-    settings = {header["mode"]: header["asked"] for header in headers}
+    complete = log.read_text()
+    rows = [json.loads(line) for line in complete.splitlines()]
+    assert len({row["text"] for row in rows if "text" in row}) == 12
+    settings = {row["mode"]: row["asked"] for row in rows if "asked" in row}
     items = micro_store.selection("test")
-    assert 0 < len(ResponseLog(log, settings, items).responses) < 16
-    select.main.__wrapped__(cfg, run)
+    torn = complete[: len(complete) * 2 // 3]
+    log.write_text(torn)
+    assert 0 < len(ResponseLog(log, settings, items).responses) < 12
+    log.write_text(torn)
+    select.main.__wrapped__(replace(cfg, batch=2), run)
     assert (run.folder / "report.json").read_text() == first
-    check_resumed(log, complete, torn)
+    assert log.read_text().startswith(f"{torn}\n")
+    lines = [*complete.splitlines(), torn.rpartition("\n")[2]]
+    assert sorted(log.read_text().splitlines()) == sorted(lines)
 
     # Responses are scored again when they are read, and a damaged line counts as missing.
     edited = complete.replace('"right": false', '"right": true').splitlines()
     log.write_text("\n".join([*edited[:4], "{", *edited[5:]]) + "\n")
     responses = ResponseLog(log, settings, items).responses
-    assert len(responses) == 15
+    assert len(responses) == 11
     letters = {i.item_id: i.letter for i in items}
     assert all(a.right == (a.letter == letters[a.item_id]) for a in responses.values())
-    log.write_text(complete)
-    # Responses of other weights are not reused.
-    other_model = {mode: {**values, "model": "another"} for mode, values in settings.items()}
-    assert not ResponseLog(log, other_model, items).responses
 
+    log.write_text(complete)
     shutil.copytree(trained_student, tmp_path / "sft" / "run")
     page = new_run(tmp_path / "report" / "run")
     report.main.__wrapped__(ReportCommand(checkpoints=str(tmp_path), store=store), page)
     html = (page.folder / "report.html").read_text()
-    assert all(f'"id": "{item.item_id}"' in html for item in select.limit_items(items, 8, 0))
+    assert all(f'"id": "{item.item_id}"' in html for item in select.limit_items(items, 6, 0))
 
 
 @pytest.mark.slow
-def test_sampled_records_of_a_base_are_the_same_after_a_kill(
-    trained_student, micro, micro_store, tmp_path
+def test_constrained_decoding_yields_records_only(
+    trained_student, micro, micro_store, tmp_path, monkeypatch
 ) -> None:
-    student = replace(
-        STUDENT, model=str(trained_student / "student"), architecture=None, temperature=1.0,
-        top_k=50,
-    )  # fmt: skip
+    # A model with random weights writes texts up to their limits, which are shorter here.
+    monkeypatch.setattr(response_schema, "MAX_RATIONALE", 9)
+    monkeypatch.setattr(response_schema, "MAX_JUSTIFICATION", 9)
+    weights = str(trained_student / "student")
+    student = replace(STUDENT, model=weights, architecture=None, max_new_tokens=300, temperature=1)
     cfg = SelectCommand(
-        benchmark=micro, student=student, store=str(micro_store.folder.parent), modes=["record"],
-        batch=3, seed=5, limit=8,
+        benchmark=micro, student=student, store=str(micro_store.folder.parent), limit=3, batch=2,
+        modes=["constrained"],
     )  # fmt: skip
-    run = new_run(tmp_path / "sampled")
-    assert set(select.main.__wrapped__(cfg, run)) >= {"record_micro", "record_parse_rate"}
-    log = run.folder / "answers.jsonl"
-    complete, torn = tear(log)
-    select.main.__wrapped__(replace(cfg, batch=2), run)
-    check_resumed(log, complete, torn)
-    assert len({json.loads(line)["text"] for line in complete.splitlines()[1:]}) == 8
-
-
-@pytest.mark.slow
-def test_constrained_decoding_yields_records_only(micro, micro_store, tmp_path) -> None:
-    student = replace(STUDENT, max_new_tokens=900, temperature=1)
-    cfg = SelectCommand(
-        benchmark=micro, student=student, store=str(micro_store.folder.parent), limit=4, batch=3
-    )
-    metrics = select.main.__wrapped__(cfg, new_run(tmp_path))
-    assert metrics["constrained_parse_rate"] == 1 > metrics["record_parse_rate"]
-    rows = list(read_json_lines(tmp_path / "answers.jsonl"))
-    constrained = [row for row in rows if row["mode"] == "constrained" and "text" in row]
-    assert len(constrained) == 4
-    for row in constrained:
+    assert select.main.__wrapped__(cfg, new_run(tmp_path))["constrained_parse_rate"] == 1
+    _, *rows = read_json_lines(tmp_path / "answers.jsonl")
+    assert len(rows) == 3
+    schema = response_schema.build_record_schema()
+    for row in rows:
+        assert not row["truncated"]
         assert parse_choice(row["text"]).letter == row["letter"]
-        # A model with random weights may write texts up to the token limit, which cuts the record,
-        # and control characters, which `strict` would refuse.
-        if not row["truncated"]:
-            record = json.loads(row["text"], strict=False)
-            jsonschema.validate(record, build_record_schema())
-            assert list(record) == list(build_record_schema()["properties"])
+        # The texts may have control characters, which `strict` would refuse.
+        record = json.loads(row["text"], strict=False)
+        jsonschema.validate(record, schema)
+        assert list(record) == list(schema["properties"])
 
 
-def test_the_log_is_append_only(micro_store, tmp_path) -> None:
-    path, items = tmp_path / "answers.jsonl", micro_store.selection("test")[:2]
-    ResponseLog(path, {"answer": {"seed": 0}}, items)
-    torn = path.read_bytes() + b'{"item_id": "to'
-    path.write_bytes(torn)
-    ResponseLog(path, {"answer": {"seed": 1}}, items)
-    assert path.read_bytes().startswith(torn + b"\n{")
-    before = path.read_bytes()
-    ResponseLog(path, {"answer": {"seed": 0}}, items)
-    assert path.read_bytes() == before
+def has_clip(request) -> bool:
+    return any(part["type"] == "video_url" for part in request["messages"][0]["content"])
+
+
+def test_a_served_base_is_measured_with_and_without_the_prefix(
+    micro, micro_store, start_server, tmp_path
+) -> None:
+    server = start_server(lambda request: "Answer: C" if has_clip(request) else "I cannot tell.")
+    cfg = SelectCommand(
+        benchmark=micro, student=SERVED, server=served_by(server), control="candidate_only",
+        limit=12, store=str(micro_store.folder.parent), checkpoints=str(tmp_path),
+    )  # fmt: skip
+    run = new_run(tmp_path / "select" / "both")
+    metrics = select.main.__wrapped__(cfg, run)
+    items = select.select_items(micro_store, None, 12, 0)
+    right, name = sum(i.letter == "C" for i in items), micro_store.name
+    report = json.loads((run.folder / "report.json").read_text())
+    rows = from_json(list[SelectionResult], report["rows"])
+    assert [(r.benchmark, r.control, r.mode) for r in rows] == [
+        (name, control, mode)
+        for control in (None, "candidate_only")
+        for mode in ("record", "constrained")
+    ]
+    assert rows[0].micro.value == right / 12
+    assert metrics["record_micro"] == metrics["record_parse_rate"] == 0
+    assert report["readings"]["record, candidate_only"] == {
+        "with a letter": 0, "  in a valid record": 0, "without: refusal": 12,
+    }  # fmt: skip
+    overall = next(p for p in report["controls"] if p["of"] == "all")
+    names = (overall["mode"], overall["left"], overall["right"])
+    assert names == ("record", "unchanged", "candidate_only")
+    assert (overall["only_left"], overall["only_right"], overall["n"]) == (right, 0, 12)
+    assert overall["difference"] == pytest.approx(right / 12)
+    text = (run.folder / "report.txt").read_text()
+    assert "record: unchanged (left) minus candidate_only (right)" in text
+
+    # The same command sends no requests when it is run again, and has the same results. Another
+    # control reuses the responses to the unchanged items, and copies them into its own log.
+    server.requests.clear()
+    assert select.main.__wrapped__(cfg, run) == metrics
+    assert not server.requests
+    shuffled, other = replace(cfg, control="shuffled_prefix"), new_run(tmp_path / "select" / "x")
+    metrics = select.main.__wrapped__(shuffled, other)
+    assert len(server.requests) == 24
+    shutil.rmtree(run.folder)
+    server.requests.clear()
+    assert select.main.__wrapped__(shuffled, other) == metrics
+    assert not server.requests
+
+
+def test_a_limit_spreads_over_the_families_or_selects_complete_pairs(benchmark_store) -> None:
+    items = benchmark_store.selection()
+    few = select.limit_items(items, 6, seed=0)
+    assert sorted(i.family for i in few) == ["event"] * 2 + ["time"] * 2 + ["window"] * 2
+    assert select.limit_items(items, 6, seed=0) == few
+    items = benchmark_store.selection(suite=MATCHED_ANCHOR)
+    few = select.limit_items(items, 3, 0)
+    [(by_event, by_time)] = pair_items(few)
+    assert few == [by_event, by_time]
+    assert sorted(select.limit_items(items, len(items), 0), key=items.index) == items
+    one = SelectCommand(student=SERVED, suite=MATCHED_ANCHOR, limit=1)
+    assert "limit=1" in " ".join(one.check())
+    with raises_user_error("no-items", contains=("interventions", "tiny_interventions")):
+        select.select_items(benchmark_store, "interventions", None, 0)
 
 
 @pytest.mark.parametrize(
-    ("damage", "code"),
+    ("name", "content", "code"),
     [
-        (shutil.rmtree, "missing-run"),
-        (lambda run: (run / "metrics.json").unlink(), "unfinished-run"),
-        (lambda run: (run / "config.yaml").write_text("student: [1"), "damaged-file"),
-        (lambda run: (run / "config.yaml").write_text(""), "missing-run"),
-        (lambda run: (run / "config.yaml").write_text("student: {rank: 1}"), "damaged-file"),
-        (lambda run: (run / "config.yaml").write_text("retriever: {}"), "missing-run"),
+        ("metrics.json", None, "unfinished-run"),
+        ("config.yaml", "student: [1", "damaged-file"),
+        ("config.yaml", "student: {rank: 1}", "damaged-file"),
+        ("config.yaml", "retriever: {}", "missing-run"),
+        ("run.json", '{"command": "evaluation.select"}', "missing-run"),
     ],
 )
-def test_a_run_that_cannot_be_measured_is_refused(trained_student, tmp_path, damage, code) -> None:
-    shutil.copytree(trained_student, tmp_path / "run")
-    damage(tmp_path / "run")
-    with raises_user_error(code):
-        read_trained_settings(tmp_path / "run", SftCommand, "student")
-
-
-def test_other_folders_than_runs_are_named(trained_student, tmp_path) -> None:
-    run, base = tmp_path / "run", tmp_path / "base"
-    shutil.copytree(trained_student, run)
-    with raises_user_error("missing-run", contains=f"model={run / 'student'}"):
+def test_a_run_that_cannot_be_measured_is_refused(
+    trained_student, tmp_path, name, content, code
+) -> None:
+    run = shutil.copytree(trained_student, tmp_path / "run")
+    with raises_user_error("missing-run", contains=f"student.model={run / 'student'}"):
         read_trained_settings(run / "student", SftCommand, "student")
-    shutil.copytree(run / "student", base)
-    (base / "config.json").write_text("{}")
-    with raises_user_error("missing-run", contains=f"student.model={base}"):
-        read_trained_settings(base, SftCommand, "student")
-    (run / "run.json").write_text('{"command": "evaluation.select"}')
-    with raises_user_error("missing-run", contains="no run that trained a student"):
+    (run / name).unlink()
+    if content is not None:
+        (run / name).write_text(content)
+    with raises_user_error(code, contains=str(run)):
         read_trained_settings(run, SftCommand, "student")
 
 
-def test_a_model_is_not_tested_on_its_training_scenes(trained_student, micro) -> None:
+def test_a_model_is_not_tested_on_its_training_scenes(trained_student, micro, tmp_path) -> None:
     cfg = SelectCommand(model=str(trained_student))
     other_scenes = {"seed": 1, "test_share": 0.9}
     for allowed in ({}, other_scenes, {"scenes": 99}, {"test_share": 0.01}):
@@ -182,18 +213,13 @@ def test_a_model_is_not_tested_on_its_training_scenes(trained_student, micro) ->
     with raises_user_error("training-scenes-tested", contains="seed=1"):
         check_unseen("model", release, replace(release, seed=1))
 
-
-def test_a_base_is_not_tested_on_its_training_scenes(micro, tmp_path) -> None:
+    # The folder of a base may have the settings of its training, or a file of another project.
+    cfg = SelectCommand(student=StudentConfig(name="x", model=str(tmp_path)))
     trained = OmegaConf.structured(replace(micro, test_share=0.01))
     OmegaConf.save({"benchmark": trained}, tmp_path / "config.yaml")
-    cfg = SelectCommand(student=StudentConfig(name="x", model=str(tmp_path)))
     resolve_model(cfg, replace(micro, seed=1), SftCommand, "student")
     with raises_user_error("training-scenes-tested", contains=str(tmp_path)):
         resolve_model(cfg, micro, SftCommand, "student")
-    (tmp_path / "config.yaml").write_text("benchmark: {scenes: [")
-    with raises_user_error("damaged-file", contains=str(tmp_path)):
-        resolve_model(cfg, micro, SftCommand, "student")
-    # A file of another project.
     (tmp_path / "config.yaml").write_text("hidden: 64")
     resolve_model(cfg, micro, SftCommand, "student")
 
@@ -215,14 +241,5 @@ def test_settings_that_a_trained_model_cannot_use_are_refused(
     matcher = EmbedderConfig(model=str(trained_retriever))
     arguments = (matcher, micro, ContrastiveCommand, "retriever")
     resolve_model(*arguments, ("student.frames=2", "matcher.model=RUN"), "matcher.model")
-    for refused in ("matcher=clip", "matcher.retriever.image_size=64"):
-        with raises_user_error("unused-setting", contains="matcher.train"):
-            resolve_model(*arguments, (refused,), "matcher.model")
-
-
-def test_a_limit_spreads_over_the_families(micro_store) -> None:
-    items = micro_store.selection()
-    few = select.limit_items(items, 6, seed=0)
-    assert sorted(i.family for i in few) == ["event"] * 2 + ["time"] * 2 + ["window"] * 2
-    assert select.limit_items(items, 6, seed=0) == few
-    assert select.limit_items(items, None, seed=0) == items
+    with raises_user_error("unused-setting", contains="matcher.train"):
+        resolve_model(*arguments, ("matcher=clip",), "matcher.model")

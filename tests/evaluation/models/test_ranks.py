@@ -1,7 +1,8 @@
-"""Several ranks of a launcher share the items of an evaluation."""
+"""Several ranks of a launcher share the work of an evaluation."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import pickle
@@ -14,159 +15,117 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from dynapix.conf.runs import Run
-from dynapix.conf.schema import (
-    ContrastiveTrainConfig,
-    EmbedderConfig,
-    RetrieveCommand,
-    RetrieverConfig,
-    SelectCommand,
-    TwoStageCommand,
-)
-from dynapix.data.store import Store
-from dynapix.evaluation import select
+from dynapix.conf.schema import EmbedderConfig, RetrieveCommand, SelectCommand, TwoStageCommand
 from tests.children import run_child
-from tests.evaluation.models import released
-from tests.evaluation.models.conftest import NO_LORA, STUDENT
+from tests.evaluation.models.conftest import STUDENT
 
 ROOT = Path(__file__).parents[3]
-EVALUATE = """
-import importlib, pickle, sys
+Job = tuple[str, object, Path]
+LAUNCHED = """
+import pickle, sys
 from pathlib import Path
-from dynapix.conf.runs import Run
+from dynapix.models import distributed
+from tests.evaluation.models.test_ranks import evaluate
 
-command, settings, folder = sys.argv[1:]
-cfg = pickle.loads(Path(settings).read_bytes())
-main = importlib.import_module(f"dynapix.evaluation.{command}").main
-sampling = ("student.temperature", "student.top_k")
-main.__wrapped__(cfg, Run("run", Path(folder), sampling))
+jobs = pickle.loads(Path(sys.argv[1]).read_bytes())
+end_ranks = distributed.end_ranks
+# A process can start the communication of ranks once, so it ends after the last command.
+distributed.end_ranks = lambda: None
+evaluate(jobs[:-1])
+distributed.end_ranks = end_ranks
+evaluate(jobs[-1:])
 """
 
 
-def launch(*arguments: object, ranks: int = 2):
-    launcher = Path(sys.executable).with_name("torchrun")
-    several = [launcher, "--standalone", f"--nproc-per-node={ranks}"]
+def evaluate(jobs: list[Job]) -> None:
+    """Run commands, each with its settings and in its folder."""
+    for command, cfg, folder in jobs:
+        main = importlib.import_module(f"dynapix.evaluation.{command}").main
+        main.__wrapped__(cfg, Run("run", folder, ("student.temperature", "student.top_k")))
+
+
+def evaluate_on_two_ranks(jobs: list[Job], folder: Path) -> None:
+    (folder / "jobs").write_bytes(pickle.dumps(jobs))
+    (folder / "evaluate.py").write_text(LAUNCHED)
+    launcher = [Path(sys.executable).with_name("torchrun"), "--standalone", "--nproc-per-node=2"]
     environment = {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
-    return run_child(
-        [*([sys.executable] if ranks == 1 else several), *arguments],
-        cwd=ROOT,
-        env={**os.environ, **environment},
-    )
+    command = [*launcher, folder / "evaluate.py", folder / "jobs"]
+    run_child(command, check=True, cwd=ROOT, env={**os.environ, **environment})
 
 
-def evaluate(command: str, cfg: object, folder: Path, ranks: int = 2) -> dict:
-    """Run a command in a new folder with one process or several ranks. Return its report without
-    the times."""
-    (folder / "run").mkdir(parents=True, exist_ok=True)
-    (folder / "cfg").write_bytes(pickle.dumps(cfg))
-    (folder / "evaluate.py").write_text(EVALUATE)
-    program = (folder / "evaluate.py", command, folder / "cfg", folder / "run")
-    ended = launch(*program, ranks=ranks)
-    assert ended.returncode == 0, ended.stderr
-    report = json.loads((folder / "run" / "report.json").read_text())
-    for row in report["rows"]:
-        row.pop("seconds", None)
-    return report
-
-
-def read_rows(cache: Path) -> dict[str, np.ndarray]:
-    """Return the embeddings in a file by name, in the order in which they were written."""
-    with closing(sqlite3.connect(cache)) as db:
-        rows = db.execute("SELECT name, entries FROM embedding ORDER BY rowid").fetchall()
-    return {name: np.frombuffer(entries, np.float32) for name, entries in rows}
-
-
-@pytest.fixture
-def clip(tmp_path: Path) -> RetrieverConfig:
-    """An encoder of frames and texts, which is not trained."""
-    return RetrieverConfig(
-        name="clip", encoder="dual", model=str(released.clip(tmp_path / "clip")),
-        widths=[24, 12], image_size=released.IMAGE_SIZE, frames=released.CLIP_FRAMES, **NO_LORA,
-    )  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("command", "written"),
-    [
-        ("retrieve", {"query", "frame", "ranks.jsonl"}),
-        ("two_stage", {"text", "frame", "texts.jsonl", "matched.jsonl"}),
-    ],
-)
-def test_two_ranks_embed_what_one_process_embeds(
-    command,
-    written,
-    micro,
-    micro_store: Store,
-    trained_student,
-    trained_retriever,
-    clip,
-    tmp_path: Path,
-) -> None:
-    """The texts in the store and the files of the run have the same bytes. Embeddings may differ in
-    the last bit, since a CPU's rounding can depend on where a tensor lies in memory."""
-    shared = {"benchmark": micro, "batch": 5}
-    cfg = {
-        "retrieve": RetrieveCommand(**shared, retriever=clip, model=str(trained_retriever)),
-        "two_stage": TwoStageCommand(
-            **shared, model=str(trained_student),
-            # With random weights, greedy decoding gives every response the same text.
-            student=replace(STUDENT, temperature=1.0, top_k=50),
-            routes=["predict_caption", "predict_image"],
-            matcher=EmbedderConfig(
-                retriever=clip, batch=7, train=ContrastiveTrainConfig(precision="fp32")
-            ),
-        ),
-    }[command]  # fmt: skip
-    reports, files, embeddings = [], [], []
-    for ranks in (1, 2):
-        folder = tmp_path / str(ranks)
-        shutil.copytree(micro_store.folder, folder / "store" / "micro")
-        shutil.rmtree(folder / "store" / "micro" / "embeddings", ignore_errors=True)
-        here = replace(cfg, store=str(folder / "store"))
-        reports.append(evaluate(command, here, folder, ranks))
-        found = sorted(folder.rglob("*.jsonl"))
-        files.append({str(p.relative_to(folder)): p.read_bytes() for p in found})
-        embeddings.append({p.name: read_rows(p) for p in folder.rglob("*.sqlite")})
-    assert reports[0] == reports[1]
-    assert files[0].keys() == files[1].keys()
-    assert [name for name, content in files[0].items() if files[1][name] != content] == []
-    assert embeddings[0].keys() == embeddings[1].keys()
-    for name, rows in embeddings[0].items():
-        assert [*rows] == [*embeddings[1][name]]
-        np.testing.assert_allclose(
-            [*rows.values()], [*embeddings[1][name].values()], rtol=0, atol=1e-6
-        )
-    names = [*map(Path, files[0]), *map(Path, embeddings[0])]
-    assert {path.name.partition("-")[0] for path in names} >= written
+def read_results(root: Path) -> dict[str, object]:
+    """Return the reports without the times, the embeddings in the order in which they were
+    written, and the bytes of the other results."""
+    found: dict[str, object] = {}
+    for path in sorted(root.rglob("*")):
+        name = str(path.relative_to(root))
+        if path.name == "report.json":
+            found[name] = json.loads(path.read_text())
+            for row in found[name]["rows"]:
+                row.pop("seconds", None)
+        elif path.suffix == ".sqlite":
+            with closing(sqlite3.connect(path)) as db:
+                rows = db.execute("SELECT name, entries FROM embedding ORDER BY rowid").fetchall()
+            found[f"{name} names"] = [row for row, _ in rows]
+            found[name] = np.array([np.frombuffer(entries, np.float32) for _, entries in rows])
+        elif path.suffix == ".jsonl":
+            found[name] = path.read_bytes()
+    return found
 
 
 @pytest.mark.slow
 def test_two_ranks_write_what_one_process_writes(
-    micro, micro_store: Store, trained_student: Path, tmp_path: Path
+    micro, micro_store, trained_student, trained_retriever, clip, tmp_path
 ) -> None:
-    """Also if one process has finished a part of the items."""
-    cfg = SelectCommand(
-        benchmark=micro, store=str(micro_store.folder.parent), model=str(trained_student),
-        student=STUDENT, modes=["answer", "reasoning"], limit=11, batch=3,
-    )  # fmt: skip
-    one, two, fresh = tmp_path / "one", tmp_path / "two" / "run", tmp_path / "fresh"
-    one.mkdir()
-    two.mkdir(parents=True)
-    select.main.__wrapped__(cfg, Run("one", one))
-    log = (one / "answers.jsonl").read_text()
-    (two / "answers.jsonl").write_text("".join(log.splitlines(keepends=True)[:7]))
-    report = evaluate("select", cfg, two.parent)
-    assert len((two / "answers.jsonl").read_text().splitlines()) == 2 + 2 * 11
-    assert report == json.loads((one / "report.json").read_text())
-    evaluate("select", cfg, fresh)
-    assert (fresh / "run" / "answers.jsonl").read_text() == log
+    """Also if one process has finished a part of the answers. Embeddings may differ in the last
+    bit, since a CPU's rounding can depend on where a tensor lies in memory."""
+    # With random weights, greedy decoding gives every response the same text.
+    student = replace(STUDENT, temperature=1.0, top_k=50)
+    shared = {"benchmark": micro, "student": student, "model": str(trained_student)}
+    commands = {
+        "select": SelectCommand(**shared, modes=["answer", "reasoning"], limit=7, batch=3),
+        "retrieve": RetrieveCommand(benchmark=micro, model=str(trained_retriever), batch=5),
+        "two_stage": TwoStageCommand(
+            **shared, batch=5, routes=["predict_caption", "predict_image"],
+            matcher=EmbedderConfig(retriever=clip, batch=7),
+        ),
+    }  # fmt: skip
+
+    def prepare(root: Path) -> list[Job]:
+        shutil.copytree(micro_store.folder, root / "store" / "micro")
+        shutil.rmtree(root / "store" / "micro" / "embeddings", ignore_errors=True)
+        for name in commands:
+            (root / name).mkdir()
+        store = str(root / "store")
+        return [(name, replace(cfg, store=store), root / name) for name, cfg in commands.items()]
+
+    one, two = tmp_path / "one", tmp_path / "two"
+    threads = torch.get_num_threads()
+    # As many as a rank has.
+    torch.set_num_threads(1)
+    evaluate(prepare(one))
+    torch.set_num_threads(threads)
+    jobs = prepare(two)
+    log = (one / "select" / "answers.jsonl").read_text().splitlines(keepends=True)
+    (two / "select" / "answers.jsonl").write_text("".join(log[:5]))
+    evaluate_on_two_ranks(jobs, two)
+    expected, found = read_results(one), read_results(two)
+    assert found.keys() == expected.keys()
+    for name, result in found.items():
+        if isinstance(result, np.ndarray):
+            np.testing.assert_allclose(result, expected[name], rtol=0, atol=1e-6)
+        else:
+            assert result == expected[name], name
+    written = {Path(name).name.partition("-")[0] for name in found}
+    assert written >= {"query", "frame", "text", "ranks.jsonl", "texts.jsonl", "matched.jsonl"}
 
 
-@pytest.mark.slow
-def test_other_evaluations_refuse_ranks(tmp_path: Path) -> None:
-    ended = launch("-m", "evaluation.report", f"checkpoints={tmp_path}")
+def test_other_evaluations_refuse_ranks(tmp_path) -> None:
+    launched = {"LOCAL_RANK": "0", "RANK": "0", "WORLD_SIZE": "2"}
+    command = [sys.executable, "-m", "evaluation.report", f"checkpoints={tmp_path}"]
+    ended = run_child(command, cwd=ROOT, env={**os.environ, **launched})
     assert ended.returncode == 1
-    assert "evaluation.report uses one process, but RANK" in ended.stderr
-    assert not any(tmp_path.iterdir())
+    assert ended.stderr.endswith("[unsupported-ranks]\n")

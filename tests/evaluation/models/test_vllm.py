@@ -4,41 +4,33 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import openai
 import pytest
 import torch
-from transformers import AutoModelForImageTextToText, AutoProcessor
+from transformers import AutoProcessor
 
-from dynapix.conf.entry import Run
 from dynapix.conf.files import read_json_lines
-from dynapix.conf.schema import LoraConfig, SelectCommand, ServerConfig, StudentConfig
+from dynapix.conf.schema import LoraConfig, SelectCommand, ServerConfig
 from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.evaluation import select
 from dynapix.evaluation.generators.generator import item_sample
-from dynapix.evaluation.generators.response_schema import build_record_schema
 from dynapix.models import loading
-from dynapix.models.compat import write_clips_as_released
 from dynapix.models.student.answer_parser import Reason, parse_choice
 from dynapix.models.student.chat_requests import build_messages, qwen_fields, sampling_fields
 from dynapix.models.student.collator import Collator, encode
 from dynapix.train.student import dataset
+from tests.evaluation.models.conftest import STUDENT, new_run
 from tests.teacher.server_process import vllm_server
-from tests.tiny_models import SMALL, randomize_adapters
+from tests.tiny_models import randomize_adapters
 
 pytestmark = pytest.mark.slow
 
-STUDENT = StudentConfig(
-    name="small", architecture=SMALL, quantization="none", lora=LoraConfig(rank=0), image_size=96,
-    max_length=1500, max_new_tokens=600,
-)  # fmt: skip
-
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory, micro_store):
-    """A base on disk. Its processor has other image sizes than the preset and a chat template with
-    vision tokens around a clip, like a released one, and normalises images differently from clips,
-    like that of the tiny base."""
+def cfg(tmp_path_factory, micro_store):
+    """Settings of a base on disk. Its processor has other image sizes than the preset and a chat
+    template with vision tokens around a clip, like a released one, and normalises images
+    differently from clips, like that of the tiny base."""
     folder = tmp_path_factory.mktemp("base")
     model, processor = loading.load_base(
         STUDENT, "fp32", lambda: dataset.tokenizer_corpus(micro_store, [])
@@ -48,67 +40,63 @@ def base(tmp_path_factory, micro_store):
     processor.chat_template = processor.chat_template.replace("<|video_pad|>", marked)
     loading.save_student(model, processor, folder, "fp32")
     assert marked in AutoProcessor.from_pretrained(folder).chat_template
-    return folder
-
-
-def load_processor(folder, cfg):
-    processor = AutoProcessor.from_pretrained(folder)
-    write_clips_as_released(processor)
-    loading.pin_sizes(processor, cfg.image_size, cfg.frames)
-    return processor
+    return replace(STUDENT, model=str(folder), architecture=None)
 
 
 @pytest.fixture(scope="module")
-def cfg(base):
-    return replace(STUDENT, model=str(base), architecture=None)
-
-
-@pytest.fixture(scope="module")
-def adapters(cfg, tmp_path_factory):
-    """Adapters over that base, random and large enough to change its responses."""
+def student(cfg, tmp_path_factory):
+    """A student with adapters over that base, and the folder of the adapters. They are random, and
+    large enough to change its responses."""
     folder = tmp_path_factory.mktemp("student")
     torch.manual_seed(0)
-    trained = replace(cfg, lora=LoraConfig(rank=4))
-    model, processor = loading.load_student(trained, "fp32", list)
+    model, processor = loading.load_student(replace(cfg, lora=LoraConfig(rank=4)), "fp32", list)
     randomize_adapters(model, 0.2)
     loading.save_student(model, processor, folder, "fp32")
-    return folder
+    return model.eval(), processor, folder
 
 
 @pytest.fixture(scope="module")
-def merged(cfg, adapters, tmp_path_factory):
-    """These adapters merged into the base, as `train.export` merges them."""
-    folder = tmp_path_factory.mktemp("merged")
-    model, processor = loading.load_base(cfg, "fp32", list)
-    loading.write_model(loading.merge_adapters(model, adapters, "none", "fp32"), processor, folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def server(base, adapters, tmp_path_factory):
+def server(cfg, student, tmp_path_factory):
     folder = tmp_path_factory.mktemp("serve")
-    serving = vllm_server(base, folder, "frames=true", "dtype=float32", f"adapter={adapters}")
+    adapter = f"adapter={student[-1]}"
+    serving = vllm_server(cfg.model, folder, "frames=true", "dtype=float32", adapter)
     serving.start()
     yield serving
     serving.stop()
 
 
-@pytest.mark.parametrize("control", [None, "shuffled_prefix", "candidate_only"])
-def test_requests_become_the_token_ids_of_a_local_model(
-    server, cfg, base, micro_store, control
-) -> None:
-    frames, processor = FrameReader(micro_store, cfg.image_size), load_processor(base, cfg)
+def ask(server, cfg, sample, model: str = "tiny", **fields: object):
+    """Request one token of a response."""
+    request = sampling_fields(cfg, 1)
+    extra = {"return_token_ids": True, "return_tokens_as_token_ids": True}
+    request["extra_body"] |= qwen_fields(cfg, sample.clip) | extra
     client = openai.OpenAI(base_url=server.url, api_key="none")
-    for mode, item in zip(("record", "answer"), micro_store.selection("test"), strict=False):
-        sample = item_sample("cot", frames, cfg, control, mode, item)
-        request = sampling_fields(cfg, 1)
-        request["extra_body"] |= qwen_fields(cfg, sample.clip)
-        request["extra_body"]["return_token_ids"] = True
-        response = client.chat.completions.create(
-            model="tiny", messages=build_messages(sample), **request
-        )
-        ids = encode(sample, processor, 1500).input_ids
-        assert response.model_extra["prompt_token_ids"] == ids
+    messages = build_messages(sample)
+    return client.chat.completions.create(model=model, messages=messages, **request, **fields)
+
+
+def test_requests_become_the_inputs_of_a_local_model(server, cfg, student, micro_store) -> None:
+    model, processor, _ = student
+    frames, items = FrameReader(micro_store, cfg.image_size), micro_store.selection("test")
+    for control in (None, "shuffled_prefix", "candidate_only"):
+        for mode, item in zip(("record", "answer"), items, strict=False):
+            sample = item_sample("cot", frames, cfg, control, mode, item)
+            ids = encode(sample, processor, 1500).input_ids
+            assert ask(server, cfg, sample).model_extra["prompt_token_ids"] == ids
+
+    # A server with adapters responds as the student. Without them, the probabilities differ.
+    sample = item_sample("cot", frames, cfg, None, "answer", items[0])
+    response = ask(server, cfg, sample, "adapter", logprobs=True, top_logprobs=10)
+    top = response.choices[0].logprobs.content[0].top_logprobs
+    tokens = [int(each.token.removeprefix("token_id:")) for each in top]
+    inputs = Collator(processor, cfg.max_length)([sample])
+    with torch.no_grad():
+        adapted = model(**inputs).logits[0, -1].log_softmax(dim=-1)[tokens]
+        with model.disable_adapter():
+            plain = model(**inputs).logits[0, -1].log_softmax(dim=-1)[tokens]
+    served = [each.logprob for each in top]
+    assert served == pytest.approx(adapted.tolist(), abs=1e-3)
+    assert served != pytest.approx(plain.tolist(), abs=0.1)
 
 
 def test_constrained_responses_of_a_served_model_are_records(
@@ -116,85 +104,28 @@ def test_constrained_responses_of_a_served_model_are_records(
 ) -> None:
     caplog.set_level("INFO")
     settings = SelectCommand(
-        benchmark=micro, student=cfg, store=str(micro_store.folder.parent), limit=4,
-        modes=["answer", "constrained"], server=ServerConfig(url=server.url, model="tiny"),
+        benchmark=micro, student=replace(cfg, max_new_tokens=200, temperature=0.7), limit=4,
+        store=str(micro_store.folder.parent), modes=["answer", "constrained"],
+        server=ServerConfig(url=server.url, model="tiny"),
     )  # fmt: skip
-    metrics = select.main.__wrapped__(settings, Run("served", tmp_path))
+    run = new_run(tmp_path)
+    metrics = select.main.__wrapped__(settings, run)
     assert "applies the JSON schema as response_format" in caplog.text
     # The server has the same tokens as a local model.
     assert "prompts are not compared" not in caplog.text
     assert "reads prompts differently" not in caplog.text
-    rows = list(read_json_lines(tmp_path / "answers.jsonl"))
-    assert rows[0]["asked"]["model"]["root"] == cfg.model
     # A model with random weights may write texts up to the token limit. The choice precedes them.
     assert metrics["constrained_parse_rate"] == 1
-    for row in [r for r in rows if r.get("mode") == "constrained"][1:]:
+    asked, *rows = read_json_lines(run.folder / "answers.jsonl")
+    assert asked["asked"]["model"]["root"] == cfg.model
+    for row in [r for r in rows if r["mode"] == "constrained" and "text" in r]:
         found = parse_choice(row["text"])
         assert found.letter == row["letter"]
         assert row["valid"] or (row["truncated"] and found.reason is Reason.CUT_OFF)
-        names = [
-            f'"{name}"'
-            for name in build_record_schema()["properties"]
-            if f'"{name}"' in row["text"]
-        ]
-        assert names == sorted(names, key=row["text"].index)
-
-
-def test_concurrent_sampled_responses_depend_on_their_own_seeds(
-    server, cfg, micro, micro_store, tmp_path
-) -> None:
-    sampled = replace(cfg, temperature=0.7, max_new_tokens=16)
-    command = SelectCommand(
-        benchmark=micro, student=sampled, store=str(micro_store.folder.parent), modes=["answer"],
-        server=ServerConfig(url=server.url, model="tiny", unreachable_timeout=5),
-    )  # fmt: skip
-
-    def answers(name: str, **settings: object) -> dict[str, str]:
-        folder = tmp_path / name
-        folder.mkdir()
-        select.main.__wrapped__(replace(command, **settings), Run(name, folder))
-        rows = list(read_json_lines(folder / "answers.jsonl"))
-        return {row["item_id"]: row["text"] for row in rows if "item_id" in row}
-
-    texts = answers("first")
-    # So many concurrent requests have more prompt tokens than the server processes in one step.
-    assert len(texts) >= command.server.concurrency
-    assert len(set(texts.values())) > len(texts) // 2
-    assert answers("again") == texts
-    assert answers("other", seed=1) != texts
-
-
-def test_a_server_with_adapters_responds_as_the_student(
-    server, cfg, base, merged, micro_store
-) -> None:
-    inputs = cfg, micro_store, micro_store.selection("test")[0]
-    tokens, served = served_scores(server, "adapter", *inputs)
-    assert served == pytest.approx(local_scores(merged, *inputs)[tokens], abs=1e-3)
-    # Without the adapters the probabilities differ.
-    assert served != pytest.approx(local_scores(base, *inputs)[tokens], abs=0.1)
-
-
-def served_scores(server, model, cfg, store, item) -> tuple[list[int], list[float]]:
-    """The most likely first tokens of an answer, and their log-probabilities."""
-    sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
-    request = sampling_fields(cfg, 1)
-    request["extra_body"] |= qwen_fields(cfg, sample.clip)
-    request |= {"logprobs": True, "top_logprobs": 10}
-    request["extra_body"]["return_tokens_as_token_ids"] = True
-    client = openai.OpenAI(base_url=server.url, api_key="none")
-    response = client.chat.completions.create(
-        model=model, messages=build_messages(sample), **request
-    )
-    top_tokens = response.choices[0].logprobs.content[0].top_logprobs
-    tokens = [int(top.token.removeprefix("token_id:")) for top in top_tokens]
-    return tokens, [top.logprob for top in top_tokens]
-
-
-def local_scores(folder, cfg, store, item) -> np.ndarray:
-    """The log-probability of every first token, computed with transformers alone."""
-    sample = item_sample("cot", FrameReader(store, cfg.image_size), cfg, None, "answer", item)
-    processor = load_processor(folder, cfg)
-    model = AutoModelForImageTextToText.from_pretrained(folder, dtype="auto").eval()
-    with torch.no_grad():
-        logits = model(**Collator(processor, cfg.max_length)([sample])).logits
-    return logits[0, -1].log_softmax(dim=-1).numpy()
+    # Concurrent responses depend on their own seeds.
+    again = new_run(tmp_path / "again")
+    select.main.__wrapped__(replace(settings, modes=["answer"]), again)
+    texts = {row["text"] for row in rows if row["mode"] == "answer" and "text" in row}
+    assert len(texts) == 4
+    _, *repeated = read_json_lines(again.folder / "answers.jsonl")
+    assert {row["text"] for row in repeated} == texts

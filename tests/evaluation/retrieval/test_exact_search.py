@@ -3,8 +3,6 @@ vector per frame, and for several vectors by late interaction."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from sentence_transformers.util.similarity import maxsim
@@ -13,7 +11,6 @@ from dynapix.evaluation.embedders.cache import pad_rows
 from dynapix.evaluation.retrieval import exact_search
 from dynapix.evaluation.retrieval.exact_search import (
     LATE_GRID,
-    Ranks,
     exact_ranks,
     pair_scores,
     score,
@@ -48,145 +45,76 @@ def rows_of(vectors: list[np.ndarray], more: int = 0) -> np.ndarray:
     return np.pad(rows, ((0, 0), (0, more * LATE_WIDTH)))
 
 
-@dataclass
-class Case:
-    """Rows of queries and frames, in which every third frame equals the first."""
-
-    queries: np.ndarray
-    frames: np.ndarray
-    widths: tuple[int, ...]
-    late: bool
-
-    def ranks(self, frames: np.ndarray, targets: np.ndarray, size: int = FRAMES) -> Ranks:
-        """Rank frames in parts of a size. `targets` are their indices of the targets."""
-        parts = [frames[k : k + size] for k in range(0, len(frames), size)]
-        return exact_ranks(self.queries, frames[targets], parts, self.widths, late=self.late)
-
-
-@pytest.fixture(params=["single", "late"])
-def case(request) -> Case:
-    if request.param == "single":
-        queries, frames = embeddings(QUERIES), embeddings(FRAMES, 1)
-        frames[::3] = frames[0]
-        return Case(queries, frames, WIDTHS, late=False)
-    vectors = random_vectors(FRAMES, 9, 1)
-    vectors = [vectors[0] if k % 3 == 0 else v for k, v in enumerate(vectors)]
-    queries = rows_of(random_vectors(QUERIES, 20, 0))
-    return Case(queries, rows_of(vectors), (LATE_WIDTH,), late=True)
-
-
-def same(one: Ranks, two: Ranks) -> bool:
-    return np.array_equal(one.above, two.above) and np.array_equal(one.tied, two.tied)
-
-
-def exact_cosines(queries: np.ndarray, database: np.ndarray, width: int) -> np.ndarray:
-    """Cosines (queries, frames) by their definition, in double precision."""
-    units = [
-        a[:, :width].astype(float) / np.linalg.norm(a[:, :width].astype(float), axis=1)[:, None]
-        for a in (queries, database)
-    ]
-    return units[0] @ units[1].T
-
-
-@pytest.mark.parametrize(("size", "block", "cells"), [(1, 9, 1), (7, 64, 2**10), (299, 1, 2**23)])
-def test_blocks_do_not_change_ranks(monkeypatch, case, size, block, cells) -> None:
-    expected = case.ranks(case.frames, TARGETS)
-    monkeypatch.setattr(exact_search, "BLOCK_ENTRIES", block * case.frames.shape[1])
-    monkeypatch.setattr(exact_search, "BLOCK_PRODUCTS", cells)
-    assert same(case.ranks(case.frames, TARGETS, size), expected)
-
-
-def test_the_order_of_the_database_does_not_change_ranks(case) -> None:
-    places = np.random.default_rng(3).permutation(FRAMES)
-    moved = case.ranks(case.frames[places], np.argsort(places)[TARGETS], 13)
-    assert same(moved, case.ranks(case.frames, TARGETS))
-
-
-def test_equal_frames_tie(case) -> None:
-    found = case.ranks(case.frames, TARGETS)
-    copies = TARGETS % 3 == 0
-    assert (found.tied[:, copies] == FRAMES // 3 - 1).all()
-    assert not found.tied[:, ~copies].any()
-    # Each copy of the database adds as many frames above a target.
-    double = case.ranks(np.concatenate([case.frames, case.frames[::-1]]), TARGETS, 101)
-    assert np.array_equal(double.above, 2 * found.above)
-
-
 def score_rows(
     queries: np.ndarray, frames: np.ndarray, width: int, late: bool = False
 ) -> np.ndarray:
     return score(to_grid(queries, width, late), to_grid(frames, width, late))
 
 
-def test_scores_of_pairs_and_of_blocks_are_bit_identical(case) -> None:
-    frames = case.frames[TARGETS]
-    for width in case.widths:
-        block = score_rows(case.queries, frames, width, case.late)
-        assert block.dtype == np.float32
-        pairs = pair_scores(case.queries, frames, width, case.late)
-        assert np.array_equal(pairs, np.diagonal(block))
-        for rows in (slice(3, 4), slice(9, 22), np.array([5, 38, 2])):
-            part = score_rows(case.queries[rows], frames, width, case.late)
-            assert np.array_equal(part, block[rows])
+def exact_cosines(queries: np.ndarray, database: np.ndarray, width: int) -> np.ndarray:
+    """Cosines (queries, frames) by their definition, in double precision."""
+    rows = [a[:, :width].astype(float) for a in (queries, database)]
+    one, two = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in rows)
+    return one @ two.T
 
 
-@pytest.mark.parametrize("width", WIDTHS)
-def test_scores_are_cosines_to_fp32(width) -> None:
-    queries, database = embeddings(30), embeddings(50, 1)
-    scores = score_rows(queries, database, width, late=False)
-    np.testing.assert_allclose(scores, exact_cosines(queries, database, width), atol=6e-8)
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize(("size", "block", "cells"), [(1, 9, 1), (7, 64, 2**10), (299, 1, 2**23)])
+def test_order_and_blocks_do_not_change_ranks(monkeypatch, late, size, block, cells) -> None:
+    """Every third frame equals the first. These tie only if scores have the same bits in any block
+    and as those of a query and its target alone."""
+    if late:
+        queries, frames = rows_of(random_vectors(QUERIES, 20, 0)), random_vectors(FRAMES, 9, 1)
+        frames = rows_of([frames[k if k % 3 else 0] for k in range(FRAMES)])
+    else:
+        queries, frames = embeddings(QUERIES), embeddings(FRAMES, 1)
+        frames[::3] = frames[0]
+    widths = (LATE_WIDTH,) if late else WIDTHS
+    expected = exact_ranks(queries, frames[TARGETS], [frames], widths, late=late)
+    copies = TARGETS % 3 == 0
+    assert (expected.tied[:, copies] == FRAMES // 3 - 1).all()
+    assert not expected.tied[:, ~copies].any()
+    monkeypatch.setattr(exact_search, "BLOCK_ENTRIES", block * frames.shape[1])
+    monkeypatch.setattr(exact_search, "BLOCK_PRODUCTS", cells)
+    moved = np.random.default_rng(3).permutation(frames)
+    parts = [moved[k : k + size] for k in range(0, FRAMES, size)]
+    found = exact_ranks(queries, frames[TARGETS], parts, widths, late=late)
+    assert np.array_equal(found.above, expected.above)
+    assert np.array_equal(found.tied, expected.tied)
 
 
-def test_ranks_equal_those_of_a_score_matrix() -> None:
-    queries, database = embeddings(QUERIES), embeddings(FRAMES, 1)
-    found = exact_ranks(queries, database[TARGETS], [database], WIDTHS)
+def test_scores_are_cosines_and_ranks_those_of_a_score_matrix() -> None:
+    queries, database = embeddings(QUERIES + 1), embeddings(FRAMES, 1)
+    # An embedding of zeros ties with all frames.
+    queries[-1] = 0
+    found = exact_ranks(queries, database[[*TARGETS, 0]], [database], WIDTHS)
+    assert (found.above[:, -1] == 0).all()
+    assert (found.tied[:, -1] == FRAMES - 1).all()
     for k, width in enumerate(WIDTHS):
-        above, tied = count_ranks(exact_cosines(queries, database, width), TARGETS)
+        cosines = exact_cosines(queries[:-1], database, width)
+        scores = score_rows(queries[:-1], database, width)
+        np.testing.assert_allclose(scores, cosines, atol=6e-8)
+        above, tied = count_ranks(cosines, TARGETS)
         # A few frames tie with the target in fp32 but not in double precision.
-        assert np.abs(found.above[k] - above).max() <= 1
-        assert (found.above[k] + found.tied[k] >= above).all()
-        assert (found.tied[k] >= tied).all()
-    assert found.tied.sum() < 5
+        own_above, own_tied = found.above[k, :-1], found.tied[k, :-1]
+        assert np.abs(own_above - above).max() <= 1
+        assert (own_above + own_tied >= above).all()
+        assert (own_tied >= tied).all()
+    assert found.tied[:, :-1].sum() < 5
 
 
 def test_twins_are_compared_with_targets_at_each_width() -> None:
     queries, database = embeddings(400), embeddings(800, 1)
-    targets, twins = database[:400], database[400:]
-
-    def share(rows: np.ndarray) -> np.ndarray:
-        return exact_ranks(rows, targets, [database], WIDTHS, twins).twin_above
-
-    assert (share(targets) == 0).all(), "embeddings of the counterfactual frames"
-    assert (share(twins) == 1).all(), "embeddings of the factual frames"
-    assert (share(np.zeros_like(queries)) == 0.5).all()
+    queries[0], queries[1], queries[2] = database[0], database[401], 0
+    found = exact_ranks(queries, database[:400], [database], WIDTHS, database[400:]).twin_above
+    # The embedding of the counterfactual frame, that of the factual frame, and one of zeros.
+    assert found[:, :3].tolist() == [[0, 1, 0.5]] * len(WIDTHS)
     for k, width in enumerate(WIDTHS):
-        scores = exact_cosines(queries, database, width)
-        clear = np.abs(gap := np.diagonal(scores[:, 400:]) - np.diagonal(scores)) > 1e-6
-        assert np.array_equal(share(queries)[k][clear], (gap > 0)[clear])
-    assert exact_ranks(queries, targets, [database], WIDTHS).twin_above is None
-
-
-def test_products_on_the_grid_are_exact() -> None:
-    """The products equal those of Python's integers, also if all products of entries are
-    positive."""
-    rng = np.random.default_rng(0)
-    rows = rng.standard_normal((4, 4096))
-    rows[1], rows[2] = 1.0, np.abs(rows[2])
-    rows[3, 1:] = 0
-    grid = to_grid(rows.astype(np.float32), 4096)
-    products = grid @ grid.T
-    integers = [[int(x) for x in row] for row in grid.tolist()]
-    for i, a in enumerate(integers):
-        for j, b in enumerate(integers):
-            assert int(products[i, j]) == sum(x * y for x, y in zip(a, b, strict=True))
-
-
-def test_an_embedding_of_zeros_ties_with_all_frames() -> None:
-    database = embeddings(10)
-    database[4] = 0
-    found = exact_ranks(np.zeros((1, 96), np.float32), database[:1], [database], WIDTHS)
-    assert (found.above == 0).all()
-    assert (found.tied == 9).all()
+        scores = exact_cosines(queries[3:], database, width)
+        rows = np.arange(397)
+        gap = scores[rows, rows + 403] - scores[rows, rows + 3]
+        clear = np.abs(gap) > 1e-6
+        assert np.array_equal(found[k, 3:][clear], (gap > 0)[clear])
 
 
 def test_late_scores_agree_with_the_librarys_in_any_order_of_the_vectors() -> None:
@@ -200,8 +128,11 @@ def test_late_scores_agree_with_the_librarys_in_any_order_of_the_vectors() -> No
     assert padded.vectors == sum(map(len, frames)), "padding is not counted"
 
 
-def test_sums_of_up_to_8000_vectors_are_exact() -> None:
-    """All vectors are equal, which gives the largest possible sum."""
+def test_the_largest_sums_are_exact() -> None:
+    """Equal vectors with equal entries give the largest sums."""
+    grid = to_grid(np.ones((1, 4096), np.float32), 4096)
+    exact = sum(int(x) ** 2 for x in grid[0])
+    assert int((grid @ grid.T)[0, 0]) == exact < 2**53
     vector = np.full((1, LATE_WIDTH), LATE_WIDTH**-0.5, np.float32)
     steps = np.rint(vector.astype(np.float64) * LATE_GRID).astype(object)
     for count in (1, 7999, 8000):
