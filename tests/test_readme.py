@@ -16,11 +16,13 @@ import dynapix
 from dynapix.conf.compose import compose, config_name
 from dynapix.conf.multirun.sweep import Sweep
 from dynapix.conf.runs import TRAINER_FOLDERS, run_name
-from tests.conf.schemas import SCHEMAS
+from tests.conf.schemas import SCHEMAS, distinct
 from tests.evaluation.chat_server import ChatServer
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+LONGEST_README = 150
+"""Maximum number of lines of the README."""
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINE = re.compile(r"^    (?:accelerate launch .*|python) -m (\S+)(.*)$", re.MULTILINE)
 LINES = sorted({line for page in PAGES for line in LINE.findall(page.read_text())})
@@ -34,31 +36,28 @@ def run_folder(command: str, overrides: list[str]) -> str:
     return f"{config_name(command)}/{run_name(settings.get('run'), overrides)}"
 
 
-def test_named_modules_exist() -> None:
-    for page in PAGES:
-        for module in re.findall(r"python -m\s+([\w.]+)", page.read_text()):
-            is_script = module.startswith(("benchmarks.", "research."))
-            path = ROOT / f"{module.replace('.', '/')}.py"
-            is_program = (ROOT / module.replace(".", "/") / "__main__.py").exists()
-            is_command = module.removeprefix("dynapix.") in SCHEMAS or is_program
-            assert path.exists() if is_script else is_command, f"{page.name}: {module}"
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_what_a_page_names_exists(page: Path) -> None:
+    text = page.read_text()
+    for module in re.findall(r"python -m\s+([\w.]+)", text):
+        is_script = module.startswith(("benchmarks.", "research."))
+        path = ROOT / f"{module.replace('.', '/')}.py"
+        is_program = (ROOT / module.replace(".", "/") / "__main__.py").exists()
+        is_command = module.removeprefix("dynapix.") in SCHEMAS or is_program
+        assert path.exists() if is_script else is_command, module
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert {*re.findall(r"(?:`| {4}|&& )make ([a-z-]+)", text)} <= {*targets}
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", text):
+        assert (page.parent / target).exists(), target
+    assert page.name != "README.md" or len(text.splitlines()) <= LONGEST_README
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("command", "overrides"), COMMANDS, ids=lambda v: str(v).replace("/", "-"))
+@pytest.mark.parametrize(("command", "overrides"), distinct(COMMANDS), ids=str)
 def test_settings_of_a_documented_command_are_valid(command: str, overrides: list[str]) -> None:
     check = Sweep if "-m" in overrides else compose
     settings = [o.replace("=RUN", "=checkpoints/sft/exp-cot") for o in overrides if o != "-m"]
     check(command, SCHEMAS[command], settings)
-
-
-def test_named_make_targets_exist() -> None:
-    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    named = {
-        t for page in PAGES for t in re.findall(r"(?:`| {4}|&& )make ([a-z-]+)", page.read_text())
-    }
-    assert len(named) > 5
-    assert named <= targets
 
 
 def test_named_runs_are_produced_by_other_commands() -> None:
@@ -77,12 +76,6 @@ def test_named_runs_are_produced_by_other_commands() -> None:
                 named.add(folder if folder != value else f"{TRAINER_FOLDERS[product]}/{value}")
     assert len(named) > 3
     assert named <= produced
-
-
-def test_link_targets_exist() -> None:
-    for page in PAGES:
-        for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text()):
-            assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
 def test_python_examples_run(micro_store, tmp_path, monkeypatch, capsys) -> None:
@@ -107,10 +100,6 @@ def test_python_examples_run(micro_store, tmp_path, monkeypatch, capsys) -> None
     assert len(server.requests) == len(micro_store.selection("test"))
     report = json.loads((tmp_path / "runs" / "MODEL" / "report.json").read_text())
     assert report["rows"][0]["parse_rate"] == 1
-
-
-def test_the_readme_fits_its_length() -> None:
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
 
 
 @pytest.mark.slow

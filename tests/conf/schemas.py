@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterable, Iterator
 from dataclasses import Field, fields, is_dataclass
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -41,3 +42,17 @@ def walk_settings(schema: type, group: str = "") -> Iterator[tuple[str, Field, A
             yield from walk_settings(groups[0], f"{key}.")
         else:
             yield key, field, hint
+
+
+def parse_line(line: str) -> tuple[str, list[str]]:
+    """Return the command and the overrides of a line `python -m COMMAND ...`."""
+    python, m, command, *overrides = shlex.split(line)
+    assert (python, m) == ("python", "-m")
+    return command, overrides
+
+
+def distinct(commands: Iterable[tuple[str, list[str]]]) -> list[tuple[str, list[str]]]:
+    """Return the commands that differ in more than the names of their runs and models."""
+    names = ("run=", "model=", "matcher.model=")
+    found = {(c, *(o for o in sorted(own) if not o.startswith(names))): own for c, own in commands}
+    return [(command, overrides) for (command, *_), overrides in found.items()]

@@ -1,4 +1,4 @@
-"""The toy command as a process: the files of its run, its exit status and its error messages."""
+"""The toy command: the files of its run, its exit status and its error messages."""
 
 import importlib
 import json
@@ -8,6 +8,7 @@ import sys
 import pytest
 import yaml
 
+from dynapix.conf.errors import SettingsError, UserError
 from dynapix.conf.failures import report_failures
 from tests.children import run_child
 from tests.conf import toy
@@ -16,24 +17,36 @@ from tests.conf.toy_process import run_toy
 RESUME = "fix this and run the same command again to resume  [file-error]\n"
 
 
+@pytest.fixture
+def start(monkeypatch, folder):
+    """Starts the command in this process, in an empty folder, with some arguments."""
+    monkeypatch.chdir(folder)
+
+    def call(*arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["toy", *arguments])
+        toy.main()
+
+    return call
+
+
 def test_run_writes_its_record_and_can_be_repeated(folder):
-    done = run_toy(folder, "x=2", "workers=1")
-    assert (done.returncode, done.stdout) == (0, "")
-    assert done.stderr == "x is 2.0 in checkpoints/toy/x-2\n"
+    for _ in range(2):
+        done = run_toy(folder, "x=2", "workers=1")
+        assert (done.returncode, done.stdout) == (0, "")
+        assert done.stderr == "x is 2.0 in checkpoints/toy/x-2\n"
     run = folder / "checkpoints/toy/x-2"
     files = {".lock", "config.yaml", "metrics.json", "run.json", "run.log"}
     assert {p.name for p in run.iterdir()} == files
     assert json.loads((run / "metrics.json").read_text())["loss"] == 4
     assert json.loads((run / "run.json").read_text())["overrides"] == ["x=2", "workers=1"]
     assert "x is 2.0" in (run / "run.log").read_text()
-    assert run_toy(folder, "x=2").returncode == 0
-    refused = run_toy(folder, "x=3", "run=x-2")
-    assert refused.returncode == 2
-    assert "[other-settings]" in refused.stderr
 
 
 def test_unfinished_run_without_results_accepts_other_settings(folder):
-    assert run_toy(folder, "end=mistake", "run=one").returncode == 1
+    failed = run_toy(folder, "end=mistake", "run=one")
+    assert failed.returncode == 1
+    assert failed.stderr.endswith("error: this end is a mistake: set end=well  [toy-mistake]\n")
+    assert "Traceback" not in failed.stderr
     assert run_toy(folder, "x=3", "run=one").returncode == 0
     run = folder / "checkpoints/toy/one"
     assert json.loads((run / "metrics.json").read_text())["loss"] == 9
@@ -42,56 +55,18 @@ def test_unfinished_run_without_results_accepts_other_settings(folder):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "status", "end"),
+    ("error", "status", "message"),
     [
-        (["end=mistake"], 1, "error: this end is a mistake: set end=well  [toy-mistake]\n"),
-        (["end=disk"], 1, f"error: some/file: No space left on device; {RESUME}"),
-        (["end=interrupt"], 130, "interrupted; run the same command again to resume\n"),
-        (["+teacher.sed=1"], 2, "did you mean teacher.seed?  [unknown-key]\n"),
-        (["checkpoints=toy.py"], 1, f"error: toy.py/toy/default: Not a directory; {RESUME}"),
+        (UserError("one\ntwo", "a-code"), 1, "error: one  [a-code]\nerror: two  [a-code]\n"),
+        (SettingsError("x=1"), 2, "error: x=1  [invalid-setting]\n"),
+        (OSError(28, "Full", "some/file"), 1, f"error: some/file: Full; {RESUME}"),
+        (KeyboardInterrupt(), 130, "interrupted; run the same command again to resume\n"),
     ],
 )
-def test_failed_command_prints_no_traceback(folder, arguments, status, end):
-    done = run_toy(folder, *arguments)
-    assert done.returncode == status
-    assert done.stderr.endswith(end)
-    assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code"),
-    [
-        (["-m", "--cfg", "job"], "conflicting-options"),
-        (["--resolve"], "conflicting-options"),
-        (["--cfg", "job", "--package", "x"], "unknown-key"),
-        (["+sweep=lr_rank"], "needs-multirun"),
-        (["--config-dir", "folder"], "unsupported-option"),
-        (["-cn", "other"], "unsupported-option"),
-    ],
-)
-def test_invalid_options_are_named(monkeypatch, capsys, arguments, code):
-    monkeypatch.setattr(sys, "argv", ["toy", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        toy.main()
-    assert ended.value.code == 2
-    assert capsys.readouterr().err.endswith(f"[{code}]\n")
-
-
-def test_a_log_that_cannot_be_opened_is_named(folder):
-    (folder / "checkpoints/toy/default/run.log").mkdir(parents=True)
-    done = run_toy(folder)
-    log = folder.resolve() / "checkpoints/toy/default/run.log"
-    assert (done.returncode, done.stderr) == (1, f"error: {log}: Is a directory; {RESUME}")
-
-
-@pytest.mark.parametrize("closed", [">&-", "<&- >&- 2>&-"])
-def test_closed_streams_change_nothing(folder, closed):
-    done = run_child(["bash", "-c", f"{sys.executable} -m toy {closed}"], cwd=folder)
-    assert done.returncode == 0
-    assert "Traceback" not in done.stderr
-    run = folder / "checkpoints/toy/default"
-    assert json.loads((run / "metrics.json").read_text())["loss"] == 1
-    assert (run / ".lock").read_bytes() == b""
+def test_problem_of_the_user_is_one_message(capsys, error, status, message):
+    with pytest.raises(SystemExit) as ended, report_failures():
+        raise error
+    assert (ended.value.code, capsys.readouterr().err) == (status, message)
 
 
 def test_library_error_on_a_full_disk_is_a_failed_write(monkeypatch, tmp_path, capsys):
@@ -105,38 +80,58 @@ def test_library_error_on_a_full_disk_is_a_failed_write(monkeypatch, tmp_path, c
     assert capsys.readouterr().err == f"error: {tmp_path}: No space left on device; {RESUME}"
 
 
-def test_bug_keeps_its_traceback(folder):
-    done = run_toy(folder, "end=bug")
-    assert done.returncode == 1
-    assert "Traceback" in done.stderr
-    assert done.stderr.endswith("ValueError: a bug\n")
+@pytest.mark.parametrize(
+    ("arguments", "status", "code"),
+    [
+        (["-m", "--cfg", "job"], 2, "conflicting-options"),
+        (["--resolve"], 2, "conflicting-options"),
+        (["--cfg", "job", "--package", "x"], 2, "unknown-key"),
+        (["+sweep=lr_rank"], 2, "needs-multirun"),
+        (["--config-dir", "folder"], 2, "unsupported-option"),
+        (["checkpoints=toy.py"], 1, "file-error"),
+    ],
+)
+def test_invalid_arguments_are_named(start, capsys, arguments, status, code):
+    with pytest.raises(SystemExit) as ended:
+        start(*arguments)
+    assert ended.value.code == status
+    assert capsys.readouterr().err.endswith(f"[{code}]\n")
 
 
-def test_help_describes_the_settings_and_imports_nothing_heavy(folder):
-    script = (
-        "import runpy, sys; sys.argv = ['toy', '--help', 'all', 'x=5']\n"
-        "runpy.run_module('toy', run_name='__main__', alter_sys=True)\n"
-        "heavy = {'torch', 'transformers', 'pybullet', 'matplotlib', 'pandas'} & set(sys.modules)\n"
-        "assert not heavy, heavy"
-    )
-    done = run_child([sys.executable, "-c", script], check=True, cwd=folder)
-    assert "A toy that squares x." in done.stdout
-    assert "teacher: qwen3_32b, template" in done.stdout
-    lines = [line.split() for line in done.stdout.splitlines()]
+def test_a_log_that_cannot_be_opened_is_named(folder):
+    (folder / "checkpoints/toy/default/run.log").mkdir(parents=True)
+    done = run_toy(folder)
+    log = folder.resolve() / "checkpoints/toy/default/run.log"
+    assert (done.returncode, done.stderr) == (1, f"error: {log}: Is a directory; {RESUME}")
+
+
+def test_closed_streams_change_nothing(folder):
+    done = run_child(["bash", "-c", f"{sys.executable} -m toy <&- >&- 2>&-"], cwd=folder)
+    assert done.returncode == 0
+    run = folder / "checkpoints/toy/default"
+    assert json.loads((run / "metrics.json").read_text())["loss"] == 1
+    assert (run / ".lock").read_bytes() == b""
+
+
+@pytest.mark.parametrize("arguments", [("x=5", "--help", "all"), ("--help", "all", "x=5")])
+def test_help_describes_the_settings(start, folder, capsys, arguments):
+    start(*arguments)
+    shown = capsys.readouterr().out
+    assert "teacher: qwen3_32b, template" in shown
+    lines = [line.split() for line in shown.splitlines()]
     assert ["x", "=", "5.0", "Number", "to", "square."] in lines
+    start("--help")
+    brief = capsys.readouterr().out
+    assert "--help all lists the other" in brief
+    assert "Number to square" not in brief
     assert not (folder / "checkpoints").exists()
-    brief = run_child([sys.executable, "-m", "toy", "--help"], check=True, cwd=folder)
-    assert "--help all lists the other" in brief.stdout
-    assert "Number to square" not in brief.stdout
 
 
-def test_options_may_stand_among_the_overrides(folder):
-    for arguments in (("x=5", "--cfg", "job", "workers=1"), ("--cfg", "job", "x=5", "workers=1")):
-        done = run_toy(folder, *arguments)
-        settings = yaml.safe_load(done.stdout)
-        assert (settings["x"], settings["workers"]) == (5, 1)
-    for arguments in (("x=5", "--help", "all"), ("--help", "all", "x=5")):
-        assert "x = 5.0" in run_toy(folder, *arguments).stdout
+@pytest.mark.parametrize("arguments", ["x=5 --cfg job workers=1", "--cfg job x=5 workers=1"])
+def test_options_may_stand_among_the_overrides(start, capsys, arguments):
+    start(*arguments.split())
+    settings = yaml.safe_load(capsys.readouterr().out)
+    assert (settings["x"], settings["workers"]) == (5, 1)
 
 
 def test_help_can_be_piped_to_head(folder):

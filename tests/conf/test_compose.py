@@ -3,11 +3,7 @@
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from dynapix.conf.compose import (
-    compose,
-    compose_config,
-    open_hydra,
-)
+from dynapix.conf.compose import compose, compose_config, open_hydra
 from dynapix.conf.errors import SettingsError
 from dynapix.conf.multirun.sweep import Sweep
 from dynapix.conf.schema import BuildCommand, ContrastiveCommand, ExportCommand, Quota, SftCommand
@@ -18,13 +14,9 @@ from tests.user_errors import raises_user_error
     ("override", "suggested"),
     [
         ("train.lrr=1", "train.lr"),
-        ("+train.lrr=1", "train.lr"),
         ("++train.lrr=1", "train.lr"),
         ("lr=1", "train.lr"),
-        ("student.lr=1", "train.lr"),
-        ("student.lora.rnk=8", "student.lora.rank"),
         ("studnet=tiny", "student"),
-        ("sed=3", "seed"),
         ("benchmark.selection.time.in_1s.trian=3", "benchmark.selection.time.in_1s.train"),
         ("+expp=cot", "+exp"),
         ("student={lrr: 3}", "train.lr"),
@@ -39,14 +31,11 @@ def test_unknown_key_suggests_the_nearest(override, suggested):
     ("override", "code", "contains"),
     [
         ("train.lr=abc", "invalid-setting", "train.lr=abc"),
-        ("seed=null", "invalid-setting", "seed=null"),
         ("train=1", "invalid-setting", "train=1"),
         ("retriever.widths=[1", "invalid-setting", "retriever.widths=[1"),
-        ("train.lr=1,2", "invalid-setting", "train.lr=1,2"),
         ("student=nope", "invalid-setting", ("student/nope", "qwen3_vl_8b")),
         ("+exp=nope", "invalid-setting", ("exp/nope", "answer_only")),
         ("exp=cot", "invalid-setting", "+exp=cot"),
-        ("+student=tiny", "invalid-setting", "student"),
         ("retriever=tiny", "unknown-key", "retriever"),
         ("+exp=late_interaction", "unknown-key", "exp/late_interaction"),
         ("student.name=???", "missing-setting", "student.name"),
@@ -57,24 +46,16 @@ def test_unknown_key_suggests_the_nearest(override, suggested):
         ("benchmark.selection.event.new.train=3", "unknown-key", "benchmark.selection.event.new"),
         ("+benchmark.selection.event={new: {trian: 3}}", "unknown-key", "event.new.trian"),
         ("benchmark.selection.event={}", "invalid-setting", "event={}: an empty dict"),
-        ("++benchmark.selection={event: { }}", "invalid-setting", "an empty dict"),
         ("student=null", "invalid-setting", "student=null"),
-        ("+exp=null", "invalid-setting", "+exp=null"),
-        ("student=3", "invalid-setting", "student=3"),
-        ("hydra/launcher=null", "invalid-setting", "hydra/launcher=null"),
         ("workers=0", "invalid-setting", "workers=0"),
         ("benchmark.height=129", "invalid-setting", "benchmark.height=129"),
-        ("train.keep_checkpoints=0", "invalid-setting", "train.keep_checkpoints=0"),
-        ("train.max_steps=0", "invalid-setting", "train.max_steps=0"),
         ("train.lr=inf", "invalid-setting", "train.lr=inf"),
-        ("train.epochs=nan", "invalid-setting", "train.epochs=nan"),
         ("benchmark.world.camera.position=[nan,0,2]", "invalid-setting", "camera.position"),
         ("train.report_to=wandb", "invalid-setting", ("train.report_to=wandb", "[VALUE]")),
         ("run=a=b", "invalid-setting", ("run=a=b", "quotes")),
         ("checkpoints=", "invalid-setting", "checkpoints= is empty"),
         ("run=", "invalid-setting", "run="),
         ("run=../../elsewhere", "invalid-setting", "run=../../elsewhere"),
-        ("run=/elsewhere", "invalid-setting", "run=/elsewhere"),
         ("run=checkpoints/sft/first", "invalid-setting", "run=first"),
         ("benchmark.name=../elsewhere", "invalid-setting", "benchmark.name=../elsewhere"),
         ("world.camera.fov=3", "unknown-key", "@package benchmark.world"),
@@ -96,7 +77,7 @@ def test_all_failed_checks_are_reported_together():
     ]
 
 
-@pytest.mark.parametrize("url", ["localhost:8000/v1", "http://h:P/v1", "http://h h/v1"])
+@pytest.mark.parametrize("url", ["localhost:8000/v1", "http://h:P/v1"])
 def test_server_address_must_be_a_url(url):
     with raises_user_error("invalid-setting", contains=f"teacher.url={url}"):
         compose("train.sft", SftCommand, [f"teacher.url='{url}'", "teacher=qwen3_32b"])
@@ -128,22 +109,15 @@ def test_dict_setting_takes_new_names():
     assert compose("data.build", BuildCommand, new).benchmark.selection.event["new"] == Quota(3)
 
 
-def test_keys_of_hydra_are_accepted():
-    compose("train.sft", SftCommand, ["hydra.verbose=true", "hydra/launcher=basic"])
-
-
 @pytest.mark.parametrize(
     ("overrides", "code", "contains"),
     [
         (["run=a,b"], "swept-run", "run="),
         (["train.lr=range(1,1)"], "no-jobs", "no jobs"),
         (["train.lrr=1,2"], "unknown-key", "did you mean train.lr?"),
-        (["student=tiny,nope"], "invalid-setting", "student/nope"),
         (["train.lr=1e-3,abc"], "invalid-setting", "train.lr=abc"),
-        (["train.lr=1e-3,-1"], "invalid-setting", "train.lr=-1.0"),
         (["train.batch=12,16", "train.micro_batch=2,8"], "invalid-setting", "train.batch=12"),
         (["train.warmup=interval(0,1)"], "needs-search", "hydra/sweeper=optuna"),
-        (["hydra/sweeper=optuna", "train.schedule=cosine,x"], "invalid-setting", "schedule=x"),
         (["hydra/sweeper=optuna", "train.warmup=interval(0,1)"], "invalid-setting", "warmup=1"),
     ],
 )
@@ -153,9 +127,9 @@ def test_each_job_of_a_sweep_is_checked(overrides, code, contains):
 
 
 def test_valid_sweep_is_accepted():
-    sweep = ["student=tiny,qwen3_vl_8b", "+exp=cot,answer_only", "seed=range(0,2)"]
+    sweep = ["student=tiny,qwen3_vl_8b", "+exp=cot", "seed=range(0,2)", "hydra.verbose=true"]
     jobs = Sweep("train.sft", SftCommand, sweep).jobs
-    assert len(jobs) == 8
+    assert len(jobs) == 4
 
 
 def test_a_running_command_composes_further_settings() -> None:

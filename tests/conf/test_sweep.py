@@ -1,12 +1,12 @@
-"""Sweeps of the toy command, run as processes."""
+"""Sweeps and searches: their jobs, their tables, and what a killed one leaves."""
 
 import csv
 import json
 import os
-import shutil
 import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -16,20 +16,13 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from dynapix.conf.errors import import_extra
 from dynapix.conf.files import write_json
 from dynapix.conf.gpus import visible_gpus
+from dynapix.conf.multirun.launchers import Job, SubmititLauncher
 from dynapix.conf.multirun.search import STUDY_FILE, Search, distribution
-from dynapix.conf.multirun.table import (
-    JOB_FILE,
-    is_lower_better,
-    read_job,
-    read_jobs,
-    write_sweep_table,
-)
+from dynapix.conf.multirun.table import is_lower_better, read_jobs, write_sweep_table
 from tests.conf.toy_process import run_toy, start_toy
 from tests.user_errors import raises_user_error
 from tests.waiting import wait_until
 
-SEARCH = ("-m", "x=interval(0.5,3.0)", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2")
-BY_LOSS = "hydra.sweeper.metric=loss"
 TWO_GPUS = {**os.environ, "CUDA_VISIBLE_DEVICES": "0,1"}
 
 
@@ -40,20 +33,6 @@ def wait_for(*paths: Path) -> None:
 def rows(folder: Path) -> list[dict[str, str]]:
     with (folder / "sweep.csv").open() as file:
         return list(csv.DictReader(file))
-
-
-@pytest.fixture(scope="module")
-def searched(tmp_path_factory) -> Path:
-    """A working folder with the finished search `s`, which minimises the loss."""
-    folder = tmp_path_factory.mktemp("searched")
-    shutil.copy(Path(__file__).with_name("toy.py"), folder)
-    done = run_toy(folder, *SEARCH, BY_LOSS, "run=s")
-    assert done.returncode == 0, done.stderr
-    table = rows(folder / "checkpoints/toy/s")
-    best = min(table, key=lambda row: float(row["loss"]))
-    assert f"best: #{best['job']} x={best['x']}, loss" in done.stderr
-    assert all(0.5 <= float(row["x"]) <= 3 for row in table)
-    return folder
 
 
 @pytest.mark.slow
@@ -76,50 +55,39 @@ def test_sweep_survives_a_failed_job_and_resumes(folder):
     assert "x is 2.0" in (runs / "2/output.log").read_text()
     assert "x: 2.0" in (runs / "2/config.yaml").read_text()
 
-    again = run_toy(folder, *sweep, env=TWO_GPUS)
-    assert "#0 x=1 end=well: already finished, skipped" in again.stderr
-    assert "#1 x=1 end=bug: started" in again.stderr
+    shorter = run_toy(folder, "-m", "x=1", "end=well,bug", "run=s", env=TWO_GPUS)
+    assert "#0 end=well: already finished, skipped" in shorter.stderr
+    assert "#1 end=bug: started" in shorter.stderr
     assert json.loads((runs / "0/run.json").read_text())["earlier_starts"] == []
-
-    shorter = run_toy(folder, "-m", "x=1", "end=well", "run=s")
-    assert shorter.returncode == 0
-    assert [row["job"] for row in rows(runs)] == ["0"]
+    assert [row["job"] for row in rows(runs)] == ["0", "1"]
 
 
 @pytest.mark.slow
-def test_killed_sweep_ends_its_children(folder):
-    sweep = start_toy(folder, "-m", "x=1,2,3", "end=never", "run=s", env=TWO_GPUS)
-    jobs = [folder / "checkpoints/toy/s" / str(number) for number in range(3)]
-    wait_for(*(job / "output.log" for job in jobs[:2]))
+def test_killed_sweep_ends_its_children_which_had_one_gpu_each(folder):
+    sweep = start_toy(folder, "-m", "x=1,2,3", "end=never", env=TWO_GPUS)
+    # Without run=, the name of the sweep's folder is made from its overrides.
+    runs = folder / "checkpoints/toy/end-never+x-1-2-3"
+    jobs = [runs / str(number) for number in range(3)]
+    wait_until(lambda: all("GPU" in log.read_text() for log in logs(jobs[:2])))
+    assert sorted(log.read_text().split("sees GPU ")[1][0] for log in logs(jobs[:2])) == ["0", "1"]
     children = psutil.Process(sweep.pid).children(recursive=True)
     assert len(children) == 2
     sweep.send_signal(signal.SIGTERM)
     assert sweep.wait(timeout=60) == 130
     assert psutil.wait_procs(children, timeout=10)[1] == []
-    assert not list((folder / "checkpoints/toy/s").glob("*/job.json"))
+    assert not list(runs.glob("*/job.json"))
     assert [job.exists() for job in jobs] == [True, True, False]
 
 
-@pytest.mark.slow
-def test_one_job_runs_on_each_gpu(folder):
-    done = run_toy(folder, "-m", "x=1,2", "end=meet", env=TWO_GPUS)
-    assert done.returncode == 0, done.stderr
-    # Without run=, the name of the sweep's folder is made from its overrides.
-    runs = folder / "checkpoints/toy/end-meet+x-1-2"
-    logs = [(runs / f"{number}/run.log").read_text() for number in range(2)]
-    gpus = [line for log in logs for line in log.splitlines() if "sees GPU" in line]
-    assert sorted(line[-1] for line in gpus) == ["0", "1"]
-
-
-def test_a_copied_job_folder_is_not_a_job(tmp_path):
-    for name in ("0", "1", "0.bak"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / JOB_FILE).write_text('{"overrides": [], "status": "failed"}')
-    assert [job["job"] for job in read_jobs(tmp_path)] == [0, 1]
+def logs(jobs: list[Path]) -> list[Path]:
+    """Return the logs of jobs, as soon as all of these have begun to write one."""
+    found = [job / "run.log" for job in jobs]
+    wait_for(*found)
+    return found
 
 
 @pytest.mark.parametrize("rest", ["", "-1", "NoDevFiles", "-1,1"])
-@pytest.mark.parametrize("gpus", [[], ["3"], ["0", "2"], ["GPU-a1", "MIG-b2"]])
+@pytest.mark.parametrize("gpus", [[], ["0", "2"], ["GPU-a1", "MIG-b2"]])
 def test_gpus_before_the_first_invalid_one_are_visible(monkeypatch, gpus, rest):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", ", ".join([*gpus, rest]))
     assert visible_gpus() == gpus
@@ -151,72 +119,88 @@ def test_cluster_writes_the_same_table_and_run_folders(folder):
     assert "x is 2.0" in (runs / "0/output.log").read_text()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["hydra/launcher=submitit_slurm"],
-        ["hydra/launcher=submitit_local", "+hydra.launcher.nope=1"],
-    ],
-)
-def test_cluster_that_cannot_be_used_is_a_user_error(folder, options):
-    done = run_toy(folder, "-m", "x=1,2", *options)
-    assert done.stderr.startswith(f"sweep checkpoints/toy/x-1-2: 2 jobs\nerror: {options[0]}: ")
-    assert done.stderr.endswith("[cluster-refused]\n")
+@pytest.mark.parametrize(("cluster", "parameters"), [("slurm", {}), ("local", {"nope": 1})])
+def test_cluster_that_cannot_be_used_is_a_user_error(tmp_path, cluster, parameters):
+    launcher = SubmititLauncher(cluster, str(tmp_path), **parameters)
+    with raises_user_error("cluster-refused", contains=f"hydra/launcher=submitit_{cluster}"):
+        next(launcher.run([Job(tmp_path, "#0", [], ["true"])]))
 
 
 @pytest.mark.slow
-def test_killed_search_resumes_with_its_trials_and_finished_search_adds_none(searched):
-    search = (*SEARCH, BY_LOSS, "run=k")
-    runs = searched / "checkpoints/toy/k"
-    killed = start_toy(searched, *search)
+def test_killed_search_resumes_and_names_the_best_trial(folder):
+    search = ("-m", "x=interval(0.5,3.0)", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=2")
+    search += ("hydra.sweeper.metric=loss", "run=k")
+    runs = folder / "checkpoints/toy/k"
+    killed = start_toy(folder, *search)
     wait_for(runs / "0/job.json")
     killed.send_signal(signal.SIGTERM)
     assert killed.wait(timeout=60) == 130
-    resumed = run_toy(searched, *search)
+    resumed = run_toy(folder, *search)
     assert "#0 x=" in resumed.stderr.partition("already finished")[0]
-    undisturbed = rows(searched / "checkpoints/toy/s")
-    assert rows(runs) == undisturbed
-    again = run_toy(searched, *search)
-    assert again.stderr.count("already finished, skipped") == len(undisturbed) == 2
-    assert ": started" not in again.stderr
-    assert rows(runs) == undisturbed
-    assert len(json.loads((runs / STUDY_FILE).read_text())["trials"]) == 2
+    assert resumed.returncode == 0, resumed.stderr
+    table = rows(runs)
+    best = min(table, key=lambda row: float(row["loss"]))
+    assert f"best: #{best['job']} x={best['x']}, loss" in resumed.stderr
+    assert len(table) == len(json.loads((runs / STUDY_FILE).read_text())["trials"]) == 2
 
 
-@pytest.mark.slow
-def test_failed_trial_is_repeated(folder):
-    # With this seed, the search tries both values.
-    seed = "hydra.sweeper.seed=2"
-    search = ("-m", "x=range(0,2)", *SEARCH[2:], BY_LOSS, seed, "run=s")
-    assert run_toy(folder, *search).returncode == 1
-    table = rows(folder / "checkpoints/toy/s")
-    assert sorted((row["x"], row["status"]) for row in table) == [("0", "failed"), ("1", "done")]
-    again = run_toy(folder, *search).stderr
-    assert again.count(": started") == 1
-    assert " x=0: started" in again
-    assert " x=1: already finished, skipped" in again
+class Jobs:
+    """Runs the jobs of a search in this process: the loss is the square of x.
+
+    Attributes:
+        ran: The values of x, in order.
+        stop: Number of the job at which the search is interrupted.
+        fails: The value of x whose job fails.
+    """
+
+    def __init__(self, stop: int | None = None, fails: str | None = None) -> None:
+        self.ran: list[str] = []
+        self.stop, self.fails = stop, fails
+
+    def __call__(self, overrides: list[list[str]], first: int) -> list[dict[str, Any]]:
+        return [self.run(*job, number) for number, job in enumerate(overrides, first)]
+
+    def run(self, override: str, number: int) -> dict[str, Any]:
+        if number == self.stop:
+            raise KeyboardInterrupt
+        value = override.partition("=")[2]
+        self.ran.append(value)
+        done = {"status": "done", "metrics": {"loss": float(value) ** 2}}
+        return {"status": "failed"} if value == self.fails else done
 
 
-@pytest.mark.slow
-def test_unknown_metric_can_be_corrected(folder):
-    wrong = run_toy(folder, *SEARCH, "hydra.sweeper.metric=los", "run=s")
-    assert wrong.returncode == 1
-    assert wrong.stderr.endswith("the options are accuracy, loss  [unknown-metric]\n")
-    right = run_toy(folder, *SEARCH, BY_LOSS, "run=s")
-    assert right.returncode == 0
-    assert right.stderr.count("already finished, skipped") == 1
+def search(folder: Path, jobs: Jobs, swept: str, metric: str | None = "loss") -> list[str]:
+    """Run three trials of a search, and return the values of x that its jobs had."""
+    [parsed] = OverridesParser.create().parse_overrides([swept])
+    settings = Search(metric, n_trials=3, n_jobs=1, seed=0, params=None)
+    settings.run({"x": parsed}, folder, jobs)
+    return jobs.ran
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("changed", ["x=interval(0.5,4.0)", "end=bug"])
-def test_other_search_in_the_same_folder_is_refused(searched, changed):
-    table = rows(searched / "checkpoints/toy/s")
-    done = run_toy(searched, *SEARCH, BY_LOSS, "run=s", changed)
-    assert done.returncode == 2
-    assert f"{changed.partition('=')[0]} was " in done.stderr
-    assert done.stderr.endswith("[other-settings]\n")
-    assert rows(searched / "checkpoints/toy/s") == table
+def test_interrupted_search_samples_the_trials_of_an_undisturbed_one(tmp_path):
+    interval = "x=interval(0.5,3.0)"
+    undisturbed = search(tmp_path / "a", Jobs(), interval)
+    assert len({*undisturbed}) == 3
+    assert all(0.5 <= float(x) <= 3 for x in undisturbed)
+    with pytest.raises(KeyboardInterrupt):
+        search(tmp_path / "b", Jobs(stop=1), interval)
+    assert search(tmp_path / "b", Jobs(), interval) == undisturbed
+    assert search(tmp_path / "b", Jobs(), interval) == undisturbed
+    # Another search in the same folder is refused before a job runs.
+    with raises_user_error("other-settings", contains="x was "):
+        search(tmp_path / "b", Jobs(stop=0), "x=interval(0.5,4.0)")
+
+
+def test_failed_trial_is_repeated(tmp_path):
+    first = search(tmp_path, Jobs(fails="0"), "x=range(0,2)")
+    assert "0" in first
+    assert search(tmp_path, Jobs(), "x=range(0,2)") == first
+
+
+def test_unknown_metric_can_be_corrected(tmp_path):
+    with raises_user_error("unknown-metric", contains="loss"):
+        search(tmp_path, jobs := Jobs(), "x=interval(0,1)", "los")
+    assert search(tmp_path, Jobs(), "x=interval(0,1)")[:1] == jobs.ran
 
 
 @pytest.mark.parametrize(
@@ -228,10 +212,8 @@ def test_other_search_in_the_same_folder_is_refused(searched, changed):
     ],
 )
 def test_invalid_search_is_refused(tmp_path, override, metric, code):
-    [parsed] = OverridesParser.create().parse_overrides([override])
-    search = Search(metric, n_trials=2, n_jobs=None, seed=0, params=None)
     with raises_user_error(code):
-        search.run({"x": parsed}, tmp_path, pytest.fail)
+        search(tmp_path, Jobs(stop=0), override, metric)
 
 
 def test_extra_that_is_not_installed_is_a_user_error(monkeypatch):
@@ -249,7 +231,6 @@ def test_extra_that_is_not_installed_is_a_user_error(monkeypatch):
         ("x=range(1,10,3)", IntDistribution(1, 7, step=3)),
         ("x=range(0,1,0.5)", CategoricalDistribution(["0.0", "0.5"])),
         ("x=1e-5,2", CategoricalDistribution(["1e-05", "2"])),
-        ("x={a:1},{a:2}", CategoricalDistribution(["{a:1}", "{a:2}"])),
     ],
 )
 def test_swept_override_becomes_a_distribution(override, expected):
@@ -259,9 +240,12 @@ def test_swept_override_becomes_a_distribution(override, expected):
 
 def test_tables_begin_with_the_main_metrics(tmp_path):
     metrics = {"answer_loss": 2.0, "reasoning_generated_accuracy": 0.5, "loss_at_start": 3.0}
-    write_json(tmp_path / "0/metrics.json", metrics)
-    write_json(tmp_path / "0/job.json", {"overrides": ["x=1"], "status": "done"})
-    assert list(read_job(tmp_path / "0")["metrics"]) == [*metrics][1::-1]
+    # A copied folder of a job is no job.
+    for name in ("0", "0.bak"):
+        write_json(tmp_path / name / "metrics.json", metrics)
+        write_json(tmp_path / name / "job.json", {"overrides": ["x=1"], "status": "done"})
+    [job] = read_jobs(tmp_path)
+    assert list(job["metrics"]) == [*metrics][1::-1]
     header = write_sweep_table(tmp_path).splitlines()[0]
     assert header.split() == ["job", "reasoning_generated_accuracy", "answer_loss", "status"]
 

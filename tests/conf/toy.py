@@ -38,29 +38,9 @@ def main(cfg: ToyCommand, run: Run) -> dict[str, float]:
             raise UserError("this end is a mistake: set end=well", code="toy-mistake")
         case "bug":
             raise ValueError("a bug")
-        case "disk":
-            raise OSError(28, "No space left on device", "some/file")
-        case "interrupt":
-            raise KeyboardInterrupt
-        case "meet":
-            _meet(run)
         case "never":
             time.sleep(60)
     return {"loss": cfg.x**2, "accuracy": 1 / cfg.x}
-
-
-def _meet(run: Run) -> None:
-    """Wait until another job of the sweep runs at the same time.
-
-    Raises:
-        RuntimeError: None does within a minute.
-    """
-    (run.folder / "ready").touch()
-    deadline = time.monotonic() + 60
-    while len(list(run.folder.parent.glob("*/ready"))) < 2:
-        if time.monotonic() > deadline:
-            raise RuntimeError("alone")
-        time.sleep(0.05)
 
 
 if __name__ == "__main__":
