@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import os
 import re
 import shutil
@@ -15,6 +16,7 @@ from pathlib import Path
 import pytest
 
 import dynapix
+from tests.children import run_child
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("conf", "data", "teacher", "models", "train", "evaluation", "dynapix")
@@ -28,6 +30,8 @@ all."""
 HEAVY = {"torch", "transformers", "sentence_transformers", "pybullet", "matplotlib", "datasets"}
 """Packages that take long to import."""
 MODULES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+SHORT = ("data", "teacher", "train", "evaluation")
+"""Packages that a wheel has at its top too, for the short names of commands."""
 COMMANDS = sorted(
     name
     for path in MODULES
@@ -44,11 +48,6 @@ def imported_names(path: Path) -> list[str]:
     nodes = [*ast.walk(ast.parse(path.read_text()))]
     names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
     return names + [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
-
-
-def test_all_commands_are_found() -> None:
-    assert {"data.build", "train.sft", "train.contrastive", "evaluation.report"} <= set(COMMANDS)
-    assert len(COMMANDS) == 19
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -76,18 +75,15 @@ ROOMS = (
 at the end import nothing from each other."""
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "data").rglob("*.py")), ids=str)
-def test_rooms_of_data_import_only_from_those_before_them(path: Path) -> None:
+def test_rooms_of_data_import_only_from_those_before_them() -> None:
     place = {name: k for k, names in enumerate(ROOMS) for name in names.split()}
-    own = path.relative_to(ROOT / "data").parts[0].removesuffix(".py")
-    if own == "__init__":
-        return
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("dynapix.data"):
-            below = node.module.split(".")[2:]
-            names = below[:1] or [alias.name for alias in node.names]
-            for name in names:
-                assert name == own or place[name] < place[own], f"{path} imports data.{name}"
+    for path in sorted((ROOT / "data").rglob("*/*.py")):
+        own = path.relative_to(ROOT / "data").parts[0].removesuffix(".py")
+        for name in imported_names(path):
+            assert name != "dynapix.data", f"{path} names no room"
+            if name.startswith("dynapix.data."):
+                room = name.split(".")[2]
+                assert room == own or place[room] < place[own], f"{path} imports {name}"
 
 
 def test_no_folder_is_crowded() -> None:
@@ -96,33 +92,39 @@ def test_no_folder_is_crowded() -> None:
     assert not crowded
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_every_user_error_has_a_code(package: str) -> None:
-    for path in (ROOT / package).rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if (
-                isinstance(node, ast.Call)
-                and isinstance(node.func, ast.Name)
-                and node.func.id == "UserError"
-            ):
-                has_code = len(node.args) > 1 or any(k.arg == "code" for k in node.keywords)
-                assert has_code, f"{path.relative_to(ROOT)}:{node.lineno}"
+def test_every_user_error_has_a_code() -> None:
+    for path in MODULES:
+        calls = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)]
+        for call in calls:
+            if isinstance(call.func, ast.Name) and call.func.id == "UserError":
+                has_code = len(call.args) > 1 or any(k.arg == "code" for k in call.keywords)
+                assert has_code, f"{path.relative_to(ROOT)}:{call.lineno}"
+
+
+HELP = f"""
+import json, runpy, sys
+from contextlib import redirect_stdout
+from io import StringIO
+for command in {COMMANDS!r}:
+    sys.argv = [command, "--help"]
+    with redirect_stdout(StringIO()) as shown:
+        runpy.run_module(command, run_name="__main__", alter_sys=True)
+    print(json.dumps([command, shown.getvalue(), sorted({HEAVY!r} & set(sys.modules))]))
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_imports_nothing_heavy(command: str) -> None:
-    code = (
-        f"import runpy, sys; sys.argv = [{command!r}, '--help']\n"
-        f"runpy.run_module({command!r}, run_name='__main__')\n"
-        f"assert not {HEAVY!r} & set(sys.modules), sorted({HEAVY!r} & set(sys.modules))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(f"python -m {command} [KEY=VALUE ...]")
-    assert len(done.stdout.splitlines()) <= LONGEST_HELP
+def test_help_imports_nothing_heavy() -> None:
+    done = run_child([sys.executable, "-c", HELP], check=True, cwd=ROOT)
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [command for command, _, _ in rows] == COMMANDS
+    for command, text, heavy in rows:
+        assert not heavy, f"{command} imports {heavy}"
+        path = ROOT / f"{command.replace('.', '/')}.py"
+        module = path if path.exists() else path.with_suffix("") / "__main__.py"
+        purpose = ast.get_docstring(ast.parse(module.read_text()))
+        assert text.startswith(f"python -m {command} [KEY=VALUE ...]\n\n{purpose}\n"), command
+        assert len(text.splitlines()) <= LONGEST_HELP
 
 
 def test_no_file_names_a_package_registry() -> None:
@@ -136,50 +138,35 @@ def test_no_file_names_a_package_registry() -> None:
         assert not any(host in text for host in hosts), name
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The content of a wheel of this project."""
-    folder = tmp_path_factory.mktemp("wheel")
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
-    for name in listed.stdout.splitlines():
-        if (ROOT / name).exists() and not name.startswith("tests/"):
-            (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / name, folder / "source" / name, follow_symlinks=False)
-    build = [sys.executable, "-m", "uv", "build", "--quiet", "--wheel", "--out-dir", str(folder)]
-    subprocess.run([*build, str(folder / "source")], check=True)
-    (wheel,) = folder.glob("*.whl")
-    zipfile.ZipFile(wheel).extractall(folder / "site")
-    return folder / "site"
-
-
 @pytest.mark.slow
-def test_the_wheel_has_every_file_of_the_packages(site: Path) -> None:
-    command = ["git", "ls-files", *PACKAGES]
-    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    files = [name for name in listed.stdout.splitlines() if (ROOT / name).is_file()]
+def test_the_wheel_has_every_file_and_no_folder_of_a_user_hides_one(tmp_path: Path) -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    names = [name for name in listed.stdout.splitlines() if not name.startswith("tests/")]
+    for name in (name for name in names if os.path.lexists(ROOT / name)):
+        (tmp_path / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / "source" / name, follow_symlinks=False)
+    build = [sys.executable, "-m", "uv", "build", "--quiet", "--wheel", "--out-dir", tmp_path]
+    run_child([*build, tmp_path / "source"], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    zipfile.ZipFile(wheel).extractall(site := tmp_path / "site")
+    files = [n for n in names if n.split("/")[0] in PACKAGES and (ROOT / n).is_file()]
     assert len(files) > 400
     own = [name if name.startswith("dynapix/") else f"dynapix/{name}" for name in files]
     assert not [name for name in own if not (site / name).is_file()]
     assert not (site / "benchmarks").exists()
 
-
-@pytest.mark.slow
-def test_folders_of_a_user_hide_nothing_of_the_package(site: Path, tmp_path: Path) -> None:
     for name in PACKAGES[:-1]:
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "__init__.py").write_text("raise SystemExit('of the user')")
-    names = "; ".join(f"dynapix.{name}" for name in dynapix.__all__)
-    code = f"import dynapix; {names}; print(dynapix.__file__)"
+        (tmp_path / "user" / name).mkdir(parents=True)
+        (tmp_path / "user" / name / "__init__.py").write_text("raise SystemExit('of the user')")
+    every = "; ".join(f"dynapix.{name}" for name in dynapix.__all__)
+    code = f"import dynapix; {every}; print(dynapix.__file__)"
     env = {**os.environ, "PYTHONPATH": str(site)}
-    for arguments in (["-c", code], ["-m", "dynapix"], ["-m", "dynapix.train.sft", "--help"]):
-        command = [sys.executable, *arguments]
-        done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        assert arguments[0] != "-c" or done.stdout.startswith(str(site))
-    for command in ("data.build", "teacher.narrate", "train.sft", "evaluation.select"):
-        elsewhere = tmp_path / "elsewhere"
-        elsewhere.mkdir(exist_ok=True)
-        subprocess.run(
-            [sys.executable, "-m", command, "--help"],
-            cwd=elsewhere, env=env, check=True, capture_output=True,
-        )  # fmt: skip
+    # Without such folders, commands have their short names too.
+    for place, arguments, shown in (
+        ("user", ["-c", code], str(site)),
+        ("user", ["-m", "dynapix.train.sft", "--help"], "python -m train.sft "),
+        (".", ["-m", "data.build", "--help"], "python -m data.build "),
+    ):
+        done = run_child([sys.executable, *arguments], check=True, cwd=tmp_path / place, env=env)
+        assert done.stdout.startswith(shown)
+    assert all((site / name / "__init__.py").exists() for name in SHORT)
