@@ -19,9 +19,7 @@ from PIL import Image
 
 import dynapix
 from dynapix.__main__ import COMMANDS, overview
-from dynapix.benchmark import _preset_world, _reopen, preset_names
-from dynapix.conf.compose import compose
-from dynapix.conf.schema import BuildCommand
+from dynapix.benchmark import _reopen
 from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.records import SPLITS, Rationale
 from dynapix.data.store import MANIFEST, RATIONALES, Store
@@ -29,8 +27,10 @@ from dynapix.evaluation.metrics.selection import Choices, build_selection_report
 from dynapix.evaluation.reporting.tables import selection_table
 from dynapix.selection import MIN_FAILURES_TO_STOP
 from dynapix.teacher.journal import save_accepted
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.extraction import extract_predicates
 from tests.children import run_child
-from tests.dynapix.models import always_a, nearest
+from tests.dynapix.models import always_a, describe, nearest
 from tests.test_house import COMMANDS as ALL_COMMANDS
 from tests.user_errors import raises_user_error
 
@@ -40,14 +40,15 @@ PRESETS = ["tiny_balanced", "tiny_balanced-above", "small", "small-clevrer"]
 """Names that open the folders tiny_balanced-above and small."""
 
 
-IMPORTS = {
-    "import": ("import dynapix; dir(dynapix)", set()),
-    "read": (
+IMPORTS = (
+    ("import dynapix; dir(dynapix)", set()),
+    (
+        "bench = dynapix.load(built)\n"
         "item = bench.selection[0]; item.prefix, item.times, item.candidates\n"
         "bench.retrieval[0].target.image, bench.database[0].image",
         READING,
     ),
-    "evaluate": (
+    (
         "items = bench.selection[:8]; results = [\n"
         "    dynapix.evaluate(items, lambda item, letter=letter: letter, progress=False)\n"
         "    for letter in 'AB'\n"
@@ -56,58 +57,41 @@ IMPORTS = {
         "dynapix.score_rationale(items[0], 'Prediction: the cube stops.')",
         READING | {"yaml", "tqdm"},
     ),
-}
-"""Code by its work, and the packages that it may import."""
-
-
-@pytest.mark.parametrize("work", IMPORTS)
-def test_the_library_imports_only_what_its_work_needs(micro_store, work) -> None:
-    code, allowed = IMPORTS[work]
-    load = f"import dynapix; bench = dynapix.load({str(micro_store.folder)!r})\n"
-    report = (
-        "\nimport json, sys\n"
-        "roots = {name.split('.')[0] for name in sys.modules} - set(sys.stdlib_module_names)\n"
-        "print(json.dumps(sorted(roots)))"
-    )
-    script = (load if allowed else "") + code + report
-    done = run_child([sys.executable, "-c", script], check=True)
-    roots = {r for r in json.loads(done.stdout.splitlines()[-1]) if not r.startswith("_")}
-    assert roots - {"dynapix", "cython_runtime", "cloudpickle"} <= allowed
-
-
-def test_a_built_preset_opens_without_the_extra_that_builds(micro_store, tmp_path) -> None:
-    shutil.copytree(micro_store.folder, tmp_path / "tiny_balanced-above")
-    shutil.copytree(micro_store.folder, tmp_path / "small")
-    code = (
-        "import sys\n"
+    (
+        # A built preset opens without the extra that builds.
         "sys.modules |= dict.fromkeys(['hydra', 'omegaconf'])\n"
-        f"import dynapix; names = {PRESETS}\n"
-        f"print([len(dynapix.load(name, store={str(tmp_path)!r}).selection) for name in names])"
+        f"opened = [dynapix.load(name, store=store) for name in {PRESETS}]\n"
+        "assert [len(each.selection) for each in opened] == [len(bench.selection)] * len(opened)",
+        READING | {"yaml", "tqdm", "hydra", "omegaconf"},
+    ),
+)
+"""Steps of one program, each with the packages that it may have imported at its end."""
+
+
+def test_the_library_imports_only_what_its_work_needs(micro_store, tmp_path) -> None:
+    for name in ("tiny_balanced-above", "small"):
+        (tmp_path / name).symlink_to(micro_store.folder)
+    report = (
+        "print(json.dumps([*{n.split('.')[0] for n in sys.modules} - sys.stdlib_module_names]))"
     )
-    done = run_child([sys.executable, "-c", code], check=True)
-    items = len(micro_store.selection("test"))
-    assert json.loads(done.stdout) == [items] * len(PRESETS)
+    lines = ["import json, sys", f"built, store = {str(micro_store.folder)!r}, {str(tmp_path)!r}"]
+    for code, _ in IMPORTS:
+        lines += [code, report]
+    done = run_child([sys.executable, "-c", "\n".join(lines)], check=True)
+    for (code, allowed), shown in zip(IMPORTS, done.stdout.splitlines(), strict=True):
+        roots = {name for name in json.loads(shown) if not name.startswith("_")}
+        assert roots - {"dynapix", "cython_runtime", "cloudpickle"} <= allowed, code
 
 
-def test_presets_have_the_worlds_that_hydra_composes() -> None:
-    for name in preset_names():
-        cfg = compose("data.build", BuildCommand, [f"benchmark={name}"])
-        assert _preset_world(name) == cfg.benchmark.world.name, name
-
-
-def test_every_public_name_exists_and_has_a_docstring() -> None:
+def test_every_public_name_exists_has_a_docstring_and_is_in_the_overview() -> None:
     assert dir(dynapix) == sorted(dynapix.__all__)
     for name in dynapix.__all__:
         assert getattr(dynapix, name).__doc__, name
     with pytest.raises(AttributeError, match="has no attribute 'evaluat'"):
         dynapix.evaluat  # noqa: B018
-
-
-def test_the_overview_names_every_command_and_public_name() -> None:
     text = overview()
     assert sorted(COMMANDS) == ALL_COMMANDS
     assert all(name in text for name in (*ALL_COMMANDS, *dynapix.__all__, "tiny", "make run"))
-    assert max(map(len, text.splitlines()[:5])) <= 100
 
 
 def test_items_are_those_of_the_store(bench, micro_store) -> None:
@@ -129,22 +113,20 @@ def test_items_are_those_of_the_store(bench, micro_store) -> None:
     assert [item.item_id for item in few] == [record.item_id for record in records[2:5]]
 
 
-def test_queries_and_frames_are_those_of_the_store(bench, micro_store) -> None:
-    assert [query.record for query in bench.retrieval] == micro_store.standard_test()
+@pytest.mark.parametrize("split", SPLITS)
+@pytest.mark.parametrize("pool", ["future", "counterfactual"])
+def test_queries_and_frames_are_those_of_the_store(micro_store, split, pool) -> None:
+    bench = dynapix.load(micro_store.folder, split=split, pool=pool)
+    records = [query.record for query in bench.retrieval]
+    standard = (split, pool) == ("test", "future")
+    assert records == (
+        micro_store.standard_test() if standard else micro_store.retrieval(split, pool)
+    )
     names = {frame.name for frame in bench.database}
-    assert names == {ref.name for ref in micro_store.database("test")}
-    assert all(query.target.name in names for query in bench.retrieval)
-    train = dynapix.load(micro_store.folder, split="train")
-    assert [query.record for query in train.retrieval] == micro_store.retrieval("train")
-    names = {frame.name for frame in train.database}
-    assert all(query.target.name in names for query in train.retrieval)
-    for split in SPLITS:
-        absent = dynapix.load(micro_store.folder, split=split, pool="counterfactual")
-        records = [query.record for query in absent.retrieval]
-        assert records == micro_store.retrieval(split, "counterfactual")
-        names = {frame.name for frame in absent.database}
-        assert {f.name for q in records for f in (q.target, q.factual_twin)} <= names
-        assert pickle.loads(pickle.dumps(absent.retrieval[0])).record == records[0]
+    assert not standard or names == {ref.name for ref in micro_store.database("test")}
+    assert {query.target.name for query in bench.retrieval} <= names
+    assert {q.factual_twin.name for q in records if q.factual_twin} <= names
+    assert pickle.loads(pickle.dumps(bench.retrieval[0])).record == records[0]
 
 
 def test_a_result_is_the_report_of_the_command(bench, micro_store) -> None:
@@ -158,13 +140,11 @@ def test_a_result_is_the_report_of_the_command(bench, micro_store) -> None:
 
 
 def test_letters_texts_and_scores_give_equal_credits(bench) -> None:
-    def scores(item: dynapix.Item) -> np.ndarray:
-        return np.eye(4)[item.index]
-
-    def text(item: dynapix.Item) -> str:
-        return f"The ball rolls on.\nAnswer: {item.answer}"
-
-    for predict in (scores, text, lambda item: item.answer):
+    for predict in (
+        lambda item: np.eye(4)[item.index],
+        lambda item: f"The ball rolls on.\nAnswer: {item.answer}",
+        lambda item: item.answer,
+    ):
         result = dynapix.evaluate(bench.selection, predict, progress=False)
         assert result.accuracy.macro.value == 1
     tied = dynapix.evaluate(bench.selection, lambda item: [1, 1, 1, 1], progress=False)
@@ -193,7 +173,6 @@ class Unreadable:
     [
         (lambda: 1 / 0, "ZeroDivisionError"),
         (lambda: None, "None (NoneType) instead of"),
-        (lambda: {"A": 1}, "(dict) instead of"),
         (lambda: [0.1, 0.2, 0.7], "[0.1, 0.2, 0.7] (list) instead of"),
         (lambda: [0.1, float("nan"), 0.2, 0.3], "not all finite"),
         (lambda: Unreadable(), "(Unreadable) instead of"),
@@ -212,15 +191,9 @@ def test_items_that_fail_are_kept_and_count_as_wrong(bench, bad, reason) -> None
     assert result.accuracy.micro.value == pytest.approx(1 - 3 / count)
     assert "3 items failed and count as wrong" in str(result)
     # An evaluation whose items all fail stops early.
-    calls: list[str] = []
-
-    def always_fails(item: dynapix.Item) -> str:
-        calls.append(item.item_id)
-        return bad()
-
-    with raises_user_error("invalid-prediction", contains=(reason, bench.selection[0].item_id)):
-        dynapix.evaluate(bench.selection, always_fails, progress=False)
-    assert len(calls) == MIN_FAILURES_TO_STOP
+    shown = (reason, bench.selection[0].item_id, str(MIN_FAILURES_TO_STOP))
+    with raises_user_error("invalid-prediction", contains=shown):
+        dynapix.evaluate(bench.selection, lambda item: bad(), progress=False)
 
 
 def test_results_are_compared_on_the_same_items(bench) -> None:
@@ -228,53 +201,33 @@ def test_results_are_compared_on_the_same_items(bench) -> None:
     two = dynapix.evaluate(bench.selection, nearest, name="two", progress=False)
     comparison = one.compare(two)
     assert [c.of for c in comparison] == ["event", "time", "window", "macro", "all"]
-    overall = comparison[-1]
     difference = one.accuracy.micro.value - two.accuracy.micro.value
-    assert overall.difference == pytest.approx(difference)
+    assert comparison[-1].difference == pytest.approx(difference)
     assert "one (left) minus two (right)" in str(comparison)
     few = dynapix.evaluate(bench.selection[:-2], always_a, name="few", progress=False)
     with raises_user_error("different-items", contains=("2 only in one",)):
         one.compare(few)
 
 
-def test_a_rationale_is_scored_by_the_oracle(micro_store) -> None:
-    from dynapix.teacher.narrator import write_rationale
-    from dynapix.teacher.predicates.extraction import extract_predicates
-
-    train = dynapix.load(micro_store.folder, split="train")
-    item = next(
-        i
-        for i in train.selection
-        if extract_predicates(i.record, micro_store.scene(i.scene_id), micro_store.scene)
-    )
-    scene = micro_store.scene(item.scene_id)
-    predicates = extract_predicates(item.record, scene, micro_store.scene)
-    text = write_rationale(predicates, item.record, 0, 0)
-    score = dynapix.score_rationale(item, text)
-    assert score.supported
-    assert not score.contradicted
-    assert not score.numbers
-    wrong = "BCDA"["ABCD".index(item.answer)]
-    false = text.replace(f"Answer: {item.answer}", f"Answer: {wrong}")
-    score = dynapix.score_rationale(item, f"{false} It took two seconds.")
-    assert "two" in score.numbers[0]
-    assert "numbers: two" in str(score)
-
-
-def test_sufficiency_of_a_rationale_is_that_of_its_prediction(micro_store) -> None:
-    from dynapix.teacher.narrator import write_rationale
-    from dynapix.teacher.predicates.extraction import extract_predicates
-
+def test_a_rationale_is_scored_by_the_oracle(bench, micro_store) -> None:
     found = []
-    for item in dynapix.load(micro_store.folder, split="test").selection[:20]:
+    for item in bench.selection[:20]:
         scene = micro_store.scene(item.scene_id)
         predicates = extract_predicates(item.record, scene, micro_store.scene)
-        if predicates is not None:
-            text = write_rationale(predicates, item.record, 0)
-            found.append(dynapix.sufficiency(item, text))
-            assert dynapix.sufficiency(item, text.replace("Prediction:", "Summary:")) == 0.25
+        if predicates is None:
+            continue
+        text = write_rationale(predicates, item.record, 0)
+        score = dynapix.score_rationale(item, text)
+        assert score.supported
+        assert not score.contradicted
+        assert not score.numbers
+        found.append(dynapix.sufficiency(item, text))
+        assert dynapix.sufficiency(item, text.replace("Prediction:", "Summary:")) == 0.25
     assert len(found) > 5
     assert np.mean(found) > 0.9
+    score = dynapix.score_rationale(bench.selection[0], f"{text} It took two seconds.")
+    assert "two" in score.numbers[0]
+    assert "numbers: two" in str(score)
 
 
 def test_name_of_a_preset_and_a_world_builds_the_benchmark_in_the_world(
@@ -344,11 +297,17 @@ def test_rationales_are_those_of_the_last_narration(micro_store, tmp_path) -> No
     assert dynapix.load(folder).rationales == {r.item_id: r.text for r in written}
 
 
-def test_items_of_two_benchmarks_and_wrong_batches_are_refused(bench, micro_store) -> None:
+def test_items_that_cannot_be_evaluated_together_are_refused(bench, micro_store) -> None:
     rebuilt = replace(micro_store, manifest=micro_store.manifest | {"renderer": "other"})
     other = dynapix.Benchmark(rebuilt, "test", frames=12, image_size=None)
     with raises_user_error("invalid-items"):
         dynapix.evaluate([], always_a)
+    items, queries = list(bench.selection), list(bench.retrieval)
+    with raises_user_error("repeated-items", contains=items[1].item_id):
+        dynapix.evaluate([*items, items[1], items[1]], always_a, progress=False)
+    rows, frames = np.ones((len(queries) + 1, 4)), np.ones((len(bench.database), 4))
+    with raises_user_error("repeated-items", contains=queries[0].query_id):
+        dynapix.evaluate_retrieval([*queries, queries[0]], rows, frames)
     with raises_user_error("invalid-items"):
         dynapix.evaluate([bench.selection[0], other.selection[0]], always_a)
     with raises_user_error("invalid-prediction", contains=("3", "4")):
@@ -365,7 +324,6 @@ TENSORS = {
     "gradients": lambda rows: torch.tensor(rows, requires_grad=True),
     "bf16": lambda rows: torch.tensor(rows, dtype=torch.bfloat16, requires_grad=True),
     "list": lambda rows: list(torch.tensor(rows, requires_grad=True)),
-    "nested": lambda rows: np.array(rows).tolist(),
 }
 
 
@@ -389,21 +347,7 @@ def test_scores_that_are_no_numbers_are_refused() -> None:
             dynapix.rank_metrics(scores, [0])
 
 
-def test_an_item_or_a_query_that_is_given_twice_is_refused(bench) -> None:
-    items, queries = list(bench.selection), list(bench.retrieval)
-    with raises_user_error("repeated-items", contains=items[1].item_id):
-        dynapix.evaluate([*items, items[1], items[1]], always_a, progress=False)
-    rows, frames = np.ones((len(queries) + 1, 4)), np.ones((len(bench.database), 4))
-    with raises_user_error("repeated-items", contains=queries[0].query_id):
-        dynapix.evaluate_retrieval([*queries, queries[0]], rows, frames)
-
-
-def describe(record: dynapix.Item | dynapix.Query) -> tuple[str, int]:
-    """Run in a worker process."""
-    return record.record.name, int(record.prefix.sum())
-
-
-def test_public_objects_can_be_sent_to_workers(bench) -> None:
+def test_public_objects_can_be_sent_to_workers(bench, monkeypatch) -> None:
     items = bench.selection[:2]
     result = dynapix.evaluate(bench.selection, always_a, progress=False)
     vectors = np.ones((len(bench.retrieval), 4)), np.ones((len(bench.database), 4))
@@ -418,9 +362,7 @@ def test_public_objects_can_be_sent_to_workers(bench) -> None:
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         records = [items[0], bench.retrieval[0]]
         assert list(pool.map(describe, records)) == list(map(describe, records))
-
-
-def test_items_of_a_benchmark_that_was_built_again_are_refused(bench, monkeypatch) -> None:
+    # Objects of a benchmark that was built again since are refused.
     pickled = pickle.dumps(bench.selection[0])
     monkeypatch.setattr(Store, "identity", "another")
     _reopen.cache_clear()
