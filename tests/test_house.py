@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import pytest
 
 import dynapix
 from tests.children import run_child
+from tests.conf.schemas import SCHEMAS
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("conf", "data", "teacher", "models", "train", "evaluation", "dynapix")
@@ -32,11 +32,7 @@ HEAVY = {"torch", "transformers", "sentence_transformers", "pybullet", "matplotl
 MODULES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 SHORT = ("data", "teacher", "train", "evaluation")
 """Packages that a wheel has at its top too, for the short names of commands."""
-COMMANDS = sorted(
-    name
-    for path in MODULES
-    for name in re.findall(r'^@command\("([\w.]+)"', path.read_text(), re.MULTILINE)
-)
+COMMANDS = sorted(SCHEMAS)
 LONGEST_HELP = 50
 """Maximum number of lines of a command's help."""
 LARGEST_FOLDER = 12

@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterable, Iterator
 from dataclasses import Field, fields, is_dataclass
+from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from dynapix.conf import schema
 
+ROOT = Path(__file__).parents[2]
+COMMAND = re.compile(r'^@command\("([\w.]+)", (\w+)', re.MULTILINE)
 SCHEMAS = {
-    "data.build": schema.BuildCommand,
-    "data.statistics": schema.StatisticsCommand,
-    "data.export": schema.ExportCommand,
-    "data.gallery": schema.GalleryCommand,
-    "teacher.narrate": schema.NarrateCommand,
-    "teacher.claims_benchmark": schema.ClaimsCommand,
-    "teacher.serve": schema.ServeCommand,
-    "train.sft": schema.SftCommand,
-    "train.distill": schema.DistillCommand,
-    "train.reinforce": schema.ReinforceCommand,
-    "train.contrastive": schema.ContrastiveCommand,
-    "train.export": schema.ExportModelCommand,
-    "evaluation.select": schema.SelectCommand,
-    "evaluation.retrieve": schema.RetrieveCommand,
-    "evaluation.similarity": schema.SimilarityCommand,
-    "evaluation.two_stage": schema.TwoStageCommand,
-    "evaluation.report": schema.ReportCommand,
-    "evaluation.study": schema.StudyCommand,
-    "evaluation.study.export": schema.ExportStudyCommand,
+    name: getattr(schema, kind)
+    for package in ("data", "teacher", "train", "evaluation")
+    for path in sorted((ROOT / package).rglob("*.py"))
+    for name, kind in COMMAND.findall(path.read_text())
 }
+"""The settings of each command, by its name."""
 
 
 def walk_settings(schema: type, group: str = "") -> Iterator[tuple[str, Field, Any]]:

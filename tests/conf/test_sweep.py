@@ -13,7 +13,6 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-from dynapix.conf.errors import import_extra
 from dynapix.conf.files import write_json
 from dynapix.conf.gpus import visible_gpus
 from dynapix.conf.multirun.launchers import Job, SubmititLauncher
@@ -86,15 +85,13 @@ def logs(jobs: list[Path]) -> list[Path]:
     return found
 
 
-@pytest.mark.parametrize("rest", ["", "-1", "NoDevFiles", "-1,1"])
-@pytest.mark.parametrize("gpus", [[], ["0", "2"], ["GPU-a1", "MIG-b2"]])
-def test_gpus_before_the_first_invalid_one_are_visible(monkeypatch, gpus, rest):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", ", ".join([*gpus, rest]))
-    assert visible_gpus() == gpus
-
-
-def test_driver_lists_the_gpus(monkeypatch, tmp_path):
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+def test_visible_gpus_are_those_of_the_environment_or_of_the_driver(monkeypatch, tmp_path):
+    # Like CUDA, everything from the first invalid device on is ignored.
+    for rest in ("", "-1", "NoDevFiles", "-1,1"):
+        for gpus in ([], ["0", "2"], ["GPU-a1", "MIG-b2"]):
+            monkeypatch.setenv("CUDA_VISIBLE_DEVICES", ", ".join([*gpus, rest]))
+            assert visible_gpus() == gpus
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     monkeypatch.setenv("PATH", str(tmp_path))
     assert visible_gpus() == []
     driver = tmp_path / "nvidia-smi"
@@ -158,15 +155,14 @@ class Jobs:
         self.stop, self.fails = stop, fails
 
     def __call__(self, overrides: list[list[str]], first: int) -> list[dict[str, Any]]:
-        return [self.run(*job, number) for number, job in enumerate(overrides, first)]
-
-    def run(self, override: str, number: int) -> dict[str, Any]:
-        if number == self.stop:
-            raise KeyboardInterrupt
-        value = override.partition("=")[2]
-        self.ran.append(value)
-        done = {"status": "done", "metrics": {"loss": float(value) ** 2}}
-        return {"status": "failed"} if value == self.fails else done
+        records = []
+        for number, [override] in enumerate(overrides, first):
+            if number == self.stop:
+                raise KeyboardInterrupt
+            self.ran.append(value := override.partition("=")[2])
+            status = "failed" if value == self.fails else "done"
+            records.append({"status": status, "metrics": {"loss": float(value) ** 2}})
+        return records
 
 
 def search(folder: Path, jobs: Jobs, swept: str, metric: str | None = "loss") -> list[str]:
@@ -191,16 +187,13 @@ def test_interrupted_search_samples_the_trials_of_an_undisturbed_one(tmp_path):
         search(tmp_path / "b", Jobs(stop=0), "x=interval(0.5,4.0)")
 
 
-def test_failed_trial_is_repeated(tmp_path):
-    first = search(tmp_path, Jobs(fails="0"), "x=range(0,2)")
+def test_failed_trial_is_repeated_and_an_unknown_metric_can_be_corrected(tmp_path):
+    first = search(tmp_path / "a", Jobs(fails="0"), "x=range(0,2)")
     assert "0" in first
-    assert search(tmp_path, Jobs(), "x=range(0,2)") == first
-
-
-def test_unknown_metric_can_be_corrected(tmp_path):
+    assert search(tmp_path / "a", Jobs(), "x=range(0,2)") == first
     with raises_user_error("unknown-metric", contains="loss"):
-        search(tmp_path, jobs := Jobs(), "x=interval(0,1)", "los")
-    assert search(tmp_path, Jobs(), "x=interval(0,1)")[:1] == jobs.ran
+        search(tmp_path / "b", jobs := Jobs(), "x=range(0,2)", "los")
+    assert search(tmp_path / "b", Jobs(), "x=range(0,2)")[:1] == jobs.ran
 
 
 @pytest.mark.parametrize(
@@ -214,12 +207,6 @@ def test_unknown_metric_can_be_corrected(tmp_path):
 def test_invalid_search_is_refused(tmp_path, override, metric, code):
     with raises_user_error(code):
         search(tmp_path, Jobs(stop=0), override, metric)
-
-
-def test_extra_that_is_not_installed_is_a_user_error(monkeypatch):
-    monkeypatch.setitem(sys.modules, "optuna", None)
-    with raises_user_error("missing-package", contains=("hydra/sweeper=optuna", ".[optuna]")):
-        import_extra("optuna", "hydra/sweeper=optuna")
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -15,6 +16,7 @@ from dynapix.conf.entry import Run
 from dynapix.conf.files import read_json_lines, write_json
 from dynapix.conf.runs import open_run
 from dynapix.conf.schema import (
+    CommandConfig,
     ContrastiveCommand,
     ContrastiveTrainConfig,
     ExportModelCommand,
@@ -50,6 +52,15 @@ class Served:
     weights: Path
 
 
+def run_main(module: ModuleType, settings: CommandConfig, folder: Path) -> dict[str, float]:
+    """Run a command in a folder of runs of its own, and return its metrics."""
+    run = Run(folder.name, folder)
+    open_run(run, asdict(settings), module.__name__)
+    metrics = module.main.__wrapped__(settings, run)
+    write_json(folder / "metrics.json", metrics)
+    return metrics
+
+
 @pytest.fixture(scope="session")
 def served(micro, micro_store, tmp_path_factory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("served")
@@ -58,28 +69,22 @@ def served(micro, micro_store, tmp_path_factory) -> Iterator[Served]:
     train = replace(settings.train, max_steps=8, batch=8, evaluations=1, generated_items=0)
     shared = {"store": str(micro_store.folder.parent), "checkpoints": str(folder), "workers": 1}
     settings = replace(settings, benchmark=micro, train=train, run="answers", **shared)
-    trained = Run("answers", folder / "sft" / "answers")
-    open_run(trained, asdict(settings), "train.sft")
-    write_json(trained.folder / "metrics.json", sft.main.__wrapped__(settings, trained))
+    run_main(sft, settings, trained := folder / "sft" / "answers")
     exported = ExportModelCommand(**{**shared, "run": "answers", "format": "fp32"})
-    into = folder / "export_model"
-    into.mkdir()
-    export.main.__wrapped__(exported, Run("answers", into))
-    server = transformers_server(into / "student", folder)
+    run_main(export, exported, folder / "export_model")
+    weights = folder / "export_model" / "student"
+    server = transformers_server(weights, folder)
     server.start()
-    name = str(into / "student")
     command = SelectCommand(
-        benchmark=micro, student=settings.student, model=str(trained.folder),
-        server=ServerConfig(url=server.url, model=name), modes=["answer"], **shared,
+        benchmark=micro, student=settings.student, model=str(trained), modes=["answer"],
+        server=ServerConfig(url=server.url, model=str(weights)), **shared,
     )  # fmt: skip
-    run = folder / "select" / "answers"
-    run.mkdir(parents=True)
-    metrics = select.main.__wrapped__(command, Run("answers", run))
+    metrics = run_main(select, command, run := folder / "select" / "answers")
     rows = [row for row in read_json_lines(run / "answers.jsonl") if "item_id" in row]
     texts = {row["item_id"]: row["text"] for row in rows}
     # The student chooses several letters, so that equal answers are no accident.
     assert len(set(texts.values())) > 1
-    yield Served(server.url, name, micro_store, texts, metrics["answer_macro"], into / "student")
+    yield Served(server.url, str(weights), micro_store, texts, metrics["answer_macro"], weights)
     server.stop()
 
 
@@ -106,19 +111,12 @@ def ranked(micro, micro_store, tmp_path_factory) -> Path:
     train = ContrastiveTrainConfig(max_steps=2, batch=8, precision="fp32", evaluations=1)
     shared = {"store": str(micro_store.folder.parent), "checkpoints": str(folder), "workers": 1}
     # The harness runs in another folder than this one.
-    base = Path(
-        compose("train.contrastive", ContrastiveCommand, ["retriever=tiny"]).retriever.model
-    )
-    overrides = ["retriever=tiny", f"retriever.model={base.absolute()}", "retriever.image_size=96"]
+    base = compose("train.contrastive", ContrastiveCommand, ["retriever=tiny"]).retriever.model
+    overrides = ["retriever=tiny", f"retriever.model={Path(base).absolute()}"]
+    overrides.append("retriever.image_size=96")
     preset = compose("train.contrastive", ContrastiveCommand, overrides).retriever
     settings = ContrastiveCommand(benchmark=micro, retriever=preset, train=train, **shared)
-    trained = Run("moving", folder / "contrastive" / "moving")
-    open_run(trained, asdict(settings), "train.contrastive")
-    write_json(trained.folder / "metrics.json", contrastive.main.__wrapped__(settings, trained))
-    command = RetrieveCommand(
-        benchmark=micro, retriever=preset, model=str(trained.folder), **shared
-    )
-    run = trained.folder / "ranked"
-    run.mkdir()
-    retrieve.main.__wrapped__(command, Run("ranked", run))
-    return trained.folder
+    run_main(contrastive, settings, trained := folder / "contrastive" / "moving")
+    command = RetrieveCommand(benchmark=micro, retriever=preset, model=str(trained), **shared)
+    run_main(retrieve, command, trained / "ranked")
+    return trained
