@@ -32,7 +32,6 @@ def test_unknown_key_suggests_the_nearest(override, suggested):
     [
         ("train.lr=abc", "invalid-setting", "train.lr=abc"),
         ("train=1", "invalid-setting", "train=1"),
-        ("retriever.widths=[1", "invalid-setting", "retriever.widths=[1"),
         ("student=nope", "invalid-setting", ("student/nope", "qwen3_vl_8b")),
         ("+exp=nope", "invalid-setting", ("exp/nope", "answer_only")),
         ("exp=cot", "invalid-setting", "+exp=cot"),
@@ -43,7 +42,6 @@ def test_unknown_key_suggests_the_nearest(override, suggested):
         ("train.lr=${nope}", "invalid-setting", ("train.lr", "nope")),
         ("hydra.launcher.nope=1", "unknown-key", "hydra.launcher.nope"),
         ("hydra/launcher=nope", "invalid-setting", ("hydra/launcher/nope", "process")),
-        ("benchmark.selection.event.new.train=3", "unknown-key", "benchmark.selection.event.new"),
         ("+benchmark.selection.event={new: {trian: 3}}", "unknown-key", "event.new.trian"),
         ("benchmark.selection.event={}", "invalid-setting", "event={}: an empty dict"),
         ("student=null", "invalid-setting", "student=null"),
@@ -54,7 +52,6 @@ def test_unknown_key_suggests_the_nearest(override, suggested):
         ("train.report_to=wandb", "invalid-setting", ("train.report_to=wandb", "[VALUE]")),
         ("run=a=b", "invalid-setting", ("run=a=b", "quotes")),
         ("checkpoints=", "invalid-setting", "checkpoints= is empty"),
-        ("run=", "invalid-setting", "run="),
         ("run=~/a", "invalid-setting", "run="),
         ("hydra.job.chdir=true", "invalid-setting", "hydra.job.chdir"),
         ("run=../../elsewhere", "invalid-setting", "run=../../elsewhere"),
