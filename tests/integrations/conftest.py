@@ -55,7 +55,7 @@ class Served:
 def run_main(module: ModuleType, settings: CommandConfig, folder: Path) -> dict[str, float]:
     """Run a command in a folder of runs of its own, and return its metrics."""
     run = Run(folder.name, folder)
-    open_run(run, asdict(settings), module.__name__)
+    open_run(run, asdict(settings), module.__name__.removeprefix("dynapix."))
     metrics = module.main.__wrapped__(settings, run)
     write_json(folder / "metrics.json", metrics)
     return metrics

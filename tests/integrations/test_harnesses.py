@@ -100,15 +100,13 @@ import sys, dynapix, mteb
 from mteb.models.model_implementations.clip_models import CLIPModel
 from dynapix.integrations.mteb_task import ClipEncoder, RetrievalTask
 
-kind, model, folder = sys.argv[1:]
+run, clip, folder = sys.argv[1:]
 bench = dynapix.load(folder, image_size=96)
-encoder = ClipEncoder(bench, model) if kind == "clips" else CLIPModel(model, None)
-if kind == "grids":
-    encoder.processor.tokenizer.model_max_length = 77
-    encoder.mteb_model_meta = mteb.get_model_meta("openai/clip-vit-base-patch32")
-result = mteb.evaluate(
-    encoder, RetrievalTask(bench), cache=None, prediction_folder="predictions"
-)
+grids = CLIPModel(clip, None)
+grids.processor.tokenizer.model_max_length = 77
+grids.mteb_model_meta = mteb.get_model_meta("openai/clip-vit-base-patch32")
+for name, encoder in (("grids", grids), ("clips", ClipEncoder(bench, run))):
+    result = mteb.evaluate(encoder, RetrievalTask(bench), cache=None, prediction_folder=name)
 [score] = result.task_results[0].scores["test"]
 print({k: score[k] for k in ("recall_at_1", "recall_at_10")})
 """
@@ -117,9 +115,14 @@ print({k: score[k] for k in ("recall_at_1", "recall_at_10")})
 def test_mteb(ranked, micro_store, run_harness, tmp_path) -> None:
     bench = dynapix.load(micro_store.folder, image_size=96)
     (tmp_path / "run.py").write_text(MTEB)
-    shown = run_harness("python", "run.py", "clips", str(ranked), str(bench.store.folder))
+    released.clip(clip := tmp_path / "clip")
+    arguments = map(str, (ranked, clip, bench.store.folder))
+    shown = run_harness("python", "run.py", *arguments)
     scores = json.loads(shown.splitlines()[-1].replace("'", '"'))
-    [file] = tmp_path.glob("predictions/*.json")
+    # MTEB shows its own models the prefix as a grid.
+    [file] = tmp_path.glob("grids/*.json")
+    assert 0 < dynapix.RetrievalScores.from_mteb(file, bench).metrics["mrr"] < 1
+    [file] = tmp_path.glob("clips/*.json")
     result = dynapix.RetrievalScores.from_mteb(file, bench)
     rows = list(read_json_lines(ranked / "ranked" / "ranks.jsonl"))
     above = [row["above"][0] for row in rows if row["by"] == "moving"]
@@ -134,16 +137,6 @@ def test_mteb(ranked, micro_store, run_harness, tmp_path) -> None:
     file.write_text(file.read_text()[:-9])
     with raises_user_error("damaged-file", contains=file.name):
         dynapix.RetrievalScores.from_mteb(file, bench)
-
-
-def test_mteb_shows_its_own_models_the_prefix_as_a_grid(micro_store, run_harness, tmp_path) -> None:
-    (tmp_path / "run.py").write_text(MTEB)
-    released.clip(tmp_path / "clip")
-    folder = str(micro_store.folder)
-    run_harness("python", "run.py", "grids", str(tmp_path / "clip"), folder)
-    [file] = tmp_path.glob("predictions/*.json")
-    bench = dynapix.load(micro_store.folder)
-    assert 0 < dynapix.RetrievalScores.from_mteb(file, bench).metrics["mrr"] < 1
 
 
 @pytest.fixture
