@@ -11,45 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import transformers
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
-from transformers import (
-    Gemma3Config,
-    Gemma3ForConditionalGeneration,
-    Gemma3ImageProcessor,
-    Gemma3Processor,
-    GotOcr2ImageProcessor,
-    InternVLConfig,
-    InternVLForConditionalGeneration,
-    InternVLProcessor,
-    InternVLVideoProcessor,
-    LlavaOnevisionConfig,
-    LlavaOnevisionForConditionalGeneration,
-    LlavaOnevisionImageProcessor,
-    LlavaOnevisionProcessor,
-    LlavaOnevisionVideoProcessor,
-    PreTrainedModel,
-    PreTrainedTokenizerFast,
-    ProcessorMixin,
-    Qwen2_5_VLConfig,
-    Qwen2_5_VLForConditionalGeneration,
-    Qwen2_5_VLProcessor,
-    Qwen2VLImageProcessor,
-    Qwen2VLVideoProcessor,
-    Qwen3_5Config,
-    Qwen3_5ForConditionalGeneration,
-    Qwen3VLProcessor,
-    Qwen3VLVideoProcessor,
-    SmolVLMConfig,
-    SmolVLMForConditionalGeneration,
-    SmolVLMImageProcessor,
-    SmolVLMProcessor,
-    SmolVLMVideoProcessor,
-)
+
+from dynapix.models.tiny_qwen3_vl import CHAT_TEMPLATE
 
 IMAGE_SIZE = 56
 VISION = {
     "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 2,
     "image_size": IMAGE_SIZE, "patch_size": 14,
+}  # fmt: skip
+QWEN_VISION = {
+    "hidden_size": 32, "intermediate_size": 48, "depth": 2, "num_heads": 2, "out_hidden_size": 64,
+    "patch_size": 14,
 }  # fmt: skip
 TEXT = {
     # The 4-bit layers of a CPU need at least 64 inputs.
@@ -61,27 +35,17 @@ QWEN_TOKENS = (
     "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>",
     "<|image_pad|>", "<|video_pad|>",
 )  # fmt: skip
-QWEN_PART = (
-    "{%- for part in message.content -%}"
-    "{%- if part.type == 'image' -%}<|vision_start|><|image_pad|><|vision_end|>"
-    "{%- elif part.type == 'video' -%}<|vision_start|><|video_pad|><|vision_end|>"
-    "{%- else -%}{{ part.text }}{%- endif -%}{%- endfor -%}"
-)
-QWEN3_VL_TEMPLATE = (
-    "{%- for message in messages -%}{{ '<|im_start|>' + message.role + '\n' }}"
-    "{%- if message.content is string -%}{{ message.content }}"
-    f"{{%- else -%}}{QWEN_PART}{{%- endif -%}}"
-    "{{ '<|im_end|>\n' }}{%- endfor -%}"
-    "{%- if add_generation_prompt -%}{{ '<|im_start|>assistant\n' }}{%- endif -%}"
+QWEN3_VL_TEMPLATE = CHAT_TEMPLATE.replace(
+    "<|video_pad|>", "<|vision_start|><|video_pad|><|vision_end|>"
 )
 """Qwen3-VL Instruct and Embedding."""
+PROMPT_END = r"{{ '<|im_start|>assistant\n' }}"
 QWEN3_VL_THINKING_TEMPLATE = QWEN3_VL_TEMPLATE.replace(
-    "'<|im_start|>assistant\n'", "'<|im_start|>assistant\n<think>\n'"
+    PROMPT_END, r"{{ '<|im_start|>assistant\n<think>\n' }}"
 )
 QWEN3_5_TEMPLATE = QWEN3_VL_TEMPLATE.replace(
-    "{{ '<|im_start|>assistant\n' }}",
-    "{{ '<|im_start|>assistant\n' }}"
-    "{%- if enable_thinking is defined and enable_thinking is false -%}"
+    PROMPT_END,
+    f"{PROMPT_END}{{%- if enable_thinking is defined and enable_thinking is false -%}}"
     "{{ '<think>\n\n</think>\n\n' }}{%- else -%}{{ '<think>\n' }}{%- endif -%}",
 )
 QWEN2_5_VL_TEMPLATE = (
@@ -98,11 +62,9 @@ SMOLVLM_TEMPLATE = (
 )
 INTERNVL_TEMPLATE = (
     "{% for message in messages %}{{ '<|im_start|>' + message['role'] + '\n' }}"
-    "{% if message['content'] is string %}{{ message['content'] }}{% else %}"
     "{% for content in message['content'] %}"
     "{% if content['type'] == 'image' %}{{ '<IMG_CONTEXT>\n' }}"
-    "{% elif content['type'] == 'video' %}{{ '<video>\n' }}"
-    "{% elif content['type'] == 'text' %}{{ content['text'] }}{% endif %}{% endfor %}{% endif %}"
+    "{% elif content['type'] == 'text' %}{{ content['text'] }}{% endif %}{% endfor %}"
     "{{ '<|im_end|>\n' }}{% endfor %}"
     "{% if add_generation_prompt %}{{ '<|im_start|>assistant\n' }}{% endif %}"
 )
@@ -121,36 +83,30 @@ LLAVA_ONEVISION_TEMPLATE = (
     "{% for message in messages %}{{ '<|im_start|>' + message['role'] + ' ' }}"
     "{% for content in message['content'] | selectattr('type', 'equalto', 'image') %}"
     "{{ '<image>' }}{% endfor %}"
-    "{% for content in message['content'] | selectattr('type', 'equalto', 'video') %}"
-    "{{ '<video>' }}{% endfor %}"
     "{% for content in message['content'] | selectattr('type', 'equalto', 'text') %}"
     "{{ '\n' + content['text'] }}{% endfor %}{{ '<|im_end|>' }}{% endfor %}"
     "{% if add_generation_prompt %}{{ '<|im_start|>assistant\n' }}{% endif %}"
 )
 """It writes all images of a message before its texts."""
 
-Parts = tuple[PreTrainedModel, ProcessorMixin]
+Parts = tuple[transformers.PreTrainedModel, transformers.ProcessorMixin]
 
 
 def qwen2_5_vl(corpus: Iterable[str]) -> Parts:
     tokenizer = build_tokenizer(corpus, QWEN_TOKENS, end="<|im_end|>")
     rope = {"rope_type": "default", "rope_theta": 1e6, "mrope_section": [4, 6, 6]}
-    config = Qwen2_5_VLConfig(
+    config = transformers.Qwen2_5_VLConfig(
         text_config={**text_config(tokenizer), "rope_parameters": rope},
-        vision_config={
-            "depth": 2, "hidden_size": 32, "intermediate_size": 48, "num_heads": 2,
-            "out_hidden_size": 64, "patch_size": 14, "window_size": 56,
-            "fullatt_block_indexes": [1],
-        },
+        vision_config={**QWEN_VISION, "window_size": 56, "fullatt_block_indexes": [1]},
         **media_ids(tokenizer),
-    )  # fmt: skip
-    processor = Qwen2_5_VLProcessor(
-        Qwen2VLImageProcessor(patch_size=14),
+    )
+    processor = transformers.Qwen2_5_VLProcessor(
+        transformers.Qwen2VLImageProcessor(patch_size=14),
         tokenizer,
-        Qwen2VLVideoProcessor(patch_size=14),
+        transformers.Qwen2VLVideoProcessor(patch_size=14),
         chat_template=QWEN2_5_VL_TEMPLATE,
     )
-    return Qwen2_5_VLForConditionalGeneration(config), processor
+    return transformers.Qwen2_5_VLForConditionalGeneration(config), processor
 
 
 def qwen3_5(corpus: Iterable[str]) -> Parts:
@@ -159,7 +115,7 @@ def qwen3_5(corpus: Iterable[str]) -> Parts:
         "rope_type": "default", "rope_theta": 1e6, "mrope_section": [4, 2, 2],
         "mrope_interleaved": True, "partial_rotary_factor": 0.5,
     }  # fmt: skip
-    config = Qwen3_5Config(
+    config = transformers.Qwen3_5Config(
         text_config={
             **text_config(tokenizer), "rope_parameters": rope,
             "layer_types": ["linear_attention", "full_attention"],
@@ -167,21 +123,18 @@ def qwen3_5(corpus: Iterable[str]) -> Parts:
             # The 4-bit layers of a CPU need a multiple of 32 outputs.
             "linear_num_value_heads": 32,
         },
-        vision_config={
-            "depth": 2, "hidden_size": 32, "intermediate_size": 48, "num_heads": 2,
-            "out_hidden_size": 64, "patch_size": 14, "num_position_embeddings": 16,
-        },
+        vision_config={**QWEN_VISION, "num_position_embeddings": 16},
         tie_word_embeddings=True,
         **media_ids(tokenizer),
     )  # fmt: skip
     half = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
-    processor = Qwen3VLProcessor(
-        Qwen2VLImageProcessor(patch_size=14, **half),
+    processor = transformers.Qwen3VLProcessor(
+        transformers.Qwen2VLImageProcessor(patch_size=14, **half),
         tokenizer,
-        Qwen3VLVideoProcessor(patch_size=14, **half),
+        transformers.Qwen3VLVideoProcessor(patch_size=14, **half),
         chat_template=QWEN3_5_TEMPLATE,
     )
-    return Qwen3_5ForConditionalGeneration(config), processor
+    return transformers.Qwen3_5ForConditionalGeneration(config), processor
 
 
 def smolvlm(corpus: Iterable[str]) -> Parts:
@@ -190,7 +143,7 @@ def smolvlm(corpus: Iterable[str]) -> Parts:
         "<global-img>", "<image>",
     )  # fmt: skip
     tokenizer = build_tokenizer(corpus, special, end="<end_of_utterance>")
-    config = SmolVLMConfig(
+    config = transformers.SmolVLMConfig(
         text_config={**text_config(tokenizer), "model_type": "llama"},
         vision_config=VISION,
         scale_factor=2,
@@ -198,14 +151,16 @@ def smolvlm(corpus: Iterable[str]) -> Parts:
         tie_word_embeddings=True,
     )
     size = {"longest_edge": IMAGE_SIZE}
-    processor = SmolVLMProcessor(
-        SmolVLMImageProcessor(size={"longest_edge": 4 * IMAGE_SIZE}, max_image_size=size),
+    processor = transformers.SmolVLMProcessor(
+        transformers.SmolVLMImageProcessor(
+            size={"longest_edge": 4 * IMAGE_SIZE}, max_image_size=size
+        ),
         tokenizer,
-        SmolVLMVideoProcessor(size=size, max_image_size=size),
+        transformers.SmolVLMVideoProcessor(size=size, max_image_size=size),
         image_seq_len=4,
         chat_template=SMOLVLM_TEMPLATE,
     )
-    return SmolVLMForConditionalGeneration(config), processor
+    return transformers.SmolVLMForConditionalGeneration(config), processor
 
 
 def internvl(corpus: Iterable[str]) -> Parts:
@@ -215,7 +170,7 @@ def internvl(corpus: Iterable[str]) -> Parts:
     }  # fmt: skip
     special = ("<|endoftext|>", "<|im_start|>", "<|im_end|>", *named.values())
     tokenizer = build_tokenizer(corpus, special, end="<|im_end|>", named=named)
-    config = InternVLConfig(
+    config = transformers.InternVLConfig(
         text_config={**text_config(tokenizer), "model_type": "qwen2"},
         vision_config={**VISION, "image_size": [IMAGE_SIZE] * 2, "patch_size": [14, 14]},
         image_token_id=tokenizer.convert_tokens_to_ids("<IMG_CONTEXT>"),
@@ -223,14 +178,14 @@ def internvl(corpus: Iterable[str]) -> Parts:
         tie_word_embeddings=True,
     )
     size = {"height": IMAGE_SIZE, "width": IMAGE_SIZE}
-    processor = InternVLProcessor(
-        GotOcr2ImageProcessor(size=size, crop_to_patches=True),
+    processor = transformers.InternVLProcessor(
+        transformers.GotOcr2ImageProcessor(size=size, crop_to_patches=True),
         tokenizer,
-        InternVLVideoProcessor(size=size),
+        transformers.InternVLVideoProcessor(size=size),
         image_seq_length=4,
         chat_template=INTERNVL_TEMPLATE,
     )
-    return InternVLForConditionalGeneration(config), processor
+    return transformers.InternVLForConditionalGeneration(config), processor
 
 
 def gemma3(corpus: Iterable[str]) -> Parts:
@@ -243,7 +198,7 @@ def gemma3(corpus: Iterable[str]) -> Parts:
     )  # fmt: skip
     tokenizer = build_tokenizer(corpus, special, end="<eos>", pad="<pad>", named=named, bos="<bos>")
     ids = {name: tokenizer.convert_tokens_to_ids(token) for name, token in named.items()}
-    config = Gemma3Config(
+    config = transformers.Gemma3Config(
         text_config={
             **text_config(tokenizer), "sliding_window": 64, "query_pre_attn_scalar": 32,
             "layer_types": ["sliding_attention", "full_attention"],
@@ -256,13 +211,13 @@ def gemma3(corpus: Iterable[str]) -> Parts:
         tie_word_embeddings=True,
     )  # fmt: skip
     size = {"height": IMAGE_SIZE, "width": IMAGE_SIZE}
-    processor = Gemma3Processor(
-        Gemma3ImageProcessor(size=size),
+    processor = transformers.Gemma3Processor(
+        transformers.Gemma3ImageProcessor(size=size),
         tokenizer,
         chat_template=GEMMA3_TEMPLATE,
         image_seq_length=4,
     )
-    model = Gemma3ForConditionalGeneration(config)
+    model = transformers.Gemma3ForConditionalGeneration(config)
     # As released: the token that ends a turn is not the tokenizer's.
     ends = [tokenizer.eos_token_id, tokenizer.convert_tokens_to_ids("<end_of_turn>")]
     model.generation_config.update(eos_token_id=ends, top_k=64, top_p=0.95, do_sample=True)
@@ -274,7 +229,7 @@ def llava_onevision(corpus: Iterable[str]) -> Parts:
     tokenizer = build_tokenizer(corpus, special, end="<|im_end|>")
     ids = {name: tokenizer.convert_tokens_to_ids(f"<{name}>") for name in ("image", "video")}
     grid = [[IMAGE_SIZE * k, IMAGE_SIZE * n] for k in (1, 2) for n in (1, 2)]
-    config = LlavaOnevisionConfig(
+    config = transformers.LlavaOnevisionConfig(
         text_config={**text_config(tokenizer), "model_type": "qwen2"},
         vision_config={**VISION, "model_type": "siglip_vision_model", "vision_use_head": False},
         image_token_index=ids["image"],
@@ -285,15 +240,15 @@ def llava_onevision(corpus: Iterable[str]) -> Parts:
         tie_word_embeddings=True,
     )
     size = {"height": IMAGE_SIZE, "width": IMAGE_SIZE}
-    processor = LlavaOnevisionProcessor(
-        LlavaOnevisionImageProcessor(size=size, image_grid_pinpoints=grid),
+    processor = transformers.LlavaOnevisionProcessor(
+        transformers.LlavaOnevisionImageProcessor(size=size, image_grid_pinpoints=grid),
         tokenizer,
-        LlavaOnevisionVideoProcessor(size=size),
+        transformers.LlavaOnevisionVideoProcessor(size=size),
         num_image_tokens=16,
         vision_feature_select_strategy="full",
         chat_template=LLAVA_ONEVISION_TEMPLATE,
     )
-    return LlavaOnevisionForConditionalGeneration(config), processor
+    return transformers.LlavaOnevisionForConditionalGeneration(config), processor
 
 
 FAMILIES: dict[str, Callable[[Iterable[str]], Parts]] = {
@@ -319,7 +274,7 @@ def build_tokenizer(
     pad: str = "<|endoftext|>",
     named: dict[str, str] | None = None,
     bos: str | None = None,
-) -> PreTrainedTokenizerFast:
+) -> transformers.PreTrainedTokenizerFast:
     """Return a byte-level BPE tokenizer with special tokens; those in `named` become attributes."""
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
@@ -337,7 +292,7 @@ def build_tokenizer(
             single=f"{bos} $A", special_tokens=[(bos, tokenizer.token_to_id(bos))]
         )
     others = [token for token in special if token not in (end, pad, bos)]
-    return PreTrainedTokenizerFast(
+    return transformers.PreTrainedTokenizerFast(
         tokenizer_object=tokenizer,
         eos_token=end,
         pad_token=pad,
@@ -347,7 +302,7 @@ def build_tokenizer(
     )
 
 
-def text_config(tokenizer: PreTrainedTokenizerFast) -> dict[str, Any]:
+def text_config(tokenizer: transformers.PreTrainedTokenizerFast) -> dict[str, Any]:
     return {
         **TEXT,
         "vocab_size": len(tokenizer),
@@ -357,7 +312,7 @@ def text_config(tokenizer: PreTrainedTokenizerFast) -> dict[str, Any]:
     }
 
 
-def media_ids(tokenizer: PreTrainedTokenizerFast) -> dict[str, int]:
+def media_ids(tokenizer: transformers.PreTrainedTokenizerFast) -> dict[str, int]:
     names = {
         "image_token_id": "image_pad", "video_token_id": "video_pad",
         "vision_start_token_id": "vision_start", "vision_end_token_id": "vision_end",

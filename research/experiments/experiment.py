@@ -22,7 +22,7 @@ import pandas as pd
 from benchmarks.arguments import positive_int
 from dynapix.conf.compose import compose
 from dynapix.conf.files import write_bytes
-from dynapix.conf.schema import BenchmarkConfig, SelectCommand
+from dynapix.conf.schema import SelectCommand
 from dynapix.data.store import Store, open_store
 from dynapix.evaluation.metrics.results import SelectionReport, from_json, variant_name
 from dynapix.evaluation.reporting.run_responses import Responses, read_responses, reading
@@ -185,14 +185,10 @@ def training_key(
     return settings_key([{name: settings.get(name) for name in deciding}, versions])
 
 
-def compose_benchmark(benchmark: str) -> BenchmarkConfig:
-    """Return the settings of a preset."""
-    return compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
-
-
 def open_benchmark(store: Path, benchmark: str) -> Store:
     """Return the built benchmark of a preset."""
-    return open_store(store / compose_benchmark(benchmark).store_name)
+    preset = compose("evaluation.select", SelectCommand, [f"benchmark={benchmark}"]).benchmark
+    return open_store(store / preset.store_name)
 
 
 def read_item_responses(folder: Path, mode: str, control: str | None = None) -> Responses:

@@ -12,14 +12,14 @@ from transformers import PreTrainedTokenizerBase, ProcessorMixin
 
 from dynapix.data.records import LETTERS
 from dynapix.models.student.collator import Collator
-from research.tiny_base.located_mentions import (
+from research.tiny_base.mentions import (
     LocatedMention,
+    TokenizedText,
     find_next_in_candidates,
     find_next_in_clip,
     find_repeats,
     locate_mentions,
 )
-from research.tiny_base.mentions import TokenizedText
 from research.tiny_base.oracle_targets import (
     PICTURES,
     SPATIAL_WORDS,

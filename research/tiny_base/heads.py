@@ -25,7 +25,7 @@ they predict. They read
 
 A text attends to what earlier layers stored at the visual tokens, so static properties are trained
 at the tower's output and motion in the middle layers. Attention heads are trained too (see
-`research.tiny_base.pointing`).
+`research.tiny_base.trace`).
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ SMOOTH_L1_BETA = 0.1
 """Scaled error above which the loss of a place or displacement is linear."""
 MOVING_SPEED = 0.012
 """An object moves if its velocity, as a share of the image in 10 frames, is above this.
-Displacements ahead are measured for objects that move, `since` and `future` for objects that are
-displaced by more than this."""
+Displacements ahead are measured for objects that move, `since` for objects that are displaced by
+more than this."""
 
 
 class OracleHeads(nn.Module):
@@ -146,8 +146,7 @@ class OracleHeads(nn.Module):
             `color`, `material` and `shape` (N,), whether the word is right; `moving` and, for
             moving objects, `heading` (one of eight), likewise; and errors as shares of the image:
             `place_error`, and `<displacement>_error` beside `<displacement>_still`, the error of
-            predicting no displacement, of objects that are displaced, and `separation_error` beside
-            `separation_constant`, the error of the median.
+            predicting no displacement, of objects that are displaced.
         """
         truth = targets.truth
         row, token = targets.objects.T
@@ -178,10 +177,6 @@ class OracleHeads(nn.Module):
                 displaced = moves & ~distances.isnan()
             found[f"{name}_error"] = (read[name] - truth[name]).norm(dim=1)[displaced]
             found[f"{name}_still"] = distances[displaced]
-        separation = truth["separation"][:, 0]
-        compared = ~separation.isnan()
-        found["separation_error"] = (read["separation"][:, 0] - separation)[compared].abs()
-        found["separation_constant"] = (separation - separation.nanmedian())[compared].abs()
         return found
 
     def name_word_losses(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
@@ -233,36 +228,6 @@ class OracleHeads(nn.Module):
             logits = described[letters >= 0] @ self._embedding[0].weight[self._letter_ids].T
             losses["letter"] = cross_entropy(logits, letters[letters >= 0])
         return losses
-
-    def description_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
-        """Return `description_place_error`, the error of the place that the heads read at the
-        tokens that describe a named object, as a share of the image."""
-        row, at = targets.description_tokens.T
-        read = self.description["place"](self.norms["description"](hidden[row, at])).float()
-        errors = (read / SCALES["place"] - targets.description_states[:, :2]).norm(dim=1)
-        return {"description_place_error": errors[~errors.isnan()]}
-
-    def name_measures(self, hidden: Tensor, targets: OracleTargets) -> dict[str, Tensor]:
-        """Return what the heads read at names: `name_visible`, whether they tell if a picture
-        shows the object, and errors as shares of the image: `name_place_error`, and
-        `name_future_error` beside `name_future_still`, the error of predicting no displacement, of
-        objects that will be displaced."""
-        row, at = targets.names.T
-        names = self.norms["name"](hidden[row, at])
-        read = {name: self.name[name](names).float() for name in ("places", "future")}
-        places = (read["places"] / SCALES["place"] - targets.name_places).unflatten(1, (-1, 2))
-        errors = places.norm(dim=-1)
-        still = targets.name_displacements.norm(dim=1)
-        displaced = still > MOVING_SPEED
-        future = (read["future"] / SCALES["since"] - targets.name_displacements).norm(dim=1)
-        pictures = targets.has_picture[row]
-        visible = (self.name["visible"](names) > 0) == (targets.name_tokens >= 0)
-        return {
-            "name_visible": visible[pictures].float(),
-            "name_place_error": errors[~errors.isnan()],
-            "name_future_error": future[displaced],
-            "name_future_still": still[displaced],
-        }
 
 
 def regression_loss(predicted: Tensor, true: Tensor, scale: float) -> Tensor:

@@ -86,7 +86,7 @@ class Question:
         clip, candidates: Whether the prompt shows the clip, and the candidates.
         predicts_target: Whether the answer's predictions are true of the target.
         false_spans: Spans of the answer that are false on purpose (see
-            `research.tiny_base.false_words`).
+            `research.tiny_base.samples`).
         instead: The frame that is shown instead of the target, if any.
     """
 

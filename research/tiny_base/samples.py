@@ -3,10 +3,16 @@
 A sample shows the clip, the candidates, both or neither, as a selection prompt shows them, and asks
 a question of `research.tiny_base.questions`, or none. The base is trained on the items of some
 scenes and measured on those of held-out scenes.
+
+A model makes mistakes in the predictions and descriptions that it writes. If it was trained only on
+true texts, it relies on these mistakes when it chooses a candidate. So some words for places and
+relations are replaced by false ones, and the loss ignores them: the base learns to continue
+correctly after a mistake, but not to write one.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,16 +20,25 @@ import numpy as np
 
 from dynapix.conf.runs import rank, world_size
 from dynapix.data.frames.frame_cache import FrameReader
-from dynapix.data.records import LETTERS, SelectionItem, original_scene_id, sample_prefix_frames
+from dynapix.data.records import (
+    COLORS,
+    LETTERS,
+    SelectionItem,
+    original_scene_id,
+    sample_prefix_frames,
+)
 from dynapix.data.store import Store
 from dynapix.models.student.prompts import Sample, build_sample, load_clip
 from dynapix.teacher.candidate_letters import reorder_candidates
 from dynapix.teacher.predicates.extraction import extract_predicates
+from dynapix.teacher.predicates.facts import REGIONS
 from dynapix.teacher.predicates.motion import find_cut
+from dynapix.teacher.predicates.relations import VALUES
+from dynapix.teacher.sections import split_sections
+from dynapix.teacher.writers.relational import PHRASES
 from dynapix.train.common.held_out import check_not_empty, held_out_scenes
 from dynapix.train.student.dataset import prompt_corpus, uses_only
 from dynapix.train.student.samples import seeded_rng
-from research.tiny_base.false_words import falsify_words
 from research.tiny_base.oracle_targets import (
     ObjectTarget,
     clip_targets,
@@ -52,6 +67,9 @@ FALSE_WORDS = 0.25
 `COMPARISONS`. A trained base writes about as large a share of its regions wrongly."""
 CORPUS_ITEMS = 800
 """Number of items whose texts the tokenizer is trained on."""
+FALSIFIED_SECTIONS = ("Prediction", "Candidate analysis")
+FALSIFIED_KINDS = ("side", "height", "gap", "cover", "extreme")
+"""Kinds of relations whose words are replaced by another word of the kind."""
 
 
 @dataclass(frozen=True)
@@ -191,3 +209,60 @@ def tokenizer_corpus(sampler: ItemSampler) -> list[str]:
         for kind in KINDS
     ]
     return prompt_corpus(items, QUESTIONS) + answers
+
+
+def list_alternatives() -> dict[str, list[str]]:
+    """Return the words that may replace each word: for a region those beside it, and for a relation
+    the others of its kind."""
+    found = {
+        region: [
+            other
+            for y, others in enumerate(REGIONS)
+            for x, other in enumerate(others)
+            if abs(x - column) + abs(y - row) == 1
+        ]
+        for row, regions in enumerate(REGIONS)
+        for column, region in enumerate(regions)
+    }
+    for kind in FALSIFIED_KINDS:
+        words = [PHRASES[value].removesuffix(" {b}") for value in VALUES[kind]]
+        found |= {word: [other for other in words if other != word] for word in words}
+    return found
+
+
+ALTERNATIVES = list_alternatives()
+WORD = re.compile(
+    rf"\b(?:{'|'.join(sorted(ALTERNATIVES, key=len, reverse=True))})"
+    # "near" is a relation only before an object: "near the red cube", "near it".
+    rf"(?![-\w])(?:(?<!\bnear)|(?= it\b| the (?:{'|'.join(COLORS)})\b))"
+)
+
+
+def falsify_words(
+    text: str, share: float, rng: np.random.Generator
+) -> tuple[str, tuple[tuple[int, int], ...]]:
+    """Replace a share of the words for places and relations in predictions and candidate analyses.
+
+    Args:
+        share: Probability that a word is replaced.
+        rng: Chooses the words and their replacements.
+
+    Returns:
+        The text, and the spans that are not to be trained: each false word and the character after
+        it, because "near the top" may replace "near the top-left".
+    """
+    parts, spans, length, end = [], [], 0, 0
+    for title, start, stop in split_sections(text):
+        if title not in FALSIFIED_SECTIONS:
+            continue
+        for match in WORD.finditer(text, start, stop):
+            if rng.random() >= share:
+                continue
+            options = ALTERNATIVES[match.group()]
+            false = options[rng.integers(len(options))]
+            before = text[end : match.start()]
+            parts += [before, false]
+            length += len(before) + len(false)
+            spans.append((length - len(false), length + 1))
+            end = match.end()
+    return "".join([*parts, text[end:]]), tuple(spans)

@@ -49,10 +49,6 @@ class TinyBaseTrainConfig(Settings):
     """Maximum norm of the gradient of the model's weights, to which it is clipped."""
     precision: str = setting("auto", ("auto", "bf16", "fp32"))
     """Precision of the forward and backward pass, as in `train.sft`."""
-    hold_out: bool = True
-    """Hold out a tenth of the training scenes, on whose items or queries the evaluations of the run
-    are measured. false trains on all of them, as the paper does; the evaluations are then measured
-    on a sample of what the run trains on."""
     evaluations: int = setting(10, least=1)
     """Number of evaluations of each stage. A checkpoint follows each evaluation."""
     checkpoint_steps: int = setting(200, least=1)

@@ -40,10 +40,9 @@ from dynapix.train.common.curves import plot_curves
 from dynapix.train.common.journal import CURVES, JOURNAL, read_journal
 from research.tiny_base.collator import OracleCollator, letter_token_ids
 from research.tiny_base.heads import OracleHeads
+from research.tiny_base.measures import Probe
 from research.tiny_base.muon import Muon
 from research.tiny_base.oracle_targets import SPATIAL_WORDS, WORDS, OracleTargets
-from research.tiny_base.pointing import pointing_losses
-from research.tiny_base.probe import Probe
 from research.tiny_base.questions import KINDS
 from research.tiny_base.samples import ItemSampler
 from research.tiny_base.settings import StageConfig, TinyBaseCommand, TinyBaseTrainConfig
@@ -53,6 +52,7 @@ from research.tiny_base.trace import (
     SPEAKING,
     Trace,
     encode_pictures,
+    pointing_losses,
     select_tokens,
     trace_forward,
     trace_states,

@@ -45,41 +45,33 @@ def hub(tmp_path, monkeypatch):
     return cached / "refs" / "main"
 
 
-def test_a_resumed_run_keeps_its_precision(base, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("dynapix.models.precision.supports_bf16", lambda on_cpu=False: True)
-    assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
-    monkeypatch.setattr("dynapix.models.precision.supports_bf16", lambda on_cpu=False: False)
-    assert resolve_run(tmp_path, "auto", base, "x") == ("bf16", base)
-    assert resolve_precision("auto") == "fp32"
-
-
 @pytest.mark.parametrize(
     ("instructions", "expected"),
     [({"avx512_bf16": True, "avx2": True}, "bf16"), ({"amx_bf16": False, "avx2": True}, "fp32")],
 )
-def test_auto_is_bf16_if_the_cpu_has_instructions_for_it(
-    monkeypatch, instructions, expected
+def test_a_resumed_run_keeps_the_precision_that_the_cpu_had_instructions_for(
+    base, tmp_path, monkeypatch, instructions, expected
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: instructions)
-    assert resolve_precision("auto") == expected
+    assert resolve_run(tmp_path, "auto", base, "x") == (expected, base)
+    other = {"avx512_bf16": expected == "fp32"}
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: other)
+    assert resolve_precision("auto") != expected
+    assert resolve_run(tmp_path, "auto", base, "x") == (expected, base)
 
 
-def test_other_data_are_refused(base, tmp_path) -> None:
+def test_other_data_or_weights_are_refused(base, tmp_path) -> None:
     first = data_digest("store", ["a", "b"])
     assert first != data_digest("store", ["b", "a"]) != data_digest("other", ["a", "b"])
     resolve_run(tmp_path, "fp32", base, first)
     with raises_user_error("other-data", contains=str(tmp_path)):
         resolve_run(tmp_path, "fp32", base, data_digest("store", ["a"]))
-
-
-def test_other_weights_in_the_base_are_refused(base, tmp_path) -> None:
-    resolve_run(tmp_path, "fp32", base, "x")
     check_base(tmp_path, base)
     path = tmp_path / "base" / "model.safetensors"
     changed = {name: weight + 1e-3 for name, weight in load_file(path).items()}
     save_file(changed, path, metadata={"format": "pt"})
-    for attempt in (check_base, lambda f, cfg: resolve_run(f, "fp32", cfg, "x")):
+    for attempt in (check_base, lambda f, cfg: resolve_run(f, "fp32", cfg, first)):
         with raises_user_error("other-base", contains=base.model):
             attempt(tmp_path, base)
 
@@ -104,21 +96,18 @@ def test_a_run_keeps_the_commit_of_a_hub_base(tmp_path, hub) -> None:
 
 def test_a_missing_base_does_not_change_the_resolved_values(base, tmp_path, hub) -> None:
     """The error for a missing base is raised when it is loaded."""
-    folder = tmp_path / "run"
+    folder, away = tmp_path / "run", tmp_path / "away"
     folder.mkdir()
-    (tmp_path / "base").rename(tmp_path / "away")
+    (tmp_path / "base").rename(away)
     resolve_run(folder, "fp32", base, "x")
     assert not (folder / RESOLVED).exists()
-    (tmp_path / "away").rename(tmp_path / "base")
+    away.rename(tmp_path / "base")
     resolve_run(folder, "fp32", base, "x")
     before = read_resolved(folder)
-    (tmp_path / "base").rename(tmp_path / "away")
+    (tmp_path / "base").rename(away)
     resolve_run(folder, "fp32", base, "x")
     assert read_resolved(folder) == before
-
-
-@pytest.mark.parametrize("content", ["[", "3", "precision: bf16"])
-def test_a_damaged_file_is_refused(tmp_path, content) -> None:
-    (tmp_path / RESOLVED).write_text(content)
-    with raises_user_error("damaged-file", contains=RESOLVED):
-        read_resolved(tmp_path)
+    for content in ("[", "3", "precision: bf16"):
+        (folder / RESOLVED).write_text(content)
+        with raises_user_error("damaged-file", contains=RESOLVED):
+            read_resolved(folder)

@@ -15,7 +15,7 @@ from dynapix.conf.schema import LoraConfig
 from dynapix.models import loading
 from dynapix.models.layers.attention import MATMUL
 from dynapix.models.layers.fast_layers import use_fast_layers
-from dynapix.models.layers.shared_prompts import PADDING, SHARED, pack_samples, shares_prompts
+from dynapix.models.layers.shared_prompts import pack_samples, shares_prompts
 from dynapix.models.student.collator import Collator
 from dynapix.models.student.prompts import selection_sample
 from tests.tiny_models import assert_equal_gradients, loss_and_gradients, randomize_adapters
@@ -37,13 +37,11 @@ def parts(nf4_cfg, micro_store, frames):
     items = list({i.scene_id: i for i in micro_store.selection("train")}.values())
 
     def make_batch(chosen: Sequence[tuple[int, str]]) -> dict[str, Any]:
+        responses = {"reasoning": RATIONALE, "answer": "Answer: C"}
         samples = [
-            selection_sample(
-                items[k], mode, "cot", frames, cfg.frames,
-                RATIONALE if mode == "reasoning" else "Answer: C",
-            )
+            selection_sample(items[k], mode, "cot", frames, cfg.frames, responses[mode])
             for k, mode in chosen
-        ]  # fmt: skip
+        ]
         return Collator(processor, 1500)(samples)
 
     fast = copy.deepcopy(model)
@@ -73,8 +71,9 @@ def assert_equal_results(model: nn.Module, fast: nn.Module, batch: dict[str, Any
     return packed
 
 
-@pytest.mark.parametrize("attention", ["sdpa", "eager", MATMUL])
-@pytest.mark.parametrize("chosen", [ONE_ITEM, MIXED], ids=["one item", "mixed"])
+@pytest.mark.parametrize(
+    ("attention", "chosen"), [("sdpa", ONE_ITEM), ("sdpa", MIXED), (MATMUL, MIXED)]
+)
 def test_loss_and_gradients_do_not_change(parts, attention, chosen) -> None:
     model, fast, make_batch = parts
     batch = make_batch(chosen)
@@ -86,61 +85,48 @@ def test_loss_and_gradients_do_not_change(parts, attention, chosen) -> None:
     # A row has the longest sample and no more than the last instruction and answer of another.
     longest = batch["attention_mask"].sum(dim=1).max()
     assert longest < packed[1] < longest + 80
-
-
-def test_padding_on_the_right_changes_nothing(parts) -> None:
-    """TRL pads prompts on the left and responses on the right."""
-    model, fast, make_batch = parts
-    batch, count = make_batch(MIXED), 7
-    names = [name for name, value in batch.items() if value.shape == batch["input_ids"].shape]
+    # TRL also pads responses on the right.
+    count, shape = 7, batch["input_ids"].shape
     padded = {
-        **batch,
-        **{name: torch.nn.functional.pad(batch[name], (0, count)) for name in names},
-        "labels": torch.nn.functional.pad(batch["labels"], (0, count), value=-100),
-        "logits_to_keep": torch.arange(
-            batch["logits_to_keep"][0], batch["logits_to_keep"][-1] + count + 1
-        ),
+        name: nn.functional.pad(value, (0, count)) if value.shape == shape else value
+        for name, value in batch.items()
     }
-    without, with_padding = results(fast, batch), results(fast, padded)
-    assert without[2] == with_padding[2]
-    torch.testing.assert_close(with_padding[0], results(model, batch)[0], rtol=1e-5, atol=0)
+    kept = batch["logits_to_keep"]
+    padded["labels"] = nn.functional.pad(batch["labels"], (0, count), value=-100)
+    padded["logits_to_keep"] = torch.arange(kept[0], kept[-1] + count + 1)
+    loss, _, width = results(fast, padded)
+    assert width == packed
+    torch.testing.assert_close(loss, results(model, batch)[0], rtol=1e-5, atol=0)
 
 
 def test_recomputed_activations_and_a_trained_vision_tower(parts) -> None:
-    model, fast, make_batch = parts
-    for each in (model, fast):
+    *models, make_batch = parts
+    for each in models:
         each.get_base_model().gradient_checkpointing_enable({"use_reentrant": False})
         each.get_base_model().model.visual.requires_grad_(True)
     try:
-        packed = assert_equal_results(model, fast, make_batch(MIXED))
-        vision = fast.get_base_model().model.visual
+        packed = assert_equal_results(*models, make_batch(MIXED))
+        vision = models[1].get_base_model().model.visual
         assert all(weight.grad is not None for weight in vision.patch_embed.parameters())
     finally:
-        for each in (model, fast):
+        for each in models:
             each.get_base_model().model.visual.requires_grad_(False)
             each.get_base_model().gradient_checkpointing_disable()
     assert packed[0] == 3
 
 
-def test_prompts_without_frames_are_shared(parts) -> None:
-    model, fast, make_batch = parts
-    batch = make_batch(ONE_ITEM)
-    texts = {
-        name: batch[name] for name in ("input_ids", "attention_mask", "labels", "logits_to_keep")
-    }
-    assert assert_equal_results(model, fast, texts)[0] == 1
-
-
-def test_other_batches_are_computed_as_before(parts) -> None:
+def test_prompts_without_frames_are_shared_and_other_batches_are_not(parts) -> None:
     """Prompts of different items share their first words only, and one sample shares nothing."""
-    _, fast, make_batch = parts
+    model, fast, make_batch = parts
+    one_item = make_batch(ONE_ITEM)
+    names = ("input_ids", "attention_mask", "labels", "logits_to_keep")
+    assert assert_equal_results(model, fast, {name: one_item[name] for name in names})[0] == 1
     for chosen in ([(0, "answer"), (1, "answer")], [(0, "reasoning")]):
         batch = make_batch(chosen)
         assert results(fast, batch)[2] == batch["input_ids"].shape
-    batch = make_batch(ONE_ITEM)
     fast.eval()
     try:
-        assert results(fast, batch)[2] == batch["input_ids"].shape
+        assert results(fast, one_item)[2] == one_item["input_ids"].shape
     finally:
         fast.train()
     flash = copy.deepcopy(fast)
@@ -148,37 +134,16 @@ def test_other_batches_are_computed_as_before(parts) -> None:
     assert not shares_prompts(flash)
 
 
-def test_rows_have_each_token_of_each_sample_once() -> None:
-    """Samples of 9, 7 and 8 tokens: the first and the last start with the same 6."""
+def test_samples_share_a_row_where_it_makes_attention_cheapest() -> None:
     torch.manual_seed(0)
-    embeds = torch.randn(3, 9, 4)
-    mask = torch.tensor([[1] * 9, [0, 0] + [1] * 7, [0] + [1] * 8])
-    embeds[2, 1:7] = embeds[0, :6]
-    packing = pack_samples(embeds, mask)
-    assert packing.rows.tolist() == [0, 1, 0]
-    assert packing.parts.tolist() == [
-        [SHARED] * 6 + [1] * 3 + [2] * 2,
-        [PADDING] * 4 + [SHARED] * 7,
-    ]
-    back = packing.take(embeds)[packing.rows[:, None], packing.places]
-    assert torch.equal(back[mask > 0], embeds[mask > 0])
-
-
-def test_packing_must_make_attention_cheaper() -> None:
-    """Many responses in one row would attend over a longer row than each of them."""
+    # Two items show the same clip, which is half of their prompts.
+    embeds = torch.randn(4, 40, 4)
+    embeds[1:, :18] = embeds[:1, :18]
+    embeds[2:, 18:36] = embeds[:2, 18:36]
+    assert pack_samples(embeds, torch.ones(4, 40)).rows.tolist() == [0, 1, 0, 1]
+    # Many responses in one row would attend over a longer row than each of them.
     embeds = torch.randn(12, 20, 4)
     embeds[:, :10] = embeds[:1, :10]
     assert pack_samples(embeds, torch.ones(12, 20)) is None
     embeds[:, :18] = embeds[:1, :18]
     assert pack_samples(embeds, torch.ones(12, 20)).parts.shape == (1, 42)
-
-
-def test_a_sample_joins_the_row_with_the_longest_common_start() -> None:
-    """Two items show the same clip, which is half of their prompts."""
-    torch.manual_seed(0)
-    embeds = torch.randn(4, 40, 4)
-    embeds[1:, :18] = embeds[:1, :18]
-    embeds[2, 18:36] = embeds[0, 18:36]
-    embeds[3, 18:36] = embeds[1, 18:36]
-    packing = pack_samples(embeds, torch.ones(4, 40))
-    assert packing.rows.tolist() == [0, 1, 0, 1]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import pytest
 
 from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.records import SelectionItem
 from dynapix.data.store import Store
+from dynapix.models.tiny_qwen3_vl import build_model
 from dynapix.teacher.predicates.motion import find_cut
 from research.tiny_base.collator import OracleCollator, letter_token_ids
 from research.tiny_base.heads import OracleHeads
@@ -17,9 +20,10 @@ from research.tiny_base.samples import ItemSampler, OracleSample
 from research.tiny_base.trace import CHOOSING
 from research.tiny_base.training import first_token_ids
 from tests.tiny_models import *  # noqa: F403
+from tests.tiny_models import SMALL
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def items(micro_store: Store) -> list[SelectionItem]:
     return [
         item
@@ -28,32 +32,32 @@ def items(micro_store: Store) -> list[SelectionItem]:
     ]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def sampler(items: list[SelectionItem], frames: FrameReader) -> ItemSampler:
     return ItemSampler(items, frames, 6, seed=0)
 
 
-@pytest.fixture(scope="module")
-def samples(sampler: ItemSampler) -> list[OracleSample]:
-    return [sampler.make_sample(item, "compare", "test") for item in sampler.items[:3]]
+@pytest.fixture(scope="session")
+def ask(sampler: ItemSampler) -> Callable[..., list[OracleSample]]:
+    """A function that asks a kind of question about the first items."""
+
+    @cache
+    def ask(kind: str, count: int) -> list[OracleSample]:
+        return [sampler.make_sample(item, kind, "test") for item in sampler.items[:count]]
+
+    return ask
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def collate(processor) -> OracleCollator:
     return OracleCollator(processor, 1500)
 
 
-@pytest.fixture(params=[PICTURES + 1, 1], ids=["", "grouped"])
-def deep_model(model, request: pytest.FixtureRequest):
-    """A model with enough layers for all targets, without and with grouped-query attention."""
-    from dynapix.models.tiny_qwen3_vl import build_model
-    from tests.tiny_models import SMALL
-
-    model = build_model(
-        replace(SMALL, layers=CHOOSING + 1, heads=PICTURES + 1, kv_heads=request.param),
-        model.config.text_config.vocab_size,
-    )
-    return model.eval()
+@pytest.fixture
+def deep_model(processor):
+    """A model with enough layers for all targets, and grouped-query attention."""
+    sizes = replace(SMALL, layers=CHOOSING + 1, heads=PICTURES + 1, kv_heads=1)
+    return build_model(sizes, len(processor.tokenizer)).eval()
 
 
 @pytest.fixture
