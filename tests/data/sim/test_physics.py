@@ -30,25 +30,30 @@ def fingerprint(scene: Scene) -> str:
 
 
 def test_scenes_are_bit_identical_in_another_process_and_order() -> None:
-    first = [fingerprint(simulate_scene(3, k)) for k in (2, 0, 1)]
-    code = (
-        "from tests.data.sim.test_physics import *\n"
-        "for k in (0, 1, 2): print(fingerprint(simulate_scene(3, k)))"
-    )
-    second = run_child([sys.executable, "-c", code], check=True).stdout.split()
-    assert [first[1], first[2], first[0]] == second[-3:]
-
-
-def test_scenes_do_not_depend_on_the_kernels_of_blas() -> None:
     # OpenBLAS chooses its kernels by the processor, and they round differently. On a processor with
     # AVX-512, starting velocities in scenes 8 and 38 would differ if they depended on the kernels.
+    first = [fingerprint(simulate_scene(0, k)) for k in (38, 1, 8)]
     code = (
         "from tests.data.sim.test_physics import *\n"
-        "for k in (8, 38): print(fingerprint(simulate_scene(0, k)))"
+        "for k in (8, 38, 1): print(fingerprint(simulate_scene(0, k)))"
     )
     environment = {**os.environ, "OPENBLAS_CORETYPE": "Nehalem"}
     child = run_child([sys.executable, "-c", code], check=True, env=environment)
-    assert child.stdout.split()[-2:] == [fingerprint(simulate_scene(0, k)) for k in (8, 38)]
+    assert child.stdout.split()[-3:] == [first[2], first[0], first[1]]
+
+
+def test_motion_of_objects_added_one_by_one_equals_a_joint_simulation() -> None:
+    """The sampled scenes also respect the limits of their world."""
+    objects, most = CLEVRER.objects, CLEVRER.start.max_collisions
+    for index in range(4):
+        sample = sample_scene(CLEVRER, 11, index)
+        together = shared_simulator().simulate(sample.bodies, CLEVRER)
+        assert np.array_equal(together.states, sample.motion.states)
+        assert together.touching == sample.motion.touching
+        assert objects.min_count <= len(sample.bodies) <= objects.max_count
+        contacts = group_contacts(together.touching, FPS)
+        assert 1 <= len(contacts) == len({c.objects for c in contacts}) <= most
+        assert all(c.frame > 0 for c in contacts)
 
 
 def test_friction_decelerates_a_sliding_cube() -> None:
@@ -74,33 +79,14 @@ def test_contacts_within_the_gap_are_one_collision() -> None:
     assert len(group_contacts({(0, 1): [10, 14]}, fps=12)) == 2
 
 
-@pytest.mark.parametrize("index", range(4))
-def test_scenes_respect_the_limits(index: int) -> None:
-    scene = simulate_scene(1, index)
-    assert CLEVRER.objects.min_count <= len(scene.objects) <= CLEVRER.objects.max_count
-    assert 1 <= len(scene.collisions) <= CLEVRER.start.max_collisions
-    pairs = [c.objects for c in scene.collisions]
-    assert len(set(pairs)) == len(pairs)
-    assert all(c.frame > 0 for c in scene.collisions)
-
-
-@pytest.mark.parametrize("index", range(6))
-def test_motion_of_objects_added_one_by_one_equals_a_joint_simulation(index: int) -> None:
-    sample = sample_scene(CLEVRER, 11, index)
-    together = shared_simulator().simulate(sample.bodies, CLEVRER)
-    assert np.array_equal(together.states, sample.motion.states)
-    assert together.touching == sample.motion.touching
-
-
-@pytest.mark.parametrize("gravity", [4.0, 9.81])
-def test_sphere_falls_by_half_g_t_squared_and_lands(gravity: float) -> None:
-    world = WorldConfig(physics=PhysicsConfig(frames=40, fps=30, substeps=6, gravity=gravity))
-    motion = shared_simulator().simulate([Body(BALL, (0, 0), 0, (0, 0), height=1.5)], world)
+def test_sphere_falls_by_half_g_t_squared_and_lands() -> None:
+    world = WorldConfig(physics=PhysicsConfig(frames=40, fps=30, substeps=6, gravity=4.0))
+    motion = shared_simulator().simulate([Body(BALL, height=1.5)], world)
     (landing,) = motion.landings
-    seconds = np.sqrt(2 * (1.5 - RADIUS) / gravity)
+    seconds = np.sqrt(2 * (1.5 - RADIUS) / 4.0)
     assert landing.frame == pytest.approx(np.ceil(seconds * 30), abs=1)
     fall = np.arange(landing.frame) / 30
-    expected = 1.5 - gravity * fall**2 / 2
+    expected = 1.5 - 4.0 * fall**2 / 2
     np.testing.assert_allclose(motion.positions[: landing.frame, 0, 2], expected, atol=0.02)
 
 
@@ -110,9 +96,8 @@ def test_rebound_height_grows_with_the_restitution_of_the_floor() -> None:
         physics = PhysicsConfig(
             frames=40, floor_restitution=floor, restitution=ByMaterial(rubber=0.8)
         )
-        motion = shared_simulator().simulate(
-            [Body(BALL, (0, 0), 0, (0, 0), height=1.0)], WorldConfig(physics=physics)
-        )
+        world = WorldConfig(physics=physics)
+        motion = shared_simulator().simulate([Body(BALL, height=1.0)], world)
         (landing,) = motion.landings
         rebounds.append(motion.positions[landing.frame + 1 :, 0, 2].max() - RADIUS)
     none, some, more = rebounds
@@ -121,15 +106,13 @@ def test_rebound_height_grows_with_the_restitution_of_the_floor() -> None:
     assert more < 1.0 - RADIUS
 
 
-@pytest.mark.parametrize("tilt", [20.0, 44.0])
-def test_object_slides_down_a_ramp_with_the_acceleration_of_its_slope(tilt: float) -> None:
-    ramp = PartConfig([0.0, 0.0, 3.0], [8.0, 2.0, 0.1], tilt=tilt, friction=0.5)
+def test_object_slides_down_a_ramp_with_the_acceleration_of_its_slope() -> None:
+    ramp = PartConfig([0.0, 0.0, 3.0], [8.0, 2.0, 0.1], tilt=44.0, friction=0.5)
     physics = PhysicsConfig(frames=20, object_friction=0.3)
     world = WorldConfig(physics=physics, parts={"ramp": ramp})
-    cube = SceneObject("cube", "rubber", "red")
     top = surface_height([part_box(ramp)], np.array([-2.0, 0.0]))
-    slope = np.radians(tilt)
-    body = Body(cube, (-2.0, 0.0), 0.0, height=top + 0.3 / np.cos(slope))
+    slope = np.radians(44)
+    body = Body(CUBE, (-2.0, 0.0), 0.0, height=top + 0.3 / np.cos(slope))
     velocities = shared_simulator().simulate([body], world).velocities[:, 0]
     gain = 9.81 * (np.sin(slope) - 0.5 * 0.3 * np.cos(slope))
     speeds = np.linalg.norm(velocities, axis=-1)
@@ -139,8 +122,7 @@ def test_object_slides_down_a_ramp_with_the_acceleration_of_its_slope(tilt: floa
 
 
 def test_surface_height_follows_a_tilted_part() -> None:
-    part = PartConfig([0.0, 0.0, 1.0], [4.0, 2.0, 0.1], turn=90.0, tilt=30.0)
-    box = part_box(part)
+    box = part_box(PartConfig([0.0, 0.0, 1.0], [4.0, 2.0, 0.1], turn=90.0, tilt=30.0))
     slope = np.tan(np.radians(30))
     top = 1.0 + 0.05 / np.cos(np.radians(30))
     for y in (-1.0, 0.0, 1.0):
@@ -149,8 +131,8 @@ def test_surface_height_follows_a_tilted_part() -> None:
     assert surface_height([box], np.array([3.0, 0.0])) == 0
 
 
-@pytest.mark.parametrize("mass", [1 / 16, 1 / 4, 1.0, 4.0, 16.0])
-@pytest.mark.parametrize("restitution", [0.5, 1.0, 1.4])
+@pytest.mark.parametrize("mass", [1 / 16, 1.0, 16.0])
+@pytest.mark.parametrize("restitution", [0.5, 1.4])
 def test_head_on_collision_of_a_branch_follows_newtons_law(mass: float, restitution: float) -> None:
     """A moving sphere hits one at rest. Their momentum stays, and they separate at the coefficient
     of restitution times the speed of approach. Bullet also pushes overlapping bodies apart, which

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import av
-
-from tests.data.sources.pictures import picture
+from tests.data.sources.pictures import write_video
 
 
-def clevrer_annotation(index: int = 0, frames: int = 128) -> dict[str, Any]:
+def clevrer_annotation(index: int = 0) -> dict[str, Any]:
     """An annotation: a cube rests at the origin, and a sphere rolls along y and out of view.
 
     As in the release, velocities are per second of the simulation, of which a frame lasts 0.028 s.
@@ -37,7 +34,7 @@ def clevrer_annotation(index: int = 0, frames: int = 128) -> dict[str, Any]:
             {"object_id": 0, "color": "red", "material": "metal", "shape": "cube"},
             {"object_id": 1, "color": "blue", "material": "rubber", "shape": "sphere"},
         ],
-        "motion_trajectory": [{"frame_id": f, "objects": states(f)} for f in range(frames)],
+        "motion_trajectory": [{"frame_id": f, "objects": states(f)} for f in range(128)],
         "collision": [{"object_ids": [1, 0], "frame_id": 20, "location": [0.25, 0.0, 0.2]}],
     }
 
@@ -53,15 +50,3 @@ def write_clevrer_scene(
     video = folder / f"video_train/video_{span}/video_{index:05d}.mp4"
     write_video(video, video_frames)
     return annotation, video
-
-
-def write_video(path: Path, frames: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
-        for f in range(frames):
-            frame = av.VideoFrame.from_image(picture(f))
-            frame.pts, frame.time_base = f, Fraction(1, 25)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ ARRAYS = (
     "positions", "quaternions", "velocities", "angular_velocities", "image_positions", "visibility",
     "bboxes_3d",
 )  # fmt: skip
+Contacts = list[tuple[float, int, int, float, float]]
 
 
-def movi_example(contacts: list[tuple[float, int, int, float, float]] | None = None) -> dict:
+def movi_example(contacts: Contacts | None = None) -> dict:
     """Three falling objects, the last of which is never visible.
 
     Args:
@@ -28,18 +30,23 @@ def movi_example(contacts: list[tuple[float, int, int, float, float]] | None = N
     x = np.stack([np.zeros(24), 1 + s, -1 - s])
     z = np.stack([5 - 0.5 * 9.81 * s**2] * 3)
     half = np.stack([s, s, s]) / 2
+    positions = np.stack([x, 0 * x, z], -1)
+    # Boxes of widths 1.4, 0.6 and 1, turned about z by 0.8 rad.
+    turn = [[np.cos(0.8), np.sin(0.8), 0], [-np.sin(0.8), np.cos(0.8), 0], [0, 0, 1]]
+    corners = np.array([*product((-0.5, 0.5), repeat=3)]) @ turn
     return {
         "appearances": [
             ("cube", "large", "metal", "red"),
             ("sphere", "small", "rubber", "cyan"),
             ("cylinder", "small", "metal", "red"),
         ],
-        "positions": np.stack([x, 0 * x, z], -1),
+        "positions": positions,
         "quaternions": np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], -1),
         "velocities": np.stack([np.sign(x), 0 * x, np.stack([-9.81 * s] * 3)], -1),
         "angular_velocities": np.stack([0 * x, 0 * x, 0 * x + 1], -1),
         "image_positions": np.stack([0.5 + x / 20, 0.9 - z / 10], -1),
         "visibility": np.stack([np.full(24, 90), np.full(24, 30), np.arange(24) * 0]),
+        "bboxes_3d": positions[:, :, None] + np.multiply.outer([1.4, 0.6, 1.0], corners)[:, None],
         "contacts": contacts or [],
     }
 
@@ -50,7 +57,7 @@ def write_movi_folder(folder: Path, example: dict) -> Path:
         {
             "size": 1.4, "color": [0.5, 0.1, 0.1],
             "shape": shape, "size_label": size, "material": material, "color_label": color,
-            **{key: example[key][k].tolist() for key in ARRAYS if key in example},
+            **{key: example[key][k].tolist() for key in ARRAYS},
         }
         for k, (shape, size, material, color) in enumerate(example["appearances"])
     ]  # fmt: skip
@@ -58,7 +65,7 @@ def write_movi_folder(folder: Path, example: dict) -> Path:
         "metadata": {"resolution": [256, 256], "frame_rate": 12, "num_frames": 24},
         "camera": {"focal_length": 35.0},
         "instances": instances,
-    }  # fmt: skip
+    }
     collisions = [
         {
             "instances": [one, two], "frame": frame, "position": [0.0, 0.0, height],
@@ -84,7 +91,7 @@ def movi_features(example: dict) -> dict[str, Any]:
         "metadata/height": [256],
         "metadata/num_frames": [24],
         "metadata/num_instances": [len(example["appearances"])],
-        **{f"instances/{key}": example[key].ravel().tolist() for key in ARRAYS if key in example},
+        **{f"instances/{key}": example[key].ravel().tolist() for key in ARRAYS},
         "instances/shape_label": [["cube", "cylinder", "sphere"].index(s) for s in shapes],
         "instances/size_label": [["small", "large"].index(s) for s in sizes],
         "instances/material_label": [["metal", "rubber"].index(m) for m in materials],

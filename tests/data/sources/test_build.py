@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +12,16 @@ from dynapix.conf.schema import BenchmarkConfig, Quota, RetrievalTrackConfig, Se
 from dynapix.data.build import ensure_benchmark, ensure_items
 from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.parallel import Workers
+from dynapix.data.records import original_scene_id
+from dynapix.data.sources import clevrer, movi_a, tracks
 from dynapix.data.sources.releases import READERS
 from dynapix.data.sources.scenes import make_scenes
+from dynapix.data.sources.validation import scene_id
 from tests.data.sources.clevrer_files import clevrer_annotation, write_clevrer_scene
 from tests.data.sources.movi_a_files import movi_example, write_movi_folder
 from tests.data.sources.pictures import picture
+from tests.data.sources.tracks_files import write_tracked_video
 from tests.user_errors import raises_user_error
-
-pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +52,16 @@ def config(folder: Path | None, **changes: object) -> BenchmarkConfig:
     return BenchmarkConfig(**{**settings, **changes})
 
 
+@pytest.mark.slow
 def test_a_release_becomes_a_suite_with_its_own_frames(movi, tmp_path, caplog) -> None:
+    """It may move after the build."""
     caplog.set_level("INFO")
-    store = ensure_benchmark(config(movi), tmp_path, workers=2)
-    assert store.manifest["counts"]["bad records left out"] == 1
+    release = shutil.copytree(movi, tmp_path / "release")
+    built = ensure_items(config(release), tmp_path, Workers(2))
+    assert built.manifest["counts"]["bad records left out"] == 1
     assert "00007" in caplog.text
+    store = ensure_items(config(release.rename(tmp_path / "moved")), tmp_path, Workers(1))
+    assert store.identity == built.identity
     items = store.selection("test")
     assert {i.family for i in items} == {"event", "time"}
     assert {i.suite for i in items} == {"movi_a"}
@@ -66,91 +72,66 @@ def test_a_release_becomes_a_suite_with_its_own_frames(movi, tmp_path, caplog) -
         np.testing.assert_array_equal(frames.array(candidate.scene_id, candidate.frame), expected)
 
 
-def test_an_invalid_record_stops_a_strict_build(movi, tmp_path) -> None:
+@pytest.mark.slow
+def test_what_cannot_be_built_is_refused(movi, tmp_path) -> None:
     with raises_user_error("invalid-record", contains=("00007", "strict=false")):
         ensure_items(config(movi), tmp_path, Workers(1), strict=True)
-    assert not (tmp_path / "movi").exists()
-
-
-def test_displacements_below_a_pixel_of_a_release_are_refused(movi, tmp_path) -> None:
-    """Its frames are 256 px wide and high, so that a pixel is 1.31 px of 336."""
+    # Frames of the release are 256 px wide and high, so that a pixel is 1.31 px of 336.
     selection = SelectionConfig(time={"in_1s": Quota(0, 6)}, min_displacement=1.3)
     with raises_user_error("invalid-setting", contains=("1.31", "256 x 256")):
         ensure_items(config(movi, selection=selection), tmp_path, Workers(1))
-
-
-def test_scaled_velocities_are_logged_once(tmp_path, caplog) -> None:
-    release = tmp_path / "release"
-    for k in range(4):
-        example = movi_example()
-        write_movi_folder(release / f"{k:05d}", example | {"velocities": 2 * example["velocities"]})
-    make_scenes(config(release), tmp_path / "store", Workers(2), True)
-    (line,) = [r.getMessage() for r in caplog.records if "velocities" in r.getMessage()]
-    assert "4 scenes of 4 were multiplied by 0.5," in line
-
-
-def test_a_mended_record_is_read_by_the_next_build(movi, tmp_path) -> None:
-    """Also if the file that was mended is not the one whose size and time identify the record."""
-    release = shutil.copytree(movi, tmp_path / "release" / "movi_a")
-    events = release / "00007" / "events.json"
-    for damage in ("not JSON", "not a file"):
-        if damage == "not a file":
-            events.unlink()
-            events.mkdir()
-        scenes, counts = make_scenes(config(release), tmp_path / "store", Workers(1), False)
-        assert counts == {"bad records left out": 1}, damage
-        assert len(scenes["test"]) == 11
-    events.rmdir()
-    shutil.copy(release / "00006" / "events.json", events)
-    scenes, counts = make_scenes(config(release), tmp_path / "store", Workers(1), False)
-    assert counts == {"bad records left out": 0}
-    assert len(scenes["test"]) == 12
-
-
-def test_a_record_that_may_not_be_read_stops_the_build(movi, tmp_path, monkeypatch) -> None:
-    """Otherwise the benchmark would be smaller without notice."""
-
-    def refuse(path, *_):
-        raise PermissionError(13, "Permission denied", str(path))
-
-    monkeypatch.setattr(READERS["movi_a"], "read_scene", refuse)
-    with raises_user_error("unreadable-file", contains="0000"):
-        make_scenes(config(movi), tmp_path / "store", Workers(1), False)
-
-
-def test_a_release_without_a_valid_record_names_their_number(movi, tmp_path) -> None:
-    broken = tmp_path / "release" / "movi_a"
-    shutil.copytree(movi, broken)
-    for events in broken.glob("*/events.json"):
-        events.write_text("{")
-    with raises_user_error("empty-benchmark", contains="12 bad records left out"):
-        ensure_items(config(broken), tmp_path / "store", Workers(1))
-
-
-def test_queries_of_a_release_are_refused(movi) -> None:
-    queries = replace(config(movi).retrieval, builders={"1": Quota(1, 1)})
-    [problem] = config(movi, retrieval=queries).find_problems("benchmark.")
-    assert "benchmark.retrieval.builders" in problem
-
-
-def test_a_release_may_move_after_the_build(movi, tmp_path) -> None:
-    release = shutil.copytree(movi, tmp_path / "release")
-    built = ensure_items(config(release), tmp_path, Workers(1))
-    moved = release.rename(tmp_path / "moved")
-    store = ensure_items(config(moved), tmp_path, Workers(1))
-    assert store.identity == built.identity
-    candidate = store.selection("test")[0].candidates[0]
-    frame = FrameReader(store).array(candidate.scene_id, candidate.frame)
-    np.testing.assert_array_equal(frame, np.asarray(picture(candidate.frame, (256, 256))))
-
-
-def test_a_release_without_its_folder_is_refused(tmp_path) -> None:
     with raises_user_error("missing-setting", contains="benchmark.folder=FOLDER"):
         ensure_items(config(None), tmp_path, Workers(1))
     with raises_user_error("missing-folder", contains="nowhere"):
         ensure_items(config(tmp_path / "nowhere"), tmp_path, Workers(1))
+    broken = shutil.copytree(movi, tmp_path / "broken")
+    for events in broken.glob("*/events.json"):
+        events.write_text("{")
+    with raises_user_error("empty-benchmark", contains="12 bad records left out"):
+        ensure_items(config(broken), tmp_path, Workers(1))
+    assert not (tmp_path / "movi").exists()
+    queries = RetrievalTrackConfig(builders={"1": Quota(1, 1)}, database=0, source=0)
+    [problem] = config(movi, retrieval=queries).find_problems("benchmark.")
+    assert "benchmark.retrieval.builders" in problem
 
 
+def test_scaled_velocities_are_logged_once(tmp_path, caplog) -> None:
+    release = tmp_path / "release"
+    for k in range(2):
+        example = movi_example()
+        write_movi_folder(release / f"{k:05d}", example | {"velocities": 2 * example["velocities"]})
+    make_scenes(config(release), tmp_path / "store", Workers(1), True)
+    (line,) = [r.getMessage() for r in caplog.records if "velocities" in r.getMessage()]
+    assert "2 scenes of 2 were multiplied by 0.5," in line
+
+
+def test_a_mended_record_is_read_by_the_next_build(tmp_path) -> None:
+    """Also if the file that was mended is not the one whose size and time identify the record."""
+    release = tmp_path / "release"
+    for k in range(2):
+        write_movi_folder(release / f"{k:05d}", movi_example())
+    events = release / "00001" / "events.json"
+    whole = events.read_text()
+    for content, left_out in (("not JSON", 1), (whole, 0)):
+        events.write_text(content)
+        scenes, counts = make_scenes(config(release), tmp_path / "store", Workers(1), False)
+        assert counts == {"bad records left out": left_out}
+        assert len(scenes["test"]) == 2 - left_out
+
+
+def test_an_error_of_a_library_leaves_its_record_out(tmp_path, monkeypatch, caplog) -> None:
+    path = write_movi_folder(tmp_path / "release" / "00000", movi_example())
+
+    def read_scene(*_: object) -> None:
+        raise KeyError("what no reader expects")
+
+    monkeypatch.setattr(READERS["movi_a"], "read_scene", read_scene)
+    _, counts = make_scenes(config(tmp_path / "release"), tmp_path / "built", Workers(1), False)
+    assert counts == {"bad records left out": 1}
+    assert f"{path}: KeyError: 'what no reader expects'" in caplog.text
+
+
+@pytest.mark.slow
 def test_clevrers_scenes_have_the_items_of_dynapix(tmp_path) -> None:
     for k in range(8):
         annotation = clevrer_annotation(k)
@@ -170,3 +151,30 @@ def test_clevrers_scenes_have_the_items_of_dynapix(tmp_path) -> None:
     assert {i.suite for i in store.selection()} == {"dynapix"}
     assert {q.split for q in store.retrieval()} == {"train", "test"}
     assert len(store.scene_ids("train") + store.scene_ids("test")) == 8
+
+
+def test_files_that_a_user_writes_may_begin_with_a_byte_order_mark(tmp_path) -> None:
+    write_clevrer_scene(tmp_path / "clevrer", clevrer_annotation())
+    write_movi_folder(tmp_path / "movi_a" / "00000", movi_example())
+    write_tracked_video(tmp_path / "tracks", "street", 30)
+    for reader, folder, names in (
+        (clevrer, tmp_path / "clevrer", ["annotation_00000.json"]),
+        (movi_a, tmp_path / "movi_a", ["metadata.json", "events.json"]),
+        (tracks, tmp_path / "tracks", ["tracks.yaml", "street.txt"]),
+    ):
+        [path] = reader.list_scenes(folder)
+        before = reader.read_scene(path, folder, "test")
+        for name in names:
+            [file] = folder.rglob(name)
+            file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+        [path] = reader.list_scenes(folder)
+        after = reader.read_scene(path, folder, "test")
+        assert (after.objects, after.collisions) == (before.objects, before.collisions)
+        assert after.positions.tobytes() == before.positions.tobytes()
+
+
+def test_a_name_does_not_make_a_scene_of_another_one() -> None:
+    for name in ("street-without-3", "a-alt-b", "x-without-alt-y", "a/b c"):
+        own = scene_id(name, "000128")
+        assert original_scene_id(own) == own
+        assert Path(own).name == own

@@ -19,7 +19,7 @@ from dynapix.conf.schema import (
     SelectionConfig,
     TeacherConfig,
 )
-from dynapix.data.build import build, ensure_benchmark
+from dynapix.data.build import ensure_benchmark
 from dynapix.data.checks.baselines import constant_velocity_error
 from dynapix.data.items.queries import BUILDERS
 from dynapix.data.items.recipes import (
@@ -31,19 +31,13 @@ from dynapix.data.items.recipes import (
 from dynapix.data.parallel import Workers
 from dynapix.data.sources import tracks
 from dynapix.data.sources.scenes import make_scenes
-from dynapix.data.store import Store, open_store
+from dynapix.data.store import Store
 from dynapix.teacher.narrate import narrate_store
-from dynapix.teacher.narrator import write_rationale
 from dynapix.teacher.predicates.extraction import extract_facts
 from dynapix.teacher.predicates.places import close_pairs
 from dynapix.teacher.predicates.relations import Places, find_relations
-from dynapix.teacher.predicates.vocabulary import describe_item
-from tests.data.sources.tracks_files import (
-    SIZE,
-    box_lines,
-    write_tracked_video,
-    write_video,
-)
+from tests.data.sources.pictures import write_video
+from tests.data.sources.tracks_files import SIZE, box_lines, write_tracked_video
 from tests.user_errors import raises_user_error
 
 
@@ -63,18 +57,15 @@ def test_a_scene_has_the_boxes_of_its_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.velocities[10], [[12.5 / 64, 0, 0], [0, -7.5 / 64, 0]])
     np.testing.assert_allclose(scene.visible_fraction[3], [1, 0.75])
     assert scene.in_view.all()
-
-
-def test_the_layout_of_results_has_no_visibility_and_may_lack_confidences(tmp_path: Path) -> None:
-    lines = [",".join([*line.split(",")[:6], "-1", "-1", "-1", "-1"]) for line in box_lines(40)]
-    write_tracked_video(tmp_path, "street", 40, 25, *lines)
-    scene = read(tmp_path)
-    assert np.isnan(scene.visible_fraction).all()
+    # The layout of results has no visibility and may lack confidences; in the other one, a
+    # visibility may be unknown.
+    results = [",".join([*line.split(",")[:6], "-1", "-1", "-1", "-1"]) for line in box_lines(40)]
     unknown = [line.rpartition(",")[0] + ",-1" for line in box_lines(40)]
-    write_tracked_video(tmp_path, "street", 40, 25, *unknown)
-    scene = read(tmp_path)
-    assert scene.in_view.all()
-    assert np.isnan(scene.visible_fraction).all()
+    for lines in (results, unknown):
+        write_tracked_video(tmp_path, "street", 40, 25, *lines)
+        scene = read(tmp_path)
+        assert scene.in_view.all()
+        assert np.isnan(scene.visible_fraction).all()
 
 
 def test_a_gap_of_a_track_is_interpolated_and_out_of_view(tmp_path: Path) -> None:
@@ -100,7 +91,7 @@ def test_a_video_is_cut_into_clips_with_their_own_objects_and_frames(tmp_path: P
     assert second.scene_id == "street-000128"
     images = tracks.load_images(second, tmp_path, [0, 100, 127])
     for frame, image in images.items():
-        brightness = (128 + frame) % 120 + 60
+        brightness = (128 + frame) % 150 + 60
         assert np.asarray(image).mean() == pytest.approx(brightness, abs=2)
 
 
@@ -121,12 +112,8 @@ LINE_DEFECTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "too few columns": ("5,1,0,0,8,6,1", ("line 5", "frame 5", "7 columns", "9")),
     "columns of the other layout": ("5,1,0,0,8,6,1,-1,-1,-1", ("line 5", "10 columns")),
     "a word": ("5,1,0,wide,8,6,1,1,1", ("line 5", "frame 5", "bb_top is 'wide'")),
-    "no number": ("5,1,0,nan,8,6,1,1,1", ("line 5", "bb_top is 'nan'")),
     "a detection without a track": ("5,-1,0,0,8,6,1,1,1", ("line 5", "id is '-1'")),
-    "frame 0": ("0,1,0,0,8,6,1,1,1", ("line 5", "frame is '0'")),
     "half a frame": ("4.5,1,0,0,8,6,1,1,1", ("line 5", "frame is '4.5'")),
-    "a negative width": ("5,1,0,0,-8,6,1,1,1", ("line 5", "bb_width is '-8'")),
-    "a visibility above 1": ("5,1,0,0,8,6,1,1,1.5", ("line 5", "visibility is '1.5'")),
     "a character that is no UTF-8": ("5,1,0,0,8,6,1,1,\udcff", ("line 5", "visibility")),
     "a repeated box": ("2,1,0,0,8,6,1,1,1", ("line 5", "frame 2", "id 1", "line 3")),
     "a frame beyond the video": ("41,1,20,20,8,6,1,1,1", ("line 5", "frame 41", "40 frames")),
@@ -145,17 +132,16 @@ def test_a_wrong_line_is_refused(tmp_path: Path, defect: str) -> None:
 
 NAME_DEFECTS: dict[str, tuple[Callable[[dict], object], str]] = {
     "an id that does not exist": (
-        lambda c: c["videos"]["street"]["objects"].update({9: {"noun": "dog"}}),
+        lambda videos: videos["street"]["objects"].update({9: {"noun": "dog"}}),
         "videos.street.objects.9",
     ),
-    "a video that does not exist": (lambda c: c["videos"].update(road={}), "videos.road"),
+    "a video that does not exist": (lambda videos: videos.update(road={}), "videos.road"),
     "a key of another name": (
-        lambda c: c["videos"]["street"]["objects"][1].update(colour="red"),
+        lambda videos: videos["street"]["objects"][1].update(colour="red"),
         "videos.street.objects.1.colour",
     ),
-    "a rate of 0": (lambda c: c["videos"]["street"].update(fps=0.0), "videos.street.fps"),
     "a noun with a digit": (
-        lambda c: c["videos"]["street"]["objects"][1].update(noun="car 2"),
+        lambda videos: videos["street"]["objects"][1].update(noun="car 2"),
         "videos.street.objects.1.noun",
     ),
 }
@@ -167,7 +153,7 @@ def test_wrong_names_are_refused(tmp_path: Path, defect: str) -> None:
     write_tracked_video(tmp_path, frames=30)
     path = tmp_path / "tracks.yaml"
     content = yaml.safe_load(path.read_text())
-    change(content)
+    change(content["videos"])
     path.write_text(yaml.safe_dump(content))
     with raises_user_error("invalid-record", contains=(str(path), named)):
         read(tmp_path)
@@ -176,8 +162,6 @@ def test_wrong_names_are_refused(tmp_path: Path, defect: str) -> None:
 def test_missing_and_damaged_files_are_refused(tmp_path: Path) -> None:
     with raises_user_error("missing-folder", contains="nowhere"):
         tracks.list_scenes(tmp_path / "nowhere")
-    with raises_user_error("empty-release", contains="street.mp4"):
-        tracks.list_scenes(tmp_path)
     text = write_tracked_video(tmp_path, frames=30)
     text.write_text("\n")
     with raises_user_error("invalid-record", contains=(str(text), "no box")):
@@ -193,9 +177,6 @@ def test_missing_and_damaged_files_are_refused(tmp_path: Path) -> None:
         read(tmp_path)
     (tmp_path / "tracks.yaml").write_text("videos: {street: [")
     with raises_user_error("damaged-file", contains=("tracks.yaml", "line 1")):
-        read(tmp_path)
-    (tmp_path / "tracks.yaml").unlink()
-    with raises_user_error("missing-file", contains="tracks.yaml"):
         read(tmp_path)
 
 
@@ -247,54 +228,50 @@ def test_all_clips_of_a_video_are_in_one_split(store: Store) -> None:
 
 
 @pytest.mark.slow
-def test_a_bad_video_is_left_out_and_the_others_are_read(videos: Path, tmp_path: Path) -> None:
-    for path in videos.iterdir():
-        (tmp_path / path.name).symlink_to(path)
-    (tmp_path / "road1.txt").unlink()
-    scenes, counts = make_scenes(config(tmp_path), tmp_path / "store", Workers(1), False)
-    assert counts == {"bad records left out": 2}
-    assert len(scenes["train"] + scenes["test"]) == 8
-    with raises_user_error("invalid-record", contains="road1.txt"):
-        make_scenes(config(tmp_path), tmp_path / "store", Workers(1), True)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("changed", ["road1.txt", "tracks.yaml"])
-def test_build_resumed_after_files_changed_equals_a_fresh_one(
-    videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: str
+def test_files_that_changed_since_an_interrupted_build_are_read_again(
+    videos: Path, tmp_path: Path
 ) -> None:
     folder = shutil.copytree(videos, tmp_path / "videos")
-    with monkeypatch.context() as patch:
-        patch.setattr("dynapix.data.build.make_databases", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            build(config(folder), tmp_path / "resumed", Workers(1))
-    path = folder / changed
-    path.write_text(path.read_text().replace(",20,8,6,", ",30,8,6,").replace("red", "blue"))
-    for name in ("resumed", "fresh"):
-        build(config(folder), tmp_path / name, Workers(1))
-    resumed, fresh = (
-        open_store(tmp_path / name).manifest["files"] for name in ("resumed", "fresh")
-    )
-    assert resumed == fresh
-
-
-def interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
+    for changed in ("road1.txt", "tracks.yaml"):
+        make_scenes(config(folder), tmp_path / "resumed", Workers(1), True)
+        path = folder / changed
+        path.write_text(path.read_text().replace(",20,8,6,", ",30,8,6,").replace("red", "blue"))
+        for name in ("resumed", changed):
+            make_scenes(config(folder), tmp_path / name, Workers(1), True)
+        resumed, fresh = (
+            {path.name: path.read_bytes() for path in (tmp_path / name / "scenes").iterdir()}
+            for name in ("resumed", changed)
+        )
+        assert resumed == fresh
 
 
 @pytest.mark.slow
-def test_time_items_count_the_seconds_of_their_video(store: Store) -> None:
+def test_items_and_queries_count_the_seconds_of_their_video(store: Store) -> None:
+    rates = {name: store.scene(name).fps for name in store.scene_ids("train")}
+    rates |= {name: store.scene(name).fps for name in store.scene_ids("test")}
     items = [i for i in store.selection() if i.family == "time"]
-    assert {(store.scene(i.scene_id).fps, i.subtype) for i in items} == {
+    assert {(rates[i.scene_id], i.subtype) for i in items} == {
         (fps, subtype) for fps in (10, 30) for subtype in TIME_CELLS
     }
     for item in items:
-        second, ahead = int(store.scene(item.scene_id).fps), TIME_CELLS[item.subtype]
+        second, ahead = int(rates[item.scene_id]), TIME_CELLS[item.subtype]
         assert (item.prefix_start, item.prefix_stop) == (0, second - 1)
         assert item.target_frame == second + int(second * ahead)
         assert item.question == TIME_QUESTION.format(spell_seconds(ahead))
         assert item.suite == "tracks"
         assert all(c.frame > item.prefix_stop for c in item.candidates)
+    queries = store.retrieval()
+    assert {(q.builder, q.split) for q in queries} == {
+        (builder, split) for builder in (1, 2) for split in ("train", "test")
+    }
+    assert {rates[q.scene_id] for q in queries} == {10, 30}
+    for query in queries:
+        ahead = next(n for n in (1, 2, 3) if f"{n} second" in query.question)
+        assert query.target.frame - query.prefix_stop == ahead * rates[query.scene_id]
+        assert query.prefix_stop >= 2 * rates[query.scene_id]
+        if query.builder == 1:
+            assert query.target.frame == store.scene(query.scene_id).frames - 1
+    assert len(store.database()) == 20
 
 
 @pytest.mark.slow
@@ -308,24 +285,10 @@ def test_window_items_are_about_views_instead_of_contacts(store: Store) -> None:
         changes = np.diff(store.scene(item.scene_id).in_view, axis=0)
         seen = changes[item.prefix_start : item.target_frame].any()
         assert seen == (item.group != "G1")
-
-
-@pytest.mark.slow
-def test_queries_state_true_times(store: Store) -> None:
-    queries = store.retrieval()
-    assert {(q.builder, q.split) for q in queries} == {
-        (builder, split) for builder in (1, 2) for split in ("train", "test")
-    }
-    rates = {store.scene(q.scene_id).fps for q in queries}
-    assert rates == {10, 30}
-    for query in queries:
-        scene = store.scene(query.scene_id)
-        ahead = next(n for n in (1, 2, 3) if f"{n} second" in query.question)
-        assert query.target.frame - query.prefix_stop == ahead * scene.fps
-        assert query.prefix_stop >= 2 * scene.fps
-        if query.builder == 1:
-            assert query.target.frame == scene.frames - 1
-    assert len(store.database()) == 20
+    # The baseline of constant velocity needs no camera in the image plane.
+    near = [i for i in store.selection() if i.horizon == 8]
+    errors = [constant_velocity_error(i, i.candidates[i.answer], store) for i in near]
+    assert np.median(errors) < 1
 
 
 def test_builder_1_keeps_the_times_of_clevrers_scenes(tmp_path: Path) -> None:
@@ -362,14 +325,11 @@ def test_nothing_is_said_of_contacts(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_narrator_writes_what_is_known(store: Store) -> None:
-    cfg = TeacherConfig(name="template")
-    narration = narrate_store(store, cfg)
+    narration = narrate_store(store, TeacherConfig(name="template"))
     assert narration.figures["accepted"] == len(store.selection("train"))
     for rationale in narration.rationales:
         assert "contact" not in rationale.text
         assert "course" not in rationale.text
-    item = store.selection("train")[0]
-    assert "collision course" not in write_rationale(describe_item(item, store, cfg), item, 0)
 
 
 def test_what_needs_contacts_is_refused(tmp_path: Path) -> None:
@@ -377,21 +337,11 @@ def test_what_needs_contacts_is_refused(tmp_path: Path) -> None:
     selection = SelectionConfig(
         event={"contact_match": Quota(1, 0)}, window={"G2_A": Quota(6, 6)}, matched=Quota(0, 1)
     )
-    retrieval = RetrievalTrackConfig(builders={"1": Quota(1, 1), "3": Quota(1, 1)})
-    [problem] = config(tmp_path, selection=selection, retrieval=retrieval).find_problems("b.")
-    for name in ("event.contact_match", "window.G2_A", "selection.matched", "builders.3"):
-        assert name in problem
-    assert "builders.1" not in problem
-    retrieval = RetrievalTrackConfig(counterfactual=Quota(1, 1))
-    [problem] = config(tmp_path, retrieval=retrieval).find_problems("b.")
-    assert "counterfactual" in problem
-    [problem] = BenchmarkConfig(name="b", recipe="tracks").find_problems("b.")
-    assert "simulator=tracks" in problem
-
-
-@pytest.mark.slow
-def test_objects_that_keep_their_velocity_are_extrapolated_to_their_place(store: Store) -> None:
-    """The baseline of constant velocity needs no camera in the image plane."""
-    items = [i for i in store.selection() if i.horizon == 8]
-    errors = [constant_velocity_error(i, i.candidates[i.answer], store) for i in items]
-    assert np.median(errors) < 1
+    builders = {"1": Quota(1, 1), "3": Quota(1, 1)}
+    retrieval = RetrievalTrackConfig(builders=builders, counterfactual=Quota(1, 1))
+    problems = [*config(tmp_path, selection=selection, retrieval=retrieval).find_problems("b.")]
+    for name in (
+        "event.contact_match", "window.G2_A", "selection.matched", "builders.3", "counterfactual"
+    ):  # fmt: skip
+        assert any(name in problem for problem in problems)
+    assert not any("builders.1" in problem for problem in problems)

@@ -45,6 +45,13 @@ def scaled(scene: Scene, factor: float) -> Scene:
     )
 
 
+def turns(axis: int, angles: np.ndarray) -> np.ndarray:
+    """Quaternions (F, 4) of turns about a coordinate axis."""
+    quaternions = np.zeros((len(angles), 4))
+    quaternions[:, axis], quaternions[:, 3] = np.sin(angles / 2), np.cos(angles / 2)
+    return quaternions
+
+
 def test_velocities_that_agree_are_kept(scene: Scene) -> None:
     """Also beside contacts, with rounded positions, and up to a tenth of difference."""
     rng = np.random.default_rng(0)
@@ -56,46 +63,28 @@ def test_velocities_that_agree_are_kept(scene: Scene) -> None:
         np.testing.assert_allclose(kept.angular_velocities, given.angular_velocities, rtol=1e-6)
 
 
-@pytest.mark.parametrize("factor", [0.028 * FPS, 0.3, 100 / 30, 1000.0])
+@pytest.mark.parametrize("factor", [0.3, 100 / 30])
 def test_velocities_of_another_unit_of_time_are_scaled(scene: Scene, factor: float) -> None:
     with pytest.warns(RescaledVelocities) as caught:
         found = reconcile_velocities(scaled(scene, 1 / factor), PATH)
     assert caught[0].message.factor == pytest.approx(factor, rel=1e-3)
     np.testing.assert_allclose(found.velocities, scene.velocities, rtol=1e-3)
     np.testing.assert_allclose(found.angular_velocities, scene.angular_velocities, rtol=1e-3)
-
-
-@pytest.mark.parametrize("unit", [0.5, 4.0])
-@pytest.mark.parametrize("rate", [0.5, 4.0])
-def test_the_factor_depends_on_the_unit_of_time_alone(
-    scene: Scene, unit: float, rate: float
-) -> None:
-    """Lengths may be in any unit, and the axes may point anywhere."""
+    # Lengths may be in any unit, and the axes may point anywhere.
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     changed = replace(
         scene,
-        positions=unit * scene.positions @ turn + 7,
-        velocities=unit * scene.velocities @ turn,
-        fps=scene.fps * rate,
+        positions=4 * scene.positions @ turn + 7,
+        velocities=4 * scene.velocities @ turn,
+        fps=scene.fps * factor,
     )
-    assert compare_velocities(changed)[0] == pytest.approx(rate)
-
-
-def bounce(scene: Scene) -> Scene:
-    """Reverse the second object at frame 60, and record the contact."""
-    positions, velocities = scene.positions.copy(), scene.velocities.copy()
-    positions[60:, 1] = positions[60, 1] - (positions[60:, 1] - positions[60, 1])
-    velocities[60:, 1] *= -1
-    return replace(
-        scene, positions=positions, velocities=velocities, collisions=(Collision(60, (1, 2), 60),)
-    )
+    assert compare_velocities(changed)[0] == pytest.approx(factor)
 
 
 DISAGREEMENTS = {
     "no displacements": lambda s: replace(s, positions=s.positions[:1] + 0 * s.positions),
     "opposite velocities": lambda s: replace(s, velocities=-s.velocities),
     "swapped axes": lambda s: replace(s, velocities=s.velocities[..., [2, 1, 0]]),
-    "swapped objects": lambda s: replace(s, velocities=s.velocities[:, [1, 0, 2]]),
     "one object of another unit": lambda s: replace(
         s, velocities=s.velocities * np.array([1, 3, 1])[:, None]
     ),
@@ -111,7 +100,13 @@ def test_velocities_that_no_factor_explains_are_refused(scene: Scene, disagreeme
 
 
 def test_jumps_of_velocity_at_contacts_are_no_disagreement(scene: Scene) -> None:
-    factor, deviations = compare_velocities(bounce(scene))
+    positions, velocities = scene.positions.copy(), scene.velocities.copy()
+    positions[60:, 1] = positions[60, 1] - (positions[60:, 1] - positions[60, 1])
+    velocities[60:, 1] *= -1
+    bounce = replace(
+        scene, positions=positions, velocities=velocities, collisions=(Collision(60, (1, 2), 60),)
+    )
+    factor, deviations = compare_velocities(bounce)
     assert factor == pytest.approx(1)
     assert deviations == pytest.approx(0, abs=1e-6)
 
@@ -134,37 +129,29 @@ def test_rolling_about_a_pivot_off_the_centre_is_not_compared(scene: Scene) -> N
     angles = np.arange(scene.frames) * 0.6 / FPS / 0.2
     positions, quaternions = scene.positions.copy(), scene.quaternions.copy()
     positions[:, 0] += 0.2 * np.stack([-np.sin(angles), 0 * angles, -np.cos(angles)], -1)
-    quaternions[:, 0] = np.stack(
-        [0 * angles, np.sin(angles / 2), 0 * angles, np.cos(angles / 2)], -1
-    )
+    quaternions[:, 0] = turns(1, angles)
     rolling = replace(scene, positions=positions, quaternions=quaternions)
     factor, deviations = compare_velocities(rolling)
     assert (factor, deviations[0]) == (pytest.approx(1), 0)
 
 
-def test_zero_velocities_of_an_object_that_moves_are_not_recorded_ones(scene: Scene) -> None:
+def test_velocities_that_are_not_recorded_are_derived(scene: Scene) -> None:
+    """Those of one object do not concern the others, which keep or scale theirs. Zero velocities of
+    an object that moves are not recorded ones."""
+    quaternions = scene.quaternions.copy()
+    quaternions[:, 0] = turns(2, 0.5 * np.arange(scene.frames) / FPS)
+    given = replace(scaled(scene, 0.1), quaternions=quaternions)
+    given.velocities[5, 0, 1] = np.nan
+    given.angular_velocities[5, 0, 0] = np.inf
+    with pytest.warns(RescaledVelocities):
+        found = reconcile_velocities(given, PATH)
+    np.testing.assert_allclose(found.velocities, scene.velocities, atol=1e-4)
+    spin = np.tile([0, 0, 0.5], (128, 1))
+    np.testing.assert_allclose(found.angular_velocities[:, 0], spin, atol=1e-4)
     zero = scene.velocities.copy()
     zero[:, 1] = 0
     found = reconcile_velocities(replace(scene, velocities=zero), PATH)
     np.testing.assert_allclose(found.velocities, scene.velocities, atol=1e-4)
-
-
-@pytest.mark.parametrize("missing", [np.nan, np.inf])
-def test_velocities_that_are_not_recorded_are_derived(scene: Scene, missing: float) -> None:
-    """Those of one object do not concern the others, which keep or scale theirs."""
-    angles = 0.5 * np.arange(scene.frames) / FPS
-    quaternions = scene.quaternions.copy()
-    quaternions[:, 0] = np.stack(
-        [0 * angles, 0 * angles, np.sin(angles / 2), np.cos(angles / 2)], -1
-    )
-    given = replace(scaled(scene, 0.1), quaternions=quaternions)
-    given.velocities[5, 0, 1] = given.angular_velocities[5, 0, 0] = missing
-    with pytest.warns(RescaledVelocities):
-        found = reconcile_velocities(given, PATH)
-    np.testing.assert_allclose(found.velocities, scene.velocities, atol=1e-4)
-    np.testing.assert_allclose(
-        found.angular_velocities[:, 0], np.tile([0, 0, 0.5], (128, 1)), atol=1e-4
-    )
 
 
 def read_clevrer(folder: Path, factor: float) -> Scene:
@@ -179,9 +166,8 @@ def read_clevrer(folder: Path, factor: float) -> Scene:
 
 def read_movi_a(folder: Path, factor: float) -> Scene:
     example = movi_example()
-    path = write_movi_folder(
-        folder / "00012", example | {"velocities": factor * example["velocities"]}
-    )
+    example["velocities"] *= factor
+    path = write_movi_folder(folder / "00012", example)
     return movi_a.read_scene(path, folder, "test")
 
 
@@ -191,6 +177,17 @@ def read_physion(folder: Path, factor: float) -> Scene:
     trial["velocities"][:, 0, 0] = factor
     path = write_physion(folder / "Drop" / "0.hdf5", trial)
     return physion.read_scene(path, folder, "test", fps=30)
+
+
+@pytest.mark.parametrize("read", [read_clevrer, read_movi_a, read_physion])
+def test_every_reader_compares_velocities_with_positions(read, tmp_path: Path) -> None:
+    with warnings.catch_warnings(action="error"):
+        expected = read(tmp_path / "right", 1.0)
+    with pytest.warns(RescaledVelocities):
+        found = read(tmp_path / "scaled", 3.0)
+    np.testing.assert_allclose(found.velocities, expected.velocities, rtol=5e-3, atol=1e-6)
+    with raises_user_error("inconsistent-velocities"):
+        read(tmp_path / "reversed", -1.0)
 
 
 def test_a_stored_scene_keeps_what_differs_from_the_standard(tmp_path: Path) -> None:
@@ -206,14 +203,3 @@ def test_a_stored_scene_keeps_what_differs_from_the_standard(tmp_path: Path) -> 
         with np.load(path) as file:
             header = json.loads(str(file["header"]))
         assert ("radii" in header) == ("records_contacts" in header) == bool(given.radii)
-
-
-@pytest.mark.parametrize("read", [read_clevrer, read_movi_a, read_physion])
-def test_every_reader_compares_velocities_with_positions(read, tmp_path: Path) -> None:
-    with warnings.catch_warnings(action="error"):
-        expected = read(tmp_path / "right", 1.0)
-    with pytest.warns(RescaledVelocities):
-        found = read(tmp_path / "scaled", 3.0)
-    np.testing.assert_allclose(found.velocities, expected.velocities, rtol=5e-3, atol=1e-6)
-    with raises_user_error("inconsistent-velocities"):
-        read(tmp_path / "reversed", -1.0)

@@ -2,29 +2,14 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import yaml
 
-from tests.data.sources.pictures import picture
+from tests.data.sources.pictures import write_video
 
 SIZE = 96, 64
 NAMES = {1: {"noun": "ball", "color": "red"}, 2: {"noun": "van", "material": "metal"}}
-
-
-def write_video(path: Path, frames: int, fps: int = 25) -> None:
-    """Write a video whose brightness encodes the frame index, modulo 120."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=fps)
-        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
-        for f in range(frames):
-            frame = av.VideoFrame.from_image(picture(f % 120, SIZE))
-            frame.pts, frame.time_base = f, Fraction(1, fps)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
 
 
 def box_lines(frames: int, ahead: int = 0) -> list[str]:
@@ -44,7 +29,7 @@ def write_tracked_video(
 ) -> Path:
     """Write a video, its tracks (those of `box_lines`, unless others are given), and add its names
     to tracks.yaml. Return the path of the tracks."""
-    write_video(folder / f"{name}.mp4", frames, fps)
+    write_video(folder / f"{name}.mp4", frames, SIZE, fps)
     text = "\n".join(lines or box_lines(frames)) + "\n"
     (folder / f"{name}.txt").write_text(text, errors="surrogateescape")
     path = folder / "tracks.yaml"
