@@ -16,9 +16,11 @@ from huggingface_hub import ModelCard
 from safetensors.torch import load_file, save_file
 
 from dynapix.conf.entry import Run
+from dynapix.conf.files import write_json
 from dynapix.conf.runs import open_run
 from dynapix.conf.schema import (
     ExportModelCommand,
+    SelectCommand,
     SftCommand,
     SftTrainConfig,
     TeacherConfig,
@@ -59,6 +61,11 @@ def finished_run(settings: SftCommand, root: Path) -> Path:
     randomize_adapters(model, 0.05)
     loading.save_student(model, processor, folder / "student", settings.train.precision)
     (folder / "metrics.json").write_text(json.dumps(METRICS))
+    for name, limit in (("whole", None), ("part", 4)):
+        evaluated = root / "select" / name
+        cfg = SelectCommand(benchmark=settings.benchmark, model=str(folder), limit=limit)
+        open_run(Run(name, evaluated), asdict(cfg), "evaluation.select")
+        write_json(evaluated / "metrics.json", {"answer_macro": 0.625 if limit is None else 0.125})
     return root
 
 
@@ -200,10 +207,14 @@ def test_the_card_describes_the_run(settings, runs, exports) -> None:
         "| benchmark | micro, 10 scenes by bullet, seed 0 |",
         "| teacher | template |",
         "| answer loss | 2.5 | 0.375 |",
+        "| answer macro | micro | `evaluation.select` | 0.625 |",
         # The warning about servers, which load adapters over the released base.
         "unquantised base",
     ):
         assert row in card.text
+    # The hub shows the results of whole evaluations.
+    [result] = card.data.eval_results
+    assert (result.metric_type, result.metric_value) == ("answer_macro", 0.625)
     hub = replace(settings, student=replace(settings.student, model="Qwen/Qwen3-VL-2B-Instruct"))
     run = runs / "sft" / "run"
     card = build_model_card("run", hub, run, run / "student", "bf16", METRICS)
