@@ -40,10 +40,18 @@ def run_child(
     return subprocess.CompletedProcess(command, child.returncode, output, errors)
 
 
-def run_card(folder: Path, elsewhere: Path) -> str:
-    """Run the code in the card of a trained folder with the libraries alone, in another directory.
+RUN_CARDS = """
+import sys
+
+for card in sys.argv[1:]:
+    exec(open(card).read().split("```python\\n")[1].split("```")[0], {})
+"""
+
+
+def run_cards(folders: Sequence[Path], elsewhere: Path) -> str:
+    """Run the code in the cards of trained folders with the libraries alone, in another directory.
     Return what it prints."""
-    code = (folder / "README.md").read_text().split("```python\n")[1].split("```")[0]
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    done = run_child([sys.executable, "-c", code], check=True, cwd=elsewhere, env=environment)
-    return done.stdout
+    cards = [folder.resolve() / "README.md" for folder in folders]
+    command = [sys.executable, "-c", RUN_CARDS, *cards]
+    return run_child(command, check=True, cwd=elsewhere, env=environment).stdout

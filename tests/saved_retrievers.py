@@ -13,7 +13,7 @@ from tests.evaluation.models import released
 from tests.families import TEXT, save_family
 
 PROMPTS = {"query": "Find the frame: ", "document": "A frame: "}
-RETRIEVERS = ("qwen2_5_vl", "smolvlm", "gemma3", "clip")
+RETRIEVERS = ("qwen2_5_vl", "smolvlm", "clip")
 WIDTH = 32
 """Hidden size of a sentence encoder."""
 
