@@ -14,6 +14,7 @@ a function is executed, in the order of the first execution.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import tempfile
@@ -48,6 +49,7 @@ BENCHMARK = (
 TRAINING = ("+exp=cot", "train.max_steps=1", "train.evaluations=1", "train.generated_items=0")
 RETRIEVER = ("train.max_steps=1", "train.batch=16", "train.mini_batch=8")
 EVALUATION = ("student=tiny", "modes=[record]", "limit=4")
+WALKS = ("data.build", "train.sft", "train.contrastive", "evaluation.select")
 GRADIENT = torch.Tensor.backward.__code__
 
 
@@ -120,7 +122,10 @@ def walk_all(folder: str) -> Iterator[tuple[str, list[str]]]:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("walks", nargs="*", choices=[[], *WALKS], default=[])
+    asked = parser.parse_args().walks or WALKS
     with tempfile.TemporaryDirectory() as folder:
         for name, files in walk_all(folder):
-            if name in (sys.argv[1:] or [name]):
+            if name in asked:
                 print(name, *(f"  {file}" for file in files), f"{len(files)} files", sep="\n")
