@@ -281,7 +281,9 @@ def load_adapters(base: nn.Module, folder: Path, is_trainable: bool = False) -> 
         with safe_open(folder / ADAPTER_WEIGHTS, "pt") as file:
             saved = set(file.keys())
         model = peft.PeftModel.from_pretrained(base, folder, is_trainable=is_trainable)
-        if others := saved ^ set(peft.get_peft_model_state_dict(model)):
+        # By default, peft looks up the base on the hub (see `without_embeddings`).
+        own = peft.get_peft_model_state_dict(model, save_embedding_layers=False)
+        if others := saved ^ set(own):
             raise ValueError(f"its adapters are those of another model: {min(others)}")
     return model
 

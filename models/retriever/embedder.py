@@ -198,7 +198,8 @@ def load_adapters(model: Retriever, folder: Path) -> None:
 
     weights = load_file(folder / ADAPTER_WEIGHTS)
     adapters = {name.removeprefix(PEFT_PREFIX): weight for name, weight in weights.items()}
-    if others := set(adapters) ^ set(peft.get_peft_model_state_dict(model[0].model)):
+    own = peft.get_peft_model_state_dict(model[0].model, save_embedding_layers=False)
+    if others := set(adapters) ^ set(own):
         raise ValueError(f"its adapters are those of another model: {min(others)}")
     peft.set_peft_model_state_dict(model[0].model, adapters)
     load_head(model, folder)
