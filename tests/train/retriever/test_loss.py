@@ -36,7 +36,9 @@ Gradients = tuple[float, dict[str, torch.Tensor]]
 
 def load(cfg: RetrieverConfig, precision: str, micro_store, folder) -> Retriever:
     """A retriever whose adapters, if any, have an effect."""
-    torch.manual_seed(0)
+    # With the weights of seed 0, two tokens of a frame score so alike that rounding chooses the
+    # greatest, and the gradient goes to one or the other.
+    torch.manual_seed(1)
     texts = tokenizer_texts(micro_store.retrieval("train"), cfg)
     model = load_retriever(cfg, precision, texts, folder)
     randomize_adapters(model, 0.05)
