@@ -54,7 +54,7 @@ def load_encoder(preset: RetrieverConfig, precision: str, saved: Path | None) ->
 
     Raises:
         UserError: The model cannot be loaded, is incomplete, is of another kind than `encoder`, has
-            the processor of another model, or needs another number or size of frames.
+            the processor of another model, or needs another number of frames.
     """
     keep_freed_memory()
     if saved is not None:

@@ -136,9 +136,10 @@ def load_languagebind(preset: RetrieverConfig, precision: str) -> LanguageBind:
     with explain_unloadable("retriever", preset.model):
         tokenizer = CLIPTokenizer.from_pretrained(preset.model, revision=preset.revision)
     check_text_tower(preset.model, video.config, tokenizer)
-    size = {"height": preset.image_size, "width": preset.image_size}
+    edge = video.config.vision_config.image_size
     # The released models have no processor file. Their authors preprocess images as CLIP does.
-    processor = CLIPImageProcessor(crop_size=size, size={"shortest_edge": preset.image_size})
+    size = {"height": edge, "width": edge}
+    processor = CLIPImageProcessor(crop_size=size, size={"shortest_edge": edge})
     return LanguageBind(preset, video, image, tokenizer, processor)
 
 
@@ -146,7 +147,7 @@ def load_tower(
     kind: type[CLIPModel], preset: RetrieverConfig, precision: str, key: str, revision: str | None
 ) -> CLIPModel:
     """Load the model that the setting `key` names; raise UserError if it is incomplete, not of this
-    kind, or needs another number or size of frames than the preset's."""
+    kind, or needs another number of frames than the preset's."""
     source = getattr(preset, key)
     with explain_unloadable("retriever", source, key):
         # CLIPConfig.from_pretrained would warn that the file has another model type.
@@ -165,12 +166,6 @@ def load_tower(
                 f"retriever.frames={preset.frames}, but {source} needs clips of "
                 f"{vision.num_frames} frames: set retriever.frames={vision.num_frames}",
                 code="wrong-frame-count",
-            )
-        if vision.image_size != preset.image_size:
-            raise UserError(
-                f"retriever.image_size={preset.image_size}, but {source} needs images of "
-                f"{vision.image_size} px: set retriever.image_size={vision.image_size}",
-                code="wrong-image-size",
             )
         # The released folders have pytorch_model.bin only, from which the library loads tensors but
         # no code.

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from dynapix.conf.files import read_json_lines
 from dynapix.conf.runs import rank
 from dynapix.data.records import FrameRef, RetrievalQuery, SelectionItem
-from dynapix.evaluation.generators.response_schema import Record, read_record
+from dynapix.evaluation.generators.response_schema import is_valid_record
 from dynapix.models.distributed import share_from_main
 from dynapix.models.fingerprints import settings_key
 from dynapix.models.student.answer_parser import parse_choice
@@ -67,11 +67,6 @@ class Answer(ModelResponse):
     right: bool
     valid: bool | None
 
-    @property
-    def record(self) -> Record | None:
-        """The structured record, if it is valid."""
-        return read_record(self.text) if self.valid else None
-
 
 def score_response(subject: Subject, mode: str, generated: GeneratedText) -> ModelResponse:
     """Return the response to a subject. If the subject is a selection item, the letter is parsed
@@ -82,7 +77,7 @@ def score_response(subject: Subject, mode: str, generated: GeneratedText) -> Mod
     parsed = parse_choice(text, truncated=truncated)
     letter, is_right = parsed.letter, parsed.letter == subject.letter
     reason = str(parsed.reason) if letter is None and parsed.reason else None
-    valid = read_record(text) is not None if mode in RECORD_MODES else None
+    valid = is_valid_record(text) if mode in RECORD_MODES else None
     return Answer(subject.name, mode, text, truncated, letter, reason, is_right, valid)
 
 

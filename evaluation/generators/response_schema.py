@@ -1,12 +1,11 @@
 """The structured record of a response: its instruction, its JSON schema and its parser.
 
-Only the forced choice is scored. The confidence is compared with the accuracy.
+Only the forced choice is scored.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -30,22 +29,6 @@ FIELDS = {
     "justification": "one or two sentences on why you choose as you do",
 }
 """The fields of a record, in order, with the meaning that the instruction gives them."""
-
-
-@dataclass(frozen=True)
-class Record:
-    """A valid record.
-
-    `confidence` and the probabilities are from 0 to 1; the probabilities need not sum to 1.
-    """
-
-    forced_choice: str
-    confidence: float
-    distribution: dict[str, float]
-    second_choice: str
-    ambiguity: str
-    rationales: dict[str, str]
-    justification: str
 
 
 def write_record_instruction() -> str:
@@ -85,20 +68,18 @@ def _text(max_length: int) -> dict[str, Any]:
     return {"type": "string", "maxLength": max_length} if max_length else {"type": "string"}
 
 
-def read_record(raw: str) -> Record | None:
-    """Return the record in a response, or None if the response has no valid record.
-
-    A valid record is JSON that the schema accepts, with texts of any length. It must be the only
-    record with a choice in the response. The text around it is ignored.
+def is_valid_record(raw: str) -> bool:
+    """Return whether a response has a valid record: JSON that the schema accepts, with texts of any
+    length. It must be the only record with a choice in the response. The text around it is ignored.
     """
     answer = parse_choice(raw)
     if answer.record is None or answer.letter is None:
-        return None
+        return False
     try:
         value = json.loads(answer.record, parse_constant=_refuse_constant)
     except ValueError:
-        return None
-    return Record(**value) if _validator().is_valid(value) else None
+        return False
+    return _validator().is_valid(value)
 
 
 def _refuse_constant(word: str) -> float:

@@ -36,7 +36,6 @@ RETRIEVER = RetrieverConfig(
     name="small", architecture=SMALL, image_size=96, widths=[64, 32], **NO_LORA
 )
 SERVED = StudentConfig(name="any", model="any", image_size=96, max_length=1500, max_new_tokens=40)
-"""A base on a server."""
 
 
 def served_by(*servers: ChatServer, **changes: object) -> ServerConfig:
@@ -82,9 +81,8 @@ def trained_student(tmp_path_factory, micro, micro_store) -> Path:
 @pytest.fixture(scope="session")
 def trained_retriever(tmp_path_factory, micro, micro_store) -> Path:
     """A finished run of train.contrastive."""
-    return save_retriever(
-        RETRIEVER, tmp_path_factory.mktemp("contrastive") / "run", micro, micro_store
-    )
+    folder = tmp_path_factory.mktemp("contrastive") / "run"
+    return save_retriever(RETRIEVER, folder, micro, micro_store)
 
 
 @pytest.fixture(scope="session")

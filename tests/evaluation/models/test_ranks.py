@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from dynapix.conf.runs import Run
 from dynapix.conf.schema import EmbedderConfig, RetrieveCommand, SelectCommand, TwoStageCommand
@@ -103,11 +102,7 @@ def test_two_ranks_write_what_one_process_writes(
         return [(name, replace(cfg, store=store), root / name) for name, cfg in commands.items()]
 
     one, two = tmp_path / "one", tmp_path / "two"
-    threads = torch.get_num_threads()
-    # As many as a rank has.
-    torch.set_num_threads(1)
     evaluate(prepare(one))
-    torch.set_num_threads(threads)
     jobs = prepare(two)
     log = (one / "select" / "answers.jsonl").read_text().splitlines(keepends=True)
     (two / "select" / "answers.jsonl").write_text("".join(log[:5]))

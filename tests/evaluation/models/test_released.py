@@ -65,31 +65,24 @@ def load(preset: RetrieverConfig):
 def test_a_query_is_the_sum_of_its_prefix_and_its_question(
     kind, presets, frames, micro_store
 ) -> None:
-    """In a batch as alone, and like the embeddings of transformers."""
-    preset, queries = presets[kind], micro_store.standard_test()[:2]
+    preset, query = presets[kind], micro_store.standard_test()[0]
     model = AutoModel.from_pretrained(preset.model)
     processor = AutoProcessor.from_pretrained(preset.model)
-    prefixes, questions, images, refs = [], [], [], []
-    for query in queries:
-        prefix = sample_prefix_frames(query.prefix_start, query.prefix_stop, preset.frames)
-        inputs = processor(
-            text=[query.question.lower()], images=[frames.image(query.scene_id, f) for f in prefix],
-            padding="max_length", max_length=model.config.text_config.max_position_embeddings,
-            truncation=True, return_tensors="pt",
-        )  # fmt: skip
-        with torch.no_grad():
-            # The embeddings that the model's `forward` returns have length 1.
-            output = model(input_ids=inputs["input_ids"], pixel_values=inputs["pixel_values"])
-        prefixes.append(unit_rows(output.image_embeds.mean(0, keepdim=True).numpy())[0])
-        questions.append(output.text_embeds[0].numpy())
-        images.append(output.image_embeds[0].numpy())
-        refs.append(FrameRef(query.scene_id, prefix[0]))
-    encoder = load(preset)
-    summed = unit_rows(np.stack(prefixes) + np.stack(questions))
-    np.testing.assert_allclose(encoder.embed_queries(queries, frames), summed, atol=1e-4)
-    texts = encoder.embed_texts([query.question for query in queries])
-    np.testing.assert_allclose(texts, np.stack(questions), atol=1e-4)
-    np.testing.assert_allclose(encoder.embed_frames(refs, frames), np.stack(images), atol=1e-4)
+    prefix = sample_prefix_frames(query.prefix_start, query.prefix_stop, preset.frames)
+    inputs = processor(
+        text=[query.question.lower()], images=[frames.image(query.scene_id, f) for f in prefix],
+        padding="max_length", max_length=model.config.text_config.max_position_embeddings,
+        truncation=True, return_tensors="pt",
+    )  # fmt: skip
+    with torch.no_grad():
+        # The embeddings that the model's `forward` returns have length 1.
+        output = model(input_ids=inputs["input_ids"], pixel_values=inputs["pixel_values"])
+    mean = unit_rows(output.image_embeds.mean(0, keepdim=True).numpy())
+    expected = unit_rows(mean + output.text_embeds.numpy())
+    encoder, refs = load(preset), [FrameRef(query.scene_id, frame) for frame in prefix]
+    np.testing.assert_allclose(encoder.embed_queries([query], frames), expected, atol=1e-4)
+    np.testing.assert_allclose(encoder.embed_texts([query.question]), output.text_embeds, atol=1e-4)
+    np.testing.assert_allclose(encoder.embed_frames(refs, frames), output.image_embeds, atol=1e-4)
 
 
 def test_languagebind_without_attention_over_time_is_clip(presets, frames, micro_store) -> None:
@@ -122,8 +115,6 @@ def test_languagebind_without_attention_over_time_is_clip(presets, frames, micro
     together = encoder.embed_queries(queries, frames)
     alone = [encoder.embed_queries([query], frames)[0] for query in queries]
     np.testing.assert_allclose(together, np.stack(alone), atol=1e-5)
-    targets = encoder.embed_frames([query.target for query in queries], frames)
-    np.testing.assert_allclose(np.linalg.norm(targets, axis=1), 1, atol=1e-5)
 
 
 def test_vlm2vec_reads_media_at_text_positions_without_start_tokens(
@@ -184,8 +175,6 @@ def test_the_nearest_candidate_is_chosen(presets, frames, micro, micro_store, tm
     stored = list(read_json_lines(run.folder / "scores.jsonl"))
     assert [row["item_id"] for row in stored] == [item.item_id for item in items]
     assert np.array([row["scores"] for row in stored]) == pytest.approx(scores, abs=1e-5)
-    text = (run.folder / "report.txt").read_text()
-    assert all(part in text for part in ("SigLIP 2", *report["subtypes"]["clip"]))
 
 
 def test_tied_candidates_share_the_credit_and_none_is_chosen() -> None:
@@ -201,7 +190,6 @@ def test_tied_candidates_share_the_credit_and_none_is_chosen() -> None:
         ("vlm2vec", {"model": "clip"}, "wrong-model-type", "VLM2Vec"),
         ("languagebind", {"model": "clip"}, "wrong-model-type", "retriever.model="),
         ("languagebind", {"frames": 12}, "wrong-frame-count", "set retriever.frames=4"),
-        ("languagebind", {"image_size": 28}, "wrong-image-size", "set retriever.image_size=56"),
         ("languagebind", {"image_model": "siglip2"}, "incomplete-model", "image_model="),
     ],
 )

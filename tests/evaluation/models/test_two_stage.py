@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from dynapix.conf.schema import EmbedderConfig, LateConfig, RetrieverConfig, TwoStageCommand
 from dynapix.data.store import Store, open_store
 from dynapix.evaluation import two_stage
-from dynapix.evaluation.embedders.embedder import Embedder, open_embedders
+from dynapix.evaluation.embedders.embedder import open_embedders
 from dynapix.evaluation.metrics.results import SCENE_ALONE, retrieval_results
 from dynapix.evaluation.retrieval.standard_test import load_test
 from dynapix.evaluation.retrieval.text_matching import ROUTES, future_text, rank_by_text
@@ -37,29 +37,18 @@ def store(tmp_path, micro_store) -> Store:
     return open_store(shutil.copytree(micro_store.folder, tmp_path / "store" / "micro"))
 
 
-def open_matcher(preset: RetrieverConfig, store: Store, folder: Path) -> Embedder:
-    [embedder] = open_embedders(None, EmbedderConfig(retriever=preset), store, folder, 16)
-    return embedder
-
-
-@pytest.mark.parametrize(
-    ("text", "state"),
-    [
-        (RATIONALE, STATE),
-        (RATIONALE.replace("Prediction:", "### 3. **prediction**\n"), STATE),
-        (RATIONALE.replace("Outcome:", "**Outcome:**"), STATE),
-        (f"<think>Prediction: A sphere.</think>\n{RATIONALE}", STATE),
-        ("  The cube is near the top.\n", "The cube is near the top."),
-        ("<think>The cube will", ""),
-        ("\ud800 rests", "? rests"),
-    ],
-)
-def test_the_part_of_a_response_about_the_target_is_matched(text, state) -> None:
-    assert future_text(text) == state
+def test_the_part_of_a_response_about_the_target_is_matched() -> None:
+    heading = RATIONALE.replace("Prediction:", "### 3. **prediction**\n")
+    marked = RATIONALE.replace("Outcome:", "**Outcome:**")
+    thought = f"<think>Prediction: A sphere.</think>\n{RATIONALE}"
+    assert {future_text(text) for text in (RATIONALE, heading, marked, thought)} == {STATE}
+    assert future_text("  The cube is near the top.\n") == "The cube is near the top."
+    assert future_text("<think>The cube will") == ""
+    assert future_text("\ud800 rests") == "? rests"
 
 
 def test_texts_are_matched_to_frames_and_captions(store, clip, tmp_path) -> None:
-    matcher = open_matcher(clip, store, tmp_path)
+    [matcher] = open_embedders(None, EmbedderConfig(retriever=clip), store, tmp_path, 16)
     queries, database = load_test(store)
 
     def rank(route: str, texts: list[str], captions: list[str] = ()):
@@ -91,8 +80,7 @@ def test_texts_are_matched_to_frames_and_captions(store, clip, tmp_path) -> None
     captions = [f"Frame {f.name}." for f in database]
     texts = [f"Frame {q.target.name}." for q in queries]
     found = rank("predict_caption", texts, captions)
-    assert not found.above.any()
-    assert not found.tied.any()
+    assert not np.any([found.above, found.tied])
     same = rank("predict_caption", texts, ["A frame."] * len(captions))
     assert (same.tied == len(database) - 1).all()
     # A query whose target has no caption is a miss. The frame still counts in the database.
@@ -144,14 +132,11 @@ def test_a_students_texts_serve_every_matcher(
     assert report["texts"]["caption"]["texts"] == len(database)
     text = (tmp_path / "one" / "report.txt").read_text()
     assert all(part in text for part in ("Qwen3-VL-2B predict -> caption", "Parsed responses"))
-    matched = (tmp_path / "one" / "matched.jsonl").read_text().splitlines()
-    assert len(matched) == 2 * len(queries)
 
     # With another matcher, the student is not loaded: without config.json, it could not be loaded.
     (folder / "student" / "config.json").unlink()
     other = EmbedderConfig(retriever=replace(clip, name="narrow", widths=[12]))
-    again, _ = measure("three", *overrides, **settings, matcher=other)
-    assert set(again) == set(metrics)
+    assert set(measure("three", *overrides, **settings, matcher=other)[0]) == set(metrics)
 
 
 @pytest.mark.slow
@@ -199,11 +184,5 @@ def test_routes_that_a_model_or_a_matcher_cannot_take_are_refused(
     minilm = RetrieverConfig(name="minilm", model=weights, widths=[32, 16], **NO_LORA)
     with raises_user_error("no-images", contains="routes=[predict_caption]"):
         measure(matcher=EmbedderConfig(retriever=minilm))
-    queries, database = load_test(store)
-    texts = {
-        "prediction": {q.name: f"Frame {q.target.name}." for q in queries},
-        "caption": {f.name: f"Frame {f.name}." for f in database},
-    }
-    matcher = open_matcher(minilm, store, tmp_path)
-    ranks = rank_by_text(ROUTES["predict_caption"], matcher, texts, queries, database)
-    assert not ranks.above.any()
+    [matcher] = open_embedders(None, EmbedderConfig(retriever=minilm), store, tmp_path, 16)
+    matcher.try_out(None)

@@ -15,7 +15,6 @@ from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.evaluation import select
 from dynapix.evaluation.generators.generator import item_sample
 from dynapix.models import loading
-from dynapix.models.student.answer_parser import Reason, parse_choice
 from dynapix.models.student.chat_requests import build_messages, qwen_fields, sampling_fields
 from dynapix.models.student.collator import Collator, encode
 from dynapix.train.student import dataset
@@ -70,19 +69,19 @@ def ask(server, cfg, sample, model: str = "tiny", **fields: object):
     request = sampling_fields(cfg, 1)
     extra = {"return_token_ids": True, "return_tokens_as_token_ids": True}
     request["extra_body"] |= qwen_fields(cfg, sample.clip) | extra
+    request |= {"model": model, "messages": build_messages(sample), **fields}
     client = openai.OpenAI(base_url=server.url, api_key="none")
-    messages = build_messages(sample)
-    return client.chat.completions.create(model=model, messages=messages, **request, **fields)
+    return client.chat.completions.create(**request)
 
 
 def test_requests_become_the_inputs_of_a_local_model(server, cfg, student, micro_store) -> None:
     model, processor, _ = student
     frames, items = FrameReader(micro_store, cfg.image_size), micro_store.selection("test")
-    for control in (None, "shuffled_prefix", "candidate_only"):
-        for mode, item in zip(("record", "answer"), items, strict=False):
-            sample = item_sample("cot", frames, cfg, control, mode, item)
-            ids = encode(sample, processor, 1500).input_ids
-            assert ask(server, cfg, sample).model_extra["prompt_token_ids"] == ids
+    modes = {None: "record", "shuffled_prefix": "answer", "candidate_only": "record"}
+    for (control, mode), item in zip(modes.items(), items, strict=False):
+        sample = item_sample("cot", frames, cfg, control, mode, item)
+        ids = encode(sample, processor, 1500).input_ids
+        assert ask(server, cfg, sample).model_extra["prompt_token_ids"] == ids
 
     # A server with adapters responds as the student. Without them, the probabilities differ.
     sample = item_sample("cot", frames, cfg, None, "answer", items[0])
@@ -104,7 +103,7 @@ def test_constrained_responses_of_a_served_model_are_records(
 ) -> None:
     caplog.set_level("INFO")
     settings = SelectCommand(
-        benchmark=micro, student=replace(cfg, max_new_tokens=200, temperature=0.7), limit=4,
+        benchmark=micro, student=replace(cfg, max_new_tokens=60, temperature=0.7), limit=4,
         store=str(micro_store.folder.parent), modes=["answer", "constrained"],
         server=ServerConfig(url=server.url, model="tiny"),
     )  # fmt: skip
@@ -114,14 +113,10 @@ def test_constrained_responses_of_a_served_model_are_records(
     # The server has the same tokens as a local model.
     assert "prompts are not compared" not in caplog.text
     assert "reads prompts differently" not in caplog.text
-    # A model with random weights may write texts up to the token limit. The choice precedes them.
+    # Without a constraint, random weights write no choice.
     assert metrics["constrained_parse_rate"] == 1
     asked, *rows = read_json_lines(run.folder / "answers.jsonl")
     assert asked["asked"]["model"]["root"] == cfg.model
-    for row in [r for r in rows if r["mode"] == "constrained" and "text" in r]:
-        found = parse_choice(row["text"])
-        assert found.letter == row["letter"]
-        assert row["valid"] or (row["truncated"] and found.reason is Reason.CUT_OFF)
     # Concurrent responses depend on their own seeds.
     again = new_run(tmp_path / "again")
     select.main.__wrapped__(replace(settings, modes=["answer"]), again)

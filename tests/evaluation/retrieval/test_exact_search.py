@@ -45,12 +45,6 @@ def rows_of(vectors: list[np.ndarray], more: int = 0) -> np.ndarray:
     return np.pad(rows, ((0, 0), (0, more * LATE_WIDTH)))
 
 
-def score_rows(
-    queries: np.ndarray, frames: np.ndarray, width: int, late: bool = False
-) -> np.ndarray:
-    return score(to_grid(queries, width, late), to_grid(frames, width, late))
-
-
 def exact_cosines(queries: np.ndarray, database: np.ndarray, width: int) -> np.ndarray:
     """Cosines (queries, frames) by their definition, in double precision."""
     rows = [a[:, :width].astype(float) for a in (queries, database)]
@@ -92,7 +86,7 @@ def test_scores_are_cosines_and_ranks_those_of_a_score_matrix() -> None:
     assert (found.tied[:, -1] == FRAMES - 1).all()
     for k, width in enumerate(WIDTHS):
         cosines = exact_cosines(queries[:-1], database, width)
-        scores = score_rows(queries[:-1], database, width)
+        scores = score(to_grid(queries[:-1], width), to_grid(database, width))
         np.testing.assert_allclose(scores, cosines, atol=6e-8)
         above, tied = count_ranks(cosines, TARGETS)
         # A few frames tie with the target in fp32 but not in double precision.
@@ -119,11 +113,13 @@ def test_twins_are_compared_with_targets_at_each_width() -> None:
 
 def test_late_scores_agree_with_the_librarys_in_any_order_of_the_vectors() -> None:
     queries, frames = random_vectors(20, 60, 0), random_vectors(120, 9, 1)
-    found = score_rows(rows_of(queries), rows_of(frames), LATE_WIDTH, late=True)
+    rows = rows_of(queries), rows_of(frames)
+    found = score(*(to_grid(side, LATE_WIDTH, late=True) for side in rows))
     np.testing.assert_allclose(found, maxsim([*queries], [*frames]).numpy(), rtol=1e-6, atol=1e-5)
     rng = np.random.default_rng(2)
     moved = [rows_of([rng.permutation(v) for v in side], 5) for side in (queries, frames)]
-    assert np.array_equal(score_rows(*moved, LATE_WIDTH, late=True), found)
+    again = score(*(to_grid(side, LATE_WIDTH, late=True) for side in moved))
+    assert np.array_equal(again, found)
     padded = exact_ranks(moved[0], moved[1][:20], [moved[1]], [LATE_WIDTH], late=True)
     assert padded.vectors == sum(map(len, frames)), "padding is not counted"
 
@@ -138,6 +134,5 @@ def test_the_largest_sums_are_exact() -> None:
     for count in (1, 7999, 8000):
         query = np.repeat(vector, count, axis=0).reshape(1, -1)
         (found,) = pair_scores(query, vector, LATE_WIDTH, late=True)
-        exact = count * int((steps * steps).sum())
-        assert exact < 2**53
+        assert (exact := count * int((steps * steps).sum())) < 2**53
         assert found == np.float32(exact / 2**40)
