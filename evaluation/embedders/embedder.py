@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 EMBEDDINGS = "embeddings"
 """Folder of the embeddings in a store."""
-INPUT_VERSION = 2
+INPUT_VERSION = 3
 """Version of the layout of the models' inputs. Increment it when the layout changes, so that
 earlier embeddings are not reused."""
 PACKAGES = ("sentence-transformers", "transformers")
