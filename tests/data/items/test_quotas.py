@@ -20,8 +20,16 @@ from dynapix.data.build import ensure_items
 from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.parallel import Workers
 from dynapix.data.records import original_scene_id
+from dynapix.data.seeded_order import named_rng
 from dynapix.data.sources.scenes import scene_prefix, split_scenes
 from dynapix.data.store import DATABASES
+
+
+def test_every_seed_has_an_order_of_its_own() -> None:
+    """Also seed 0."""
+    orders = [named_rng(seed, "cell").permutation(50).tolist() for seed in (0, 1, 2)]
+    assert orders[0] not in orders[1:]
+    assert orders[0] == named_rng(0, "cell").permutation(50).tolist()
 
 
 def config(**selection) -> BenchmarkConfig:

@@ -12,7 +12,7 @@ from dynapix.data.items.pickers import Timing
 from dynapix.data.items.queries import BUILDERS
 from dynapix.data.items.recipes import EVENT_CELLS, MATCHED, make_recipe
 from dynapix.data.items.transfer import make_transfer_recipe
-from dynapix.data.oracle.contacts import first_collisions
+from dynapix.data.oracle.contacts import first_collisions, next_collision
 from dynapix.data.records import FPS, Scene
 from dynapix.data.sim.physics import Touching
 from dynapix.data.sim.sampling import sample_scene
@@ -49,6 +49,15 @@ def touches_anew(touching: Touching, step: int, first: int, last: int) -> bool:
         for frames in touching.values()
         for frame in frames
     )
+
+
+def test_the_next_collision_begins_after_the_frame(touched: tuple[Scene, Touching]) -> None:
+    scene, _ = touched
+    starts = sorted(contact.frame for contact in scene.collisions)
+    for frame in range(scene.frames):
+        following = next_collision(scene, frame)
+        expected = next((start for start in starts if start > frame), None)
+        assert (following and following.frame) == expected
 
 
 def test_every_touch_belongs_to_one_contact(touched: tuple[Scene, Touching]) -> None:
