@@ -81,8 +81,8 @@ class Recipe:
 class DistractorPicker:
     """Takes the first distractors of the recipe's pools that differ visibly from each other.
 
-    Cross-scene distractors come from the scenes of the split. `dropped` counts the timings at which
-    no item can be made, by reason.
+    Cross-scene distractors come from the scenes of the split. `dropped` counts timings at which no
+    item can be made because too few distractors differ from the target and from each other.
     """
 
     cell: CellInputs

@@ -268,8 +268,9 @@ def _response_entry(
 
 
 def mark_claims(item: SelectionItem, response: ItemResponse, store: Store) -> list[dict[str, Any]]:
-    """Return the spans of a rationale's claims in text order, each with the verdicts on the claims
-    that it states, and with these claims in words. Spans do not overlap."""
+    """Return the spans of the claims of a rationale that count as reasons, in text order, each with
+    the verdicts on the claims that it states, and with these claims in words. Of overlapping
+    spans, the first is returned."""
     if SECTIONS[0] not in response.text:
         return []
     reasons = read_reasons(item, response.text, response.letter, store)

@@ -25,9 +25,9 @@ REGION_INDICES = {value: (x, y) for y, row in enumerate(REGIONS) for x, value in
 
 
 def measure_margin(statement: Relation, places: Places) -> float:
-    """Return the distance of what a statement describes from the bound of its words, as a share of
-    the image's width or height: not negative if the statement is true of a frame, negative if it is
-    false.
+    """Return how far a frame is from the point at which a statement changes between true and false,
+    as a share of the image's width or height: not negative if the statement is true of the frame,
+    negative if it is false.
 
     A statement about regions, sides, heights or extremes stays true, or false, if one of its
     objects moves by less than this in the image. For "between", this holds if the object in the
@@ -40,6 +40,7 @@ def measure_margin(statement: Relation, places: Places) -> float:
     kind, objects, value = statement
     seen = all(name in places.image for name in objects)
     if kind == "sight":
+        # The only statement of this kind is that an object cannot be seen.
         return -FAINT if seen else FAINT
     if not seen:
         return -FAINT

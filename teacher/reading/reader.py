@@ -15,8 +15,8 @@ VERBS = {
 }
 """Tags that may be the verb of the last noun phrase before them."""
 DENIALS = {"not", "none", "no_contact", "lack", "gone"}
-"""Tags that deny something, so that "or" joins what is denied. Elsewhere, it leaves open what is
-true."""
+"""Tags that deny something. In a sentence with one of them, "A or B" means neither; in any other,
+it leaves open which is true, and the sentence is unreadable."""
 LACKING = {"no", "lack", "gone"}
 """Words or tags before an object that need not exist."""
 
@@ -127,7 +127,7 @@ class Reader:
         return [name for name in (*self.predicates.objects, *self.extras) if noun.fits(name)]
 
     def _find_mentions(self) -> list[Claim]:
-        """Return the claims that the named objects exist, and those that they are at rest."""
+        """Return a claim for each object that the sentence names: that it exists."""
         found: list[Claim] = []
         for previous, tag in zip((END, *self.tags), self.tags, strict=False):
             if not isinstance(noun := tag.value, Noun):

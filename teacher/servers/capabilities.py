@@ -75,8 +75,9 @@ def without_optional(fields: RequestFields) -> RequestFields:
 
 
 def constraint_forms(constraint: Constraint) -> dict[str, RequestFields]:
-    """Return the fields that ask for a constraint, by the name under which servers know it: vLLM,
-    llama.cpp and earlier versions of vLLM for a grammar, and all of them for a JSON schema."""
+    """Return the fields that ask for a constraint, by the name under which servers know it. For a
+    grammar: vLLM, llama.cpp and earlier versions of vLLM. For a JSON schema: OpenAI's API, which
+    all of them have, and earlier versions of vLLM."""
     if isinstance(constraint, str):
         return {
             "structured_outputs": {"structured_outputs": {"grammar": constraint}},

@@ -5,9 +5,9 @@ The candidates are the target and frames of other futures of the scene
 (`data.items.scores`). In the time family, two candidates show the right moment
 and two a wrong one, and two show the scene's own future and two another one.
 
-A subtype keeps the question, prefix and target of its cell. The distractors of the cells named
-`match` and of hard items are those nearest to the target; those of the cells named `cross` and of
-easy items are the farthest.
+A subtype keeps the question, prefix and target of its cell. As in the paper's recipe, some subtypes
+are hard and some easy (`IS_HARD`): the distractors of hard items are the futures nearest to the
+target, those of easy items the farthest.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from dynapix.data.store import save_scene, scene_path
 
 FUTURES = {"event": 10, "time": 12, "window": 12}
 """Number of alternative futures from which the distractors of an item are chosen, by family."""
-NEAREST = {"same_obj_match": True, "same_near": True, "cross_scene": False, "same_far": False}
+IS_HARD = {"same_obj_match": True, "same_near": True, "cross_scene": False, "same_far": False}
 """Whether the distractors of a balanced item are the nearest to the target or the farthest, by the
 distractors that the cell has in the paper's recipe."""
 TRIES = 3
@@ -101,7 +101,7 @@ class BalancedPicker(DistractorPicker):
         displacement = frame_displacements(frames, about)
         choices = _choices(len(moments), len(futures))
         choices = distinct_choices(choices, displacement, self.cell.min_displacement)
-        choices = _of_difficulty(choices, displacement, NEAREST.get(cell["distractors"]))
+        choices = _of_difficulty(choices, displacement, IS_HARD.get(cell["distractors"]))
         if not len(choices):
             return None
         scores = self._compare(frames, frame_moments).scores(choices)
