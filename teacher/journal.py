@@ -40,8 +40,12 @@ class Journal:
         self.path = path
         self.file = open(path, "ab+")  # noqa: SIM115  closed by __exit__
         wait_for_lock(self.file.fileno(), f"another process is writing {path}")
-        self._repair_last_line()
-        self.rationales = read_rationales(path)
+        try:
+            self._repair_last_line()
+            self.rationales = read_rationales(path)
+        except BaseException:
+            self.file.close()
+            raise
 
     def __enter__(self) -> Journal:
         return self

@@ -229,7 +229,7 @@ class IndexedPredicates:
 
 def _same(value: str, actual: str | None) -> bool | None:
     """Return whether a value is the actual one. A rough value may also be neither true nor false:
-    "~west" for a direction at most 90 degrees from west, "~near the left" for its corners."""
+    "~west" for northwest and southwest, "~near the left" for its corners."""
     if actual is None:
         return None
     if not value.startswith(COARSE):

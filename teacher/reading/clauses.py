@@ -20,7 +20,6 @@ FRONTED = {
 """Tags that may precede their subject, as in "near the top is the red cube"."""
 OF_CONTACT = {"be", "future", "expected", "time", "occurs", "region"}
 """Tags of the clause after "the contact between the cube and the sphere"."""
-SINGULAR = {"is", "was", "does", "has"}
 PLURAL = {"are", "were", "do", "have", "move", "meet", "collide", "stay", "remain"}
 FINITE = {
     *("be", "moves", "stays", "future", "across", "leaves", "enters", "show", "past", "expected"),
@@ -270,7 +269,9 @@ class ClauseReader(Reader):
             if self.was_verbal and self.carried and plural and len(clause.subjects) == 1:
                 # "The cube moves west, the sphere east, and the cylinder are at rest."
                 raise UnreadableError
-            if not (self.was_verbal or first in SINGULAR or (first.endswith("s") and not plural)):
+            # "Passes" is singular, "pass" is not.
+            singular = first.endswith("s") and not first.endswith("ss")
+            if not (self.was_verbal or singular):
                 clause.subjects = [*dict.fromkeys([*self.carried, *clause.subjects])]
             self.carried = []
             clause.has_verb = True
@@ -321,7 +322,7 @@ class ClauseReader(Reader):
 
     def on_struck(self, tag: Tag) -> None:
         partners = self.read_list(True) if self.take("with") else []
-        self._add_event("meeting", tag, self.clause.subjects, partners, alone=True)
+        self._add_event("meeting", tag, self.clause.subjects, partners, alone=not partners)
 
     def _add_event(
         self,

@@ -12,7 +12,7 @@ from dynapix.teacher.predicates.facts import COMPASS
 
 COARSE = "~"
 """Prefix of a value that the text states only roughly. "Leftward" has the value "~west": true for
-west, false for directions more than 90 degrees from it, and unknown for the others."""
+west, unknown for northwest and southwest, and false for the other directions."""
 ENDINGS = ("", "ern", "ward", "wards", "erly", "bound", "wardly")
 """Endings of a compass direction, as in "eastward" and "eastbound"."""
 

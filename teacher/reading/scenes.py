@@ -5,7 +5,7 @@ from __future__ import annotations
 from dynapix.teacher.predicates.facts import COMPASS
 from dynapix.teacher.predicates.relations import CHANGES, KINDS
 from dynapix.teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
-from dynapix.teacher.reading.clauses import SINGULAR, ClauseReader
+from dynapix.teacher.reading.clauses import ClauseReader
 from dynapix.teacher.reading.phrases import COARSE
 from dynapix.teacher.reading.reader import SEPARATORS, UnreadableError
 from dynapix.teacher.reading.tagging import (
@@ -18,8 +18,24 @@ from dynapix.teacher.reading.tagging import (
     Tag,
 )
 
-STILL_VERBS = SINGULAR | {
-    *("do", "did", "are", "rests", "rest", "stands", "stand", "sits", "sit", "lies", "lie"),
+STILL_VERBS = {
+    *(
+        "is",
+        "was",
+        "does",
+        "has",
+        "do",
+        "did",
+        "are",
+        "rests",
+        "rest",
+        "stands",
+        "stand",
+        "sits",
+        "sit",
+        "lies",
+        "lie",
+    ),
     *("keep", "keeps", "have", "shows", "show", "stays", "stay", "remains", "remain"),
 }
 """First words of the phrases of the tag "still" that contain a verb."""
