@@ -34,21 +34,21 @@ def write_archive(store: Store, path: Path) -> None:
     Raises:
         UserError: `path` holds something else.
     """
+    names = [MANIFEST, *store.manifest["files"]]
+    names += [f"{FRAMES_FOLDER}/{p.name}" for p in (store.folder / FRAMES_FOLDER).glob("[!.]*")]
+    names += [name for name in (JOURNAL, RATIONALES) if (store.folder / name).exists()]
     if path.exists():
-        if _read_manifest(path)[1] != store.manifest:
+        if _read_manifest(path)[1] != store.manifest or not _has_rationales(path, store):
             raise UserError(
-                f"{path} holds another benchmark or build: choose another archive=FILE, or delete "
-                "it",
+                f"{path} holds another benchmark or build, or other rationales: choose another "
+                "archive=FILE, or delete it",
                 code="other-settings",
             )
         log.info("%s already holds this benchmark", path)
         return
-    names = [MANIFEST, *store.manifest["files"]]
-    names += [f"{FRAMES_FOLDER}/{p.name}" for p in (store.folder / FRAMES_FOLDER).glob("[!.]*")]
-    names += [name for name in (JOURNAL, RATIONALES) if (store.folder / name).exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.partial")
-    # Scenes and frames are compressed already.
+    # Frames, which take most of the space, are compressed already.
     with zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as archive:
         for name in tqdm(sorted(names), desc=f"writing {path.name}", unit="file", mininterval=1.0):
             # ZipInfo has a fixed date.
@@ -56,6 +56,14 @@ def write_archive(store: Store, path: Path) -> None:
             with open(store.folder / name, "rb") as file, archive.open(member, "w") as target:
                 shutil.copyfileobj(file, target, CHUNK)
     unfinished.rename(path)
+
+
+def _has_rationales(path: Path, store: Store) -> bool:
+    """Return whether an archive has the rationales of a store, which its manifest does not list."""
+    name, own = f"{store.name}/{JOURNAL}", store.folder / JOURNAL
+    with zipfile.ZipFile(path) as archive:
+        held = archive.read(name) if name in archive.namelist() else None
+    return held == (own.read_bytes() if own.exists() else None)
 
 
 def open_archive(source: str, root: Path) -> Store:
@@ -87,7 +95,10 @@ def _download(address: str, file: Path) -> None:
                 while chunk := reply.read(CHUNK):
                     target.write(chunk)
                     bar.update(len(chunk))
-    # HTTPException, such as an interrupted transfer, is no OSError.
+            # A transfer that is cut off ends like a complete one.
+            if size is not None and target.tell() != size:
+                raise ValueError(f"the transfer ended after {target.tell()} of {size} bytes")
+    # An HTTPException is no OSError.
     except (OSError, ValueError, HTTPException) as error:
         raise UserError(f"{address} cannot be downloaded: {error}", code="no-download") from error
 

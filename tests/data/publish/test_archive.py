@@ -27,10 +27,18 @@ def archive(micro_store: Store, tmp_path_factory) -> Path:
     return path
 
 
+class Handler(SimpleHTTPRequestHandler):
+    """Serves files, but ends a transfer early if its address asks for that."""
+
+    def copyfile(self, source, outputfile) -> None:
+        cut = source.read()[:-1000] if "cut" in self.path else source.read()
+        outputfile.write(cut)
+
+
 @pytest.fixture
 def address(archive: Path) -> Iterator[str]:
     """The address of the folder of the archive on a web server."""
-    handler = partial(SimpleHTTPRequestHandler, directory=archive.parent)
+    handler = partial(Handler, directory=archive.parent)
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_port}"
@@ -64,6 +72,11 @@ def test_the_same_benchmark_gives_the_same_bytes(micro_store, archive, tmp_path)
     changed = Store(micro_store.folder, with_checksum(micro_store.manifest | {"seed": 7}))
     with raises_user_error("other-settings", contains=archive.name):
         write_archive(changed, archive)
+    narrated = shutil.copytree(micro_store.folder, tmp_path / "narrated")
+    with open(narrated / "rationales.jsonl", "a") as file:
+        file.write("{}\n")
+    with raises_user_error("other-settings", contains="other rationales"):
+        write_archive(Store(narrated, micro_store.manifest), archive)
 
 
 def test_damaged_archives_are_refused_and_leave_nothing(archive, address, tmp_path) -> None:
@@ -89,6 +102,8 @@ def test_damaged_archives_are_refused_and_leave_nothing(archive, address, tmp_pa
         dynapix.load(changed, store=tmp_path / "store")
     with raises_user_error("no-download", contains="404"):
         dynapix.load(f"{address}/missing.zip", store=tmp_path / "store")
+    with raises_user_error("no-download", contains="the transfer ended after"):
+        dynapix.load(f"{address}/{archive.name}?cut", store=tmp_path / "store")
     assert all(p.suffix == ".lock" for p in (tmp_path / "store").iterdir())
 
 
