@@ -1,7 +1,8 @@
-"""Measures how time and memory grow with the amount of work, from a scene to a rank.
+r"""Measures how time and memory grow with the amount of work, from a scene to a rank.
 
     python -m benchmarks.speed.growth
-    python -m benchmarks.speed.growth build --sizes 10000 100000 --parallel ray
+    python -m benchmarks.speed.growth build --sizes 10000 100000 --parallel ray \
+        --settings world=falling benchmark.world.objects.{min,max}_count=3
 
 Each stage doubles one size: the scenes of a build without frames and of its narration, the samples
 and the queries of a training step, the frames that a retriever embeds, the frames of a database,
@@ -85,7 +86,7 @@ def timed(seconds: Seconds, part: str) -> Iterator[None]:
 
 def build_scenes(scenes: int, args: argparse.Namespace) -> Seconds:
     """Build the dynapix preset for a number of scenes, without frames."""
-    cfg, seconds = scale_preset(scenes), {}
+    cfg, seconds = scale_preset(scenes, args.settings), {}
     folder = args.folder / cfg.store_name
     if folder.exists():
         raise SystemExit(f"error: {folder} is already built, so it cannot be timed: delete it")
@@ -107,10 +108,10 @@ def build_scenes(scenes: int, args: argparse.Namespace) -> Seconds:
     return seconds
 
 
-def scale_preset(scenes: int) -> BenchmarkConfig:
-    """Return the dynapix preset for another number of scenes. The test scenes, the quotas and the
-    sizes of the databases change in proportion."""
-    cfg = compose("data.build", BuildCommand, ["benchmark=dynapix"]).benchmark
+def scale_preset(scenes: int, settings: list[str]) -> BenchmarkConfig:
+    """Return the dynapix preset with other settings and for another number of scenes. The test
+    scenes, the quotas and the sizes of the databases change in proportion."""
+    cfg = compose("data.build", BuildCommand, ["benchmark=dynapix", *settings]).benchmark
     share = scenes / cfg.scenes
     cfg.name, cfg.scenes = f"growth-{scenes}", scenes
     cfg.test_scenes = round(share * cfg.test_scenes)
@@ -130,7 +131,7 @@ def scale_preset(scenes: int) -> BenchmarkConfig:
 
 def narrate(scenes: int, args: argparse.Namespace) -> Seconds:
     """Write the rationales of the benchmark that `build` has left, with the built-in narrator."""
-    folder, seconds = args.folder / scale_preset(scenes).store_name, {}
+    folder, seconds = args.folder / scale_preset(scenes, args.settings).store_name, {}
     if not folder.exists():
         raise SystemExit(f"error: {folder} is missing: run the stage build first")
     (folder / JOURNAL_FILE).unlink(missing_ok=True)
@@ -246,6 +247,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("store/growth"))
     parser.add_argument("--store", default="store", help="folder of the built benchmarks")
     parser.add_argument("--workers", type=positive_int, default=2)
+    parser.add_argument("--settings", nargs="+", default=[], help="of the benchmark that is built")
     parser.add_argument("--parallel", choices=["loky", "ray"], default="loky")
     args = parser.parse_args()
     for stage in args.stages or STAGES:
