@@ -109,8 +109,10 @@ class Workers:
         warnings.filterwarnings("ignore", "A worker stopped while some jobs")
         # A caller may stop before the last result.
         warnings.filterwarnings("ignore", r"\d+ tasks have been successfully executed")
-        for batch in batched(list(jobs.items()), CHUNK * self.count):
-            yield from parallel(delayed(_run_job)(name, job) for name, job in batch)
+        # Without the block, Ray would start its workers again for each batch.
+        with parallel:
+            for batch in batched(list(jobs.items()), CHUNK * self.count):
+                yield from parallel(delayed(_run_job)(name, job) for name, job in batch)
 
 
 def batched(elements: list[Element], size: int) -> Iterator[list[Element]]:
