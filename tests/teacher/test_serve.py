@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import signal
 import socket
@@ -17,15 +18,22 @@ import pytest
 
 from dynapix.conf.schema import ServeCommand, TeacherConfig
 from dynapix.teacher import serve
+from dynapix.teacher.cited_rationales import compose_rationale, list_facts
 from dynapix.teacher.journal import read_rationales
 from dynapix.teacher.narrate import narrate_store
+from dynapix.teacher.narrator import write_rationale
+from dynapix.teacher.predicates.vocabulary import choose_vocabulary, describe_item
+from dynapix.teacher.prompts import build_messages
 from dynapix.teacher.sections import GRAMMAR_VERSION
 from dynapix.teacher.server_narrator import request_fields
 from dynapix.teacher.servers.pool import ServerPool
 from tests.teacher.memory_store import make_store
 from tests.teacher.server_process import ROOT, vllm_server
+from tests.teacher.test_cited_rationales import cite_all
+from tests.teacher.tiny_qwen3 import teach
 from tests.user_errors import raises_user_error
 
+FORMS = ("free", "cited")
 URL = "http://127.0.0.1:8000/v1"
 ITEMS = 200
 
@@ -40,8 +48,33 @@ def flags(available, **settings):
     return serve.vllm_arguments(command(**settings), "/weights", "127.0.0.1", 8000, available)
 
 
+def teacher(form, url="http://a/v1"):
+    return TeacherConfig(
+        name="tiny", url=url, model="tiny", attempts=1, max_tokens=1024, temperature=0.1,
+        form=form, grammar=form == "free", min_words=20, predicates="relational",
+    )  # fmt: skip
+
+
+def respond(form, folder):
+    """Return the messages about the only training item of a store, a response that is true, and the
+    text of its rationale."""
+    cfg, store = teacher(form), make_store(folder, 2)
+    [item] = store.selection("train")
+    vocabulary = choose_vocabulary(describe_item(item, store, cfg), cfg)
+    messages = build_messages(vocabulary, item, cfg)
+    if form == "free":
+        text = write_rationale(vocabulary, item, 0)
+        return messages, text, text
+    # vLLM admits no spaces between the elements of JSON.
+    facts = list_facts(vocabulary, item)
+    response = json.dumps(cite_all(facts), separators=(",", ":"))
+    return messages, response, compose_rationale(response, facts, item.letter)
+
+
 @pytest.fixture(scope="module")
 def server(model, tmp_path_factory):
+    """A server of a model that has learnt a response in each form."""
+    teach(model, [respond(form, tmp_path_factory.mktemp("item"))[:2] for form in FORMS])
     server = vllm_server(model, tmp_path_factory.mktemp("serve"))
     server.start()
     yield server
@@ -194,6 +227,15 @@ def test_vllm_enforces_the_schema_of_cited_rationales(server, tmp_path):
     begin = '{"Scene parse":[{"text":"'
     assert [r.text for r in rationales if not r.text.startswith(begin)] == []
     assert {r.reasons for r in rationales} == {("cut off",)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", FORMS)
+def test_true_rationales_of_a_served_model_are_accepted(server, form, tmp_path):
+    narrate_store(make_store(tmp_path, 2), teacher(form, server.url))
+    [rationale] = read_rationales(tmp_path / "rationales.jsonl")
+    assert rationale.accepted, (rationale.reasons, rationale.text)
+    assert rationale.text == respond(form, tmp_path)[-1]
 
 
 @pytest.mark.slow

@@ -60,15 +60,17 @@ def teach(folder: Path, dialogues: Iterable[tuple[list[dict[str, str]], str]]) -
         prompt = tokenizer.apply_chat_template(messages, add_generation_prompt=True)["input_ids"]
         answer = [*tokenizer(response)["input_ids"], tokenizer.eos_token_id]
         examples.append((torch.tensor([prompt + answer]), len(answer)))
-    optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=5e-3)
     for _ in range(300):
         losses = []
         for ids, length in examples:
             logits = model(ids[:, :-1], logits_to_keep=length).logits[0]
-            losses.append(torch.nn.functional.cross_entropy(logits, ids[0, -length:]))
-        if max(losses) < 0.01:
+            targets = ids[0, -length:]
+            losses.append(torch.nn.functional.cross_entropy(logits, targets, reduction="none"))
+        # Each token then has a probability of at least 74%.
+        if max(loss.max() for loss in losses) < 0.3:
             break
-        sum(losses).backward()
+        sum(loss.mean() for loss in losses).backward()
         optimizer.step()
         optimizer.zero_grad()
     model.to(torch.bfloat16).save_pretrained(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,9 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from dynapix.data.checks import observer
 from dynapix.data.checks.intervals import Interval
 from dynapix.data.checks.observer import (
-    DRAWS,
     ERRORS,
     EXTRAPOLATES,
     OBSERVER_FOLDER,
@@ -35,6 +36,16 @@ from dynapix.data.parallel import Workers
 from dynapix.data.records import SPLITS
 from dynapix.data.store import Store, open_store
 from tests.user_errors import raises_user_error
+
+DRAWS = 3
+"""Draws of each error; each needs a simulation."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_draws() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(observer, "DRAWS", DRAWS)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +103,7 @@ def test_the_curves_fall_within_their_intervals(items, results) -> None:
 def test_the_error_of_observers_is_recovered_from_their_answers(store, items, results) -> None:
     """The error lies between those of the curve, and the observers have draws of their own. With
     these items and draws, the standard deviation of the median is about 7%."""
-    count, rng = 20, np.random.default_rng(4)
+    count, rng = 12, np.random.default_rng(4)
     credits = [observe_item(i, store, [6.0], count, rng)[SIMULATES][1] for i in items]
     curve = observer_curves(results, items, 0)[SIMULATES]
     found = [curve.error_of(exactly(accuracy)).value for accuracy in np.mean(credits, axis=0)]
