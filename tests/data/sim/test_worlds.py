@@ -127,7 +127,7 @@ def world_store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
     """A small benchmark of the recipe dynapix in another world, with all kinds of records."""
     command = compose("data.build", BuildCommand, ["benchmark=tiny", f"world={request.param}"])
     cfg = command.benchmark
-    cfg.scenes = 40
+    cfg.scenes = 30
     tracks = cfg.selection, cfg.retrieval
     quotas = [*tracks[0].event.values(), *tracks[0].time.values(), *tracks[0].window.values()]
     for quota in (*quotas, *tracks[1].builders.values(), tracks[1].counterfactual):

@@ -21,7 +21,7 @@ TEACHER = TeacherConfig(name="template", predicates="relational")
 
 def responses(store: Store) -> Iterator[JudgedResponse]:
     """Narrations, the same with false regions, with each sentence twelve times, and cut off."""
-    for item in store.selection("train")[:12]:
+    for item in store.selection("train")[:5]:
         facts = describe_item(item, store, TEACHER)
         if facts is None:
             continue
