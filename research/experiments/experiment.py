@@ -97,11 +97,14 @@ class Experiment:
         return pd.read_parquet(self.args.record)
 
     def read_results(self, seeds: int | None = None) -> pd.DataFrame:
-        """Return the recorded results with seeds below `seeds`; all by default."""
+        """Return the recorded results with seeds below `seeds`; all by default. They are those of
+        the present base and settings; with `--table`, of those that were recorded last."""
         table = self.read_record()
-        for column, value in self.identity.items():
-            table = table[table[column] == value]
-        table = table[table.settings == table.variant.map(self.settings)]
+        table = table[(table.benchmark == self.args.benchmark) & table.variant.isin(self.settings)]
+        bases = table.base if self.args.table else [self.base]
+        table = table[table.base.isin(bases[-1:])]
+        recorded = table.groupby("variant").settings.last() if self.args.table else self.settings
+        table = table[table.settings == table.variant.map(recorded)]
         return table if seeds is None else table[table.seed < seeds]
 
     def run(
@@ -130,6 +133,9 @@ class Experiment:
             raise SystemExit("\n".join(failures))
         if results.empty:
             raise SystemExit("error: no results are recorded: run without --table")
+        is_present = results.settings == results.variant.map(self.settings)
+        if not all(is_present & (results.base == self.base)):
+            print("Some results are of an earlier base, or of earlier settings or versions.")
         return results
 
     def _record(self, job: Job, rows: list[dict[str, Any]]) -> None:
