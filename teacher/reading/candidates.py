@@ -42,7 +42,7 @@ class CandidateReader(Reader):
         self.lacking = self.adding = False
         while True:
             separators = self.skip(SEPARATORS)
-            if self.near().name == "stop":
+            if self.peek().name == "stop":
                 break
             self._read_candidate_clause(separators)
         self._end_object()
@@ -53,18 +53,18 @@ class CandidateReader(Reader):
     def _read_candidate_clause(self, separators: Sequence[str]) -> None:
         self.denied = self.contrasted = self.expected = self.correct = False
         self.extent: Tag | None = None
-        if self.near(1).name == "candidate":
+        if self.peek(1).name == "candidate":
             self.take("both")
-        first = self.near()
-        self.lacking &= first.name == "object" and self.near(1).name not in VERBS | {"region"}
-        if first.name == "with" and self.near(1).name == "candidate":
+        first = self.peek()
+        self.lacking &= first.name == "object" and self.peek(1).name not in VERBS | {"region"}
+        if first.name == "with" and self.peek(1).name == "candidate":
             self.at += 1
             self._begin_topic(self._read_letters())
-            if self.near().name in SEPARATORS | {"stop"}:
+            if self.peek().name in SEPARATORS | {"stop"}:
                 return
         elif first.name == "candidate":
             self._begin_topic(self._read_letters())
-            if self.near().name in SEPARATORS:
+            if self.peek().name in SEPARATORS:
                 return
         elif first.name == "other_candidates":
             self.at += 1
@@ -88,15 +88,15 @@ class CandidateReader(Reader):
         self.letters, self.objects, self.adding = letters, [], False
 
     def _read_letters(self) -> list[str]:
-        letters = [str(self.near().value)]
+        letters = [str(self.peek().value)]
         self.at += 1
         while True:
             start = self.at
             self.skip({"comma", "and"})
-            if self.near().name != "candidate":
+            if self.peek().name != "candidate":
                 self.at = start
                 return letters
-            letters.append(str(self.near().value))
+            letters.append(str(self.peek().value))
             self.at += 1
 
     def _find_trailing(self) -> list[str] | None:
@@ -111,9 +111,9 @@ class CandidateReader(Reader):
 
     def _read_choice(self) -> None:
         """Read "this layout is that of candidate B"."""
-        tag = self.near()
+        tag = self.peek()
         self.skip(CHOOSING)
-        if self.near().name != "candidate":
+        if self.peek().name != "candidate":
             raise UnreadableError
         self._begin_topic(self._read_letters())
         self._agree(True, tag)
@@ -177,7 +177,7 @@ class CandidateReader(Reader):
                 self.objects = []
             self.denied, self.lacking = False, True
             return
-        self.objects = self.read_list() if self.near(-1).name != "and" else self.read_noun()
+        self.objects = self.read_list() if self.peek(-1).name != "and" else self.read_noun()
         self.unplaced = tag
         if self.adding:
             self.show("extra", "", tag)
@@ -221,9 +221,9 @@ class CandidateReader(Reader):
         self.show("gap", "against", tag, partners)
 
     def on_with(self, tag: Tag) -> None:
-        if self.near().name == "other_objects":
+        if self.peek().name == "other_objects":
             return
-        if tag.words in PLACING and self.near().name == "candidate":
+        if tag.words in PLACING and self.peek().name == "candidate":
             self.at += 1
             return
         if tag.words not in ("with", "at", "in"):
@@ -248,10 +248,10 @@ class CandidateReader(Reader):
             self.extent = None
 
     def on_slight(self, tag: Tag) -> None:
-        if self.near().name not in ("off", "direction", "moving"):
+        if self.peek().name not in ("off", "direction", "moving"):
             raise UnreadableError
         self.extent = tag
-        if self.near().name == "direction":
+        if self.peek().name == "direction":
             self.on_off(tag)
 
     on_clear = on_slight
@@ -280,9 +280,9 @@ class CandidateReader(Reader):
     def on_gone(self, tag: Tag) -> None:
         if self.expected:
             raise UnreadableError
-        if self.near().name == "object":
+        if self.peek().name == "object":
             self.on_lack(tag)
-        elif self.near().name in ("slight", "clear", "off", "direction"):
+        elif self.peek().name in ("slight", "clear", "off", "direction"):
             # "Has gone too far."
             raise UnreadableError
         else:
@@ -309,7 +309,7 @@ class CandidateReader(Reader):
             self.add("agrees", names, "", agrees, TARGET, tag, letter)
 
     def on_agree(self, tag: Tag, names: Sequence[str] = ()) -> None:
-        if not self.letters or self.near().name == "object":
+        if not self.letters or self.peek().name == "object":
             raise UnreadableError
         self._agree(not self.denied, tag, names)
         self.skip({"agree"})
@@ -329,13 +329,13 @@ class CandidateReader(Reader):
         if self.denied:
             raise UnreadableError
         self.lacking = self.adding = False
-        if self.near().name == "agree":
+        if self.peek().name == "agree":
             self.on_agree(self.tags[self.at])
             self.at += 1
 
     def on_stays(self, tag: Tag) -> None:
         """Read "keeps the red cube near the top" and "leaves it there"."""
-        if self.near().name != "object" or self.denied:
+        if self.peek().name != "object" or self.denied:
             raise UnreadableError
         self.on_show(tag)
 
@@ -373,7 +373,7 @@ class CandidateReader(Reader):
         self.expected = True
 
     def on_which(self, tag: Tag) -> None:
-        if self.near().name not in ("agree", "differ", "be", "expected", "show"):
+        if self.peek().name not in ("agree", "differ", "be", "expected", "show"):
             raise UnreadableError
 
 

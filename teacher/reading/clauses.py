@@ -74,7 +74,7 @@ class ClauseReader(Reader):
         """Whether nothing was said of the last subject; whether an earlier clause had a verb."""
         while True:
             separators = self.skip(SEPARATORS)
-            if self.near() is END or self.near().name == "stop":
+            if self.peek() is END or self.peek().name == "stop":
                 break
             self.read_clause(separators)
         if self.is_bare or self.clause is None:
@@ -86,54 +86,67 @@ class ClauseReader(Reader):
     # Subjects.
 
     def read_clause(self, separators: Sequence[str] = ()) -> None:
-        moments = ("future", "time", "past", "expected")
-        if self.near(1).name in NOUN_STARTS | {"comma", "contact"} and (tag := self.take(*moments)):
-            # "At the target moment, the cube is near the top." "Soon, they will meet."
+        self._read_opening()
+        is_there = self._read_there()
+        if self.take("between"):
+            self.frame = self.read_list()
+            return
+        if self.peek().name == "which":
+            self.on_which(self.peek())
+            self.is_bare = False
+            return
+        is_struck = self.peek().words.startswith(OPENING)
+        self._begin_clause(separators, is_there)
+        is_said = is_struck or self.clause.event or self.clause.said
+        self.is_bare = not self._read_predicate() and not is_said
+
+    def _read_opening(self) -> None:
+        """Read "at the target moment," or "soon,"."""
+        follows = self.peek(1).name in NOUN_STARTS | {"comma", "contact"}
+        if follows and (tag := self.take("future", "time", "past", "expected")):
             self.take("comma")
             self.opening = tag
-        opening = self.take("there")
-        if opening:
-            self.take("future", "expected")
-            self.skip({"be"})
-            if self.near(1).name == "contact":
-                self.opening = self.take("time") or self.opening
-        struck = self.near() if self.near().words.startswith(OPENING) else None
-        if struck is not None:
+
+    def _read_there(self) -> bool:
+        """Read "there is" and "there will be", and return whether the clause begins with it."""
+        if not self.take("there"):
+            return False
+        self.take("future", "expected")
+        self.skip({"be"})
+        if self.peek(1).name == "contact":
+            self.opening = self.take("time") or self.opening
+        return True
+
+    def _begin_clause(self, separators: Sequence[str], is_there: bool) -> None:
+        """Read the subject of the clause, and what precedes it. Without one, the clause is about
+        the last subject."""
+        tag = self.peek()
+        if tag.words.startswith(OPENING):
             # "Once struck, the cube moves west."
             self.at += 1
             self.take("comma")
             self.begin(self.read_subject())
-            self.on_struck(struck)
+            self.on_struck(tag)
             self.clause.event = ""
-        elif self.near().name == "between":
-            self.at += 1
-            self.frame = self.read_list()
-            return
-        elif self.near().words == "with":
+        elif tag.words == "with":
             self.at += 1
             self.begin(self.read_subject())
-        elif self._is_fronted(separators, nominal=opening is not None):
+        elif self._is_fronted(separators, nominal=is_there):
             self._read_fronted()
-        elif self.near().name in NOUN_STARTS or self.near().words == "neither":
-            if self.clause is None and self.near().name == "pronoun" and "break" in separators:
+        elif tag.name in NOUN_STARTS or tag.words == "neither":
+            if self.clause is None and tag.name == "pronoun" and "break" in separators:
                 # "As it moves west, the cube leaves": "it" is the cube.
                 raise UnreadableError
             self.begin(self.read_subject())
-        elif self.near().name in ("contact", "no_contact", "course") and (
-            self.clause is None or self.near(1).name in ("between", "links", "be", "occurs")
+        elif tag.name in ("contact", "no_contact", "course") and (
+            self.clause is None or self.peek(1).name in ("between", "links", "be", "occurs")
         ):
             self._read_contact()
-        elif self.near().name == "which":
-            self.on_which(self.near())
-            self.is_bare = False
-            return
-        elif self.clause is None or opening or self.near(-1).words == "or":
+        elif self.clause is None or is_there or self.peek(-1).words == "or":
             raise UnreadableError
         else:
             self.clause.negated = False
             self.clause.event = self.clause.event if self.clause.event == "close" else ""
-        else_said = struck or self.clause.event or self.clause.said
-        self.is_bare = not self._read_predicate() and not else_said
 
     def begin(self, clause: Clause) -> None:
         """Begin a clause with another subject."""
@@ -149,7 +162,7 @@ class ClauseReader(Reader):
             clause.time = self.opening if self.opening.name == "time" else None
 
     def read_subject(self) -> Clause:
-        tag = self.near()
+        tag = self.peek()
         if tag.words == "neither":
             self.at += 1
             names = self.read_noun()
@@ -157,7 +170,7 @@ class ClauseReader(Reader):
             if (joint := self.take("not")) is None or joint.words != "nor":
                 raise UnreadableError
             return Clause([*names, *self.read_noun()], negated=True)
-        if tag.name == "object" or (tag.name == "both" and self.near(1).name == "object"):
+        if tag.name == "object" or (tag.name == "both" and self.peek(1).name == "object"):
             return Clause(self.read_list())
         self.at += 1
         if tag.name == "paths":
@@ -213,7 +226,7 @@ class ClauseReader(Reader):
 
     def _read_contact(self) -> None:
         """Read "the contact between the cube and the sphere" as a subject."""
-        tag, last = self.near(), self.clause or self.previous
+        tag, last = self.peek(), self.clause or self.previous
         self.at += 1
         self.begin(Clause([], "contact"))
         if self.take("between", "with", "links"):
@@ -291,24 +304,19 @@ class ClauseReader(Reader):
         """Read a relative clause about the object before it."""
         self.take("which")
         outer, names = self.clause, self.last_nouns
-        if len(names) > 1 and self.near().words not in ("are", "both"):
+        if len(names) > 1 and self.peek().words not in ("are", "both"):
             names = []
         before = self.tags[self.at - 2].name if self.at > 1 else ""
         if outer is None or not names or before not in ("object", "comma", "relation"):
             raise UnreadableError
         self.clause = Clause([*names])
         start, count = self.at, len(self.claims)
-        while self.near().name not in SEPARATORS | {"stop"} or self._continues():
+        while self.peek().name not in SEPARATORS | {"stop"} or self._continues():
             verbs = self.clause.has_verb and self.at > start + 1
-            if verbs and self.near().name in FINITE and self.near(-1).name not in FINITE | {"not"}:
+            if verbs and self.peek().name in FINITE and self.peek(-1).name not in FINITE | {"not"}:
                 break
             self.take("and")
-            current = self.near()
-            self.at += 1
-            handler = getattr(self, f"on_{current.name}", None)
-            if handler is None:
-                raise UnreadableError
-            handler(current)
+            self.read_tag()
         self._end_predicate()
         if len(self.claims) == count:
             raise UnreadableError
@@ -316,7 +324,7 @@ class ClauseReader(Reader):
 
     def _continues(self) -> bool:
         """Return whether "and" continues a relative clause, as in "which stops and rests"."""
-        return self.near().name == "and" and self.near(1).name not in {
+        return self.peek().name == "and" and self.peek(1).name not in {
             *(*NOUN_STARTS, *SEPARATORS, "region", "from"),
         }
 

@@ -75,14 +75,14 @@ class Reader:
 
     # The current tag.
 
-    def near(self, offset: int = 0) -> Tag:
+    def peek(self, offset: int = 0) -> Tag:
         """Return the tag at an offset from the current one; END outside the readable tags."""
         index = self.at + offset
         return self.tags[index] if 0 <= index < self.stop else END
 
     def take(self, *names: str) -> Tag | None:
         """Return the current tag and move on if it has one of these names."""
-        tag = self.near()
+        tag = self.peek()
         if tag.name not in names:
             return None
         self.at += 1
@@ -91,19 +91,24 @@ class Reader:
     def skip(self, names: Container[str]) -> list[str]:
         """Move over tags with these names, and return the names."""
         start = self.at
-        while self.near().name in names:
+        while self.peek().name in names:
             self.at += 1
         return [tag.name for tag in self.tags[start : self.at]]
 
+    def read_tag(self) -> None:
+        """Call the method of the current tag, and move on."""
+        tag = self.peek()
+        handler = getattr(self, f"on_{tag.name}", None)
+        if handler is None:
+            raise UnreadableError
+        self.at += 1
+        handler(tag)
+
     def read_tags(self, ends: Container[str] = SEPARATORS) -> int:
-        """Call the methods of the tags up to one of `ends`, and return the number of these tags."""
+        """Read the tags up to one of `ends`, and return the number of these tags."""
         start = self.at
-        while (tag := self.near()).name not in ends and tag.name != "stop":
-            self.at += 1
-            handler = getattr(self, f"on_{tag.name}", None)
-            if handler is None:
-                raise UnreadableError
-            handler(tag)
+        while self.peek().name not in ends and self.peek().name != "stop":
+            self.read_tag()
         return self.at - start
 
     def add(
@@ -226,7 +231,7 @@ class Reader:
             owner: The objects to which "it" refers.
         """
         start = self.at
-        if self.near().name == "object":
+        if self.peek().name == "object":
             things = self.read_noun()
             self.take("be")
             tag = self.take("relation")

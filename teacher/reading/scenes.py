@@ -19,24 +19,9 @@ from dynapix.teacher.reading.tagging import (
 )
 
 STILL_VERBS = {
-    *(
-        "is",
-        "was",
-        "does",
-        "has",
-        "do",
-        "did",
-        "are",
-        "rests",
-        "rest",
-        "stands",
-        "stand",
-        "sits",
-        "sit",
-        "lies",
-        "lie",
-    ),
-    *("keep", "keeps", "have", "shows", "show", "stays", "stay", "remains", "remain"),
+    *("is", "was", "does", "has", "do", "did", "are", "have", "shows", "show", "keep", "keeps"),
+    *("rests", "rest", "stands", "stand", "sits", "sit", "lies", "lie"),
+    *("stays", "stay", "remains", "remain"),
 }
 """First words of the phrases of the tag "still" that contain a verb."""
 OF_MATERIAL = ("of", "in", "made of", "made from")
@@ -82,7 +67,7 @@ class SceneReader(ClauseReader):
             self._add_close_region(tag)
         elif clause.kind == "contact":
             self.add("close region", [], str(tag.value), True, self.moment, tag)
-        elif clause.event and self.near(-2).name == "object":
+        elif clause.event and self.peek(-2).name == "object":
             # "Meets the red cube near the top": the place of either.
             raise UnreadableError
         else:
@@ -113,7 +98,7 @@ class SceneReader(ClauseReader):
     def on_relation(self, tag: Tag) -> None:
         phrase = tag.value
         assert isinstance(phrase, RelationPhrase)
-        if phrase.value == "passes" and self.near().name == "no_contact":
+        if phrase.value == "passes" and self.peek().name == "no_contact":
             denial = self.take("no_contact")
             self._add_event("meeting", denial, self.clause.subjects, self.find_partners(tag), False)
             return
@@ -133,9 +118,9 @@ class SceneReader(ClauseReader):
         if tag.last_word not in ("has", "have", "having"):
             raise UnreadableError
         self.verb(tag)
-        if self.near().name in AFTER_HAVE:
+        if self.peek().name in AFTER_HAVE:
             # "Has moved" is a path up to the target; "has been near the top" is not.
-            self.clause.on_path |= self.near().name in ("moving", "slight")
+            self.clause.on_path |= self.peek().name in ("moving", "slight")
         elif possessed := self.read_possession(self.clause.subjects):
             self._add_possession(*possessed)
         else:
@@ -146,12 +131,12 @@ class SceneReader(ClauseReader):
         self.add(KINDS[value], names, value, not self.clause.negated, self.when, tag)
 
     def on_with(self, tag: Tag) -> None:
-        if tag.words in OF_MATERIAL and self.near().name == "word":
+        if tag.words in OF_MATERIAL and self.peek().name == "word":
             return
-        if tag.words in ("toward", "towards") and self.near().name == "object":
+        if tag.words in ("toward", "towards") and self.peek().name == "object":
             self.on_approach(tag)
             return
-        if tag.words == "to" and self.near().name in ("moves", "be", "meet", "still", "stays"):
+        if tag.words == "to" and self.peek().name in ("moves", "be", "meet", "still", "stays"):
             return
         if tag.words != "with" or self.clause.negated:
             raise UnreadableError
@@ -189,7 +174,7 @@ class SceneReader(ClauseReader):
     def on_moves(self, tag: Tag) -> None:
         self.verb(tag)
         self.clause.moving = True
-        if self.near().name in SEPARATORS | {"stop"} and self.clause.slight is None:
+        if self.peek().name in SEPARATORS | {"stop"} and self.clause.slight is None:
             when = BETWEEN if self.clause.future else CUT if self.moment == CUT else EITHER
             self.state("still", "", when, tag, affirmed=False)
 
@@ -200,7 +185,7 @@ class SceneReader(ClauseReader):
     def on_still(self, tag: Tag) -> None:
         if tag.words.split()[0] in STILL_VERBS:
             self.verb(tag._replace(name="stays"))
-        if "not" in tag.words and self.near().name not in {*SEPARATORS, "stop", "region"}:
+        if "not" in tag.words and self.peek().name not in {*SEPARATORS, "stop", "region"}:
             # "Does not move east."
             raise UnreadableError
         later = self.clause.staying or self.clause.future
@@ -219,7 +204,7 @@ class SceneReader(ClauseReader):
 
     def on_in_place(self, tag: Tag) -> None:
         self.verb(tag._replace(name="stays"))
-        if self.near().name not in SEPARATORS | {"stop", "region"}:
+        if self.peek().name not in SEPARATORS | {"stop", "region"}:
             # "Where it is close to the sphere."
             raise UnreadableError
         if self.moment == CUT and not self.clause.future:
@@ -261,7 +246,7 @@ class SceneReader(ClauseReader):
 
     def on_course(self, tag: Tag) -> None:
         self.verb(tag)
-        has_partners = self.take("with") or self.near().name == "object"
+        has_partners = self.take("with") or self.peek().name == "object"
         partners = self.read_list(True) if has_partners else []
         alone = len(self.clause.subjects) == 1 and not partners
         value = str(tag.value)
@@ -275,18 +260,18 @@ class SceneReader(ClauseReader):
     def on_meet(self, tag: Tag) -> None:
         self.verb(tag)
         self.take("with")
-        at_object = self.near().name in ("object", "both")
+        at_object = self.peek().name in ("object", "both")
         partners = self.read_list(True) if at_object else []
         self._add_event("meeting", tag, self.clause.subjects, partners)
 
     def on_no_contact(self, tag: Tag) -> None:
         self.verb(tag._replace(name="meet"))
         self.take("with")
-        partners = self.read_list(True) if self.near().name == "object" else []
+        partners = self.read_list(True) if self.peek().name == "object" else []
         self._add_event("meeting", tag, self.clause.subjects, partners, False)
 
     def on_close(self, tag: Tag) -> None:
-        partners = self.read_list(True) if self.near().name == "object" else []
+        partners = self.read_list(True) if self.peek().name == "object" else []
         self._add_event("close", tag, self.clause.subjects, partners, value=str(tag.value))
 
     def on_contact(self, tag: Tag) -> None:
@@ -296,7 +281,7 @@ class SceneReader(ClauseReader):
         self._add_event("meeting", tag, self.clause.subjects, [])
 
     def on_occurs(self, tag: Tag) -> None:
-        if self.clause.kind == "objects" and self.near().name in (
+        if self.clause.kind == "objects" and self.peek().name in (
             "from",
             "into",
             "speed",
@@ -321,6 +306,6 @@ class SceneReader(ClauseReader):
         if len(self.clause.pairs) != 1:
             raise UnreadableError
         when = TARGET if self.moment == TARGET or self.clause.future else EITHER
-        after_object = self.near(-2).name != "close"
+        after_object = self.peek(-2).name != "close"
         kind = "place of either" if after_object else "close region"
         self.add(kind, self.clause.pairs[0], str(tag.value), True, when, tag)
