@@ -1,7 +1,7 @@
 """Databases of frames that retrievers rank, without near-duplicates.
 
-Near-duplicates are frames in which the same objects are visible within a pixel of each other (twins
-in a benchmark's counts). They are found from the oracle, before any frame is rendered.
+Near-duplicates are frames in which the same objects are visible within a pixel of each other. They
+are found from the oracle, before any frame is rendered.
 
 The database of the future-state queries contains that of the standard test; the counterfactual
 queries have another one (paper, Table 1 and "Query constructions").
@@ -90,20 +90,35 @@ def make_databases(
         The queries whose target has no near-duplicate in its database; frames by database; and
         counts of the queries and frames that were left out.
     """
-    unique, kept, dropped = {}, {}, {}
-    for pool in POOLS:
-        unique[pool] = UniqueFrames(scene_of)
-        own = [q for q in queries if q.pool == pool]
-        kept[pool] = drop_duplicates(cfg, own, unique[pool])
-        dropped[pool] = unique[pool].left_out
+    unique = {pool: UniqueFrames(scene_of) for pool in POOLS}
+    kept = {pool: choose_queries(cfg, queries, pool, unique[pool]) for pool in POOLS}
+    dropped = sum(frames.left_out for frames in unique.values())
     test, future = future_databases(cfg, kept["future"], scene_ids, unique["future"])
     counterfactual = counterfactual_database(cfg, kept["counterfactual"], unique["counterfactual"])
+    left_out = sum(frames.left_out for frames in unique.values())
     counts = {
-        "queries dropped, target has a twin": sum(dropped.values()),
-        "frames left out, twins": sum(unique[p].left_out - dropped[p] for p in POOLS),
+        "queries dropped, target has a near-duplicate": dropped,
+        "frames left out, near-duplicates": left_out - dropped,
     }
     databases = {"test": test, "future": future, "counterfactual": counterfactual}
     return [*kept["future"], *kept["counterfactual"]], databases, counts
+
+
+def choose_queries(
+    cfg: BenchmarkConfig, queries: list[RetrievalQuery], pool: str, unique: UniqueFrames
+) -> list[RetrievalQuery]:
+    """Return the queries of a pool up to their quotas, test queries first, and add their targets to
+    `unique`. A query whose target is a near-duplicate of another query's target is left out: both
+    frames would be right answers."""
+    quotas, kept, chosen = cell_quotas(cfg), Counter(), set()
+    own = [q for q in queries if q.pool == pool]
+    for query in sorted(own, key=lambda q: q.split != "test"):
+        cell = builder_name(query.builder), query.split
+        is_full = kept[cell] >= getattr(quotas[cell[0]], query.split)
+        if not is_full and (query.target in unique.frames or unique.add(query.target)):
+            kept[cell] += 1
+            chosen.add(query.query_id)
+    return [q for q in own if q.query_id in chosen]
 
 
 def future_databases(
@@ -138,18 +153,3 @@ def counterfactual_database(
     scenes = sorted({q.target.scene_id for q in queries})
     unique.fill(scenes, wanted - len(unique.frames), cfg.seed)
     return list(unique.frames)
-
-
-def drop_duplicates(
-    cfg: BenchmarkConfig, queries: list[RetrievalQuery], unique: UniqueFrames
-) -> list[RetrievalQuery]:
-    """Return queries up to their quotas, without those whose target is a near-duplicate of another
-    query's target: both frames would be right answers. Test queries are kept first."""
-    quotas, kept, chosen = cell_quotas(cfg), Counter(), set()
-    for query in sorted(queries, key=lambda q: q.split != "test"):
-        cell = builder_name(query.builder), query.split
-        is_full = kept[cell] >= getattr(quotas[cell[0]], query.split)
-        if not is_full and (query.target in unique.frames or unique.add(query.target)):
-            kept[cell] += 1
-            chosen.add(query.query_id)
-    return [q for q in queries if q.query_id in chosen]

@@ -6,8 +6,8 @@ The candidates are the target and frames of other futures of the scene
 and two a wrong one, and two show the scene's own future and two another one.
 
 A subtype keeps the question, prefix and target of its cell. As in the paper's recipe, some subtypes
-are hard and some easy (`IS_HARD`): the distractors of hard items are the futures nearest to the
-target, those of easy items the farthest.
+are hard and some easy (`IS_HARD`): the distractors of hard items are futures near the target, those
+of easy items futures far from it.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from dynapix.data.store import save_scene, scene_path
 FUTURES = {"event": 10, "time": 12, "window": 12}
 """Number of alternative futures from which the distractors of an item are chosen, by family."""
 IS_HARD = {"same_obj_match": True, "same_near": True, "cross_scene": False, "same_far": False}
-"""Whether the distractors of a balanced item are the nearest to the target or the farthest, by the
-distractors that the cell has in the paper's recipe."""
+"""Whether the items of a subtype are hard, by the distractors that it has in the paper's recipe.
+Items of other subtypes are neither hard nor easy."""
 TRIES = 3
 """Number of times that futures of a scene are simulated in one cell: for different timings or, in
 the time family, for different wrong moments of its only timing."""
@@ -50,6 +50,58 @@ TARGET = 1
 """Index of the target among the frames from which candidates are chosen."""
 LARGEST_SHARE = 0.9
 """Maximum time to the earlier of two moments, as a share of the time to the later one."""
+
+
+@dataclass(frozen=True)
+class FramePool:
+    """The frames from which the candidates of an item are chosen.
+
+    Attributes:
+        frames: A scene with these frames: the last observed one, the scene's own at each moment
+            (first the target), and all futures at the first moment, then at the second.
+        moments: The target's moment and, in the time family, a wrong one.
+        stop: The moment of the last observed frame.
+        futures: Number of futures.
+    """
+
+    frames: Scene
+    moments: Sequence[int]
+    stop: int
+    futures: int
+
+    @classmethod
+    def collect(
+        cls,
+        scene: Scene,
+        name: str,
+        stop: int,
+        moments: Sequence[int],
+        futures: np.ndarray,
+        world: WorldConfig,
+    ) -> FramePool:
+        """Collect the frames of a scene and of its futures from frame `stop` on (K, F, N, 13)."""
+        own = scene_states(scene)[[stop, *moments]]
+        others = [futures[:, moment - stop] for moment in moments]
+        frames = scene_with_states(scene, name, np.concatenate([own, *others]), world)
+        return cls(frames, moments, stop, len(futures))
+
+    @property
+    def moments_of_frames(self) -> list[int]:
+        return [self.stop, *self.moments, *np.repeat(self.moments, self.futures).tolist()]
+
+    def choices(self) -> np.ndarray:
+        """Return all choices of candidates (T, 4) as indices of frames, the target first. With two
+        moments, a choice has the scene's own and one other future, each at both moments."""
+        first = TARGET + len(self.moments)
+        at_target = range(first, first + self.futures)
+        if len(self.moments) == 1:
+            return np.array([[TARGET, *triple] for triple in combinations(at_target, 3)])
+        return np.array([[TARGET, TARGET + 1, k, k + self.futures] for k in at_target])
+
+    def future_of(self, frame: int) -> int | None:
+        """Return which future a frame shows; None for the scene's own."""
+        first = TARGET + len(self.moments)
+        return (frame - first) % self.futures if frame >= first else None
 
 
 @dataclass(kw_only=True)
@@ -85,7 +137,7 @@ class BalancedPicker(DistractorPicker):
         self, recipe: Recipe, scene: Scene, timing: Timing, groups: Sequence[Group]
     ) -> SelectionItem | None:
         """Make an item from new futures, or return None if no choice of them is suitable."""
-        family, cell, about = recipe.family, recipe.fields(timing), recipe.subjects(scene, timing)
+        family, fields, about = recipe.family, recipe.fields(timing), recipe.subjects(scene, timing)
         moments = [timing.target]
         if family == "time":
             moments += self._wrong_moment(scene, timing, about)
@@ -96,31 +148,29 @@ class BalancedPicker(DistractorPicker):
         branches = branches_of_velocities(scene, timing.stop, velocities)
         motions = simulate_futures(scene, timing.stop, max(moments), branches, self.world)
         futures = np.stack([motion.states for motion in motions])
-        name = f"{scene.scene_id}{ALTERNATIVE}{cell['subtype']}-{timing.stop}"
-        frames, frame_moments = self._candidate_frames(scene, name, timing.stop, moments, futures)
-        displacement = frame_displacements(frames, about)
-        choices = _choices(len(moments), len(futures))
-        choices = distinct_choices(choices, displacement, self.cell.min_displacement)
-        choices = _of_difficulty(choices, displacement, IS_HARD.get(cell["distractors"]))
+        name = f"{scene.scene_id}{ALTERNATIVE}{fields['subtype']}-{timing.stop}"
+        pool = FramePool.collect(scene, name, timing.stop, moments, futures, self.world)
+        displacement = frame_displacements(pool.frames, about)
+        choices = distinct_choices(pool.choices(), displacement, self.cell.min_displacement)
+        choices = _of_difficulty(choices, displacement, IS_HARD.get(fields["distractors"]))
         if not len(choices):
             return None
-        scores = self._compare(frames, frame_moments).scores(choices)
+        scores = self._compare(pool.frames, pool.moments_of_frames).scores(choices)
         best = self.balance.choose(scores)
         if best is None:
             return None
         chosen = choices[best].tolist()
         candidates = []
         for frame in chosen:
-            moment = frame_moments[frame]
-            if frame <= len(moments):
+            moment, future = pool.moments_of_frames[frame], pool.future_of(frame)
+            if future is None:
                 source = "target" if frame == TARGET else "same_time"
                 candidates.append(Candidate(scene.scene_id, moment, source))
-                continue
-            index = (frame - TARGET - len(moments)) % len(futures)
-            other = f"{name}-{index}"
-            self._save(scene, other, timing.stop, futures[index])
-            candidates.append(Candidate(other, moment, "alternative"))
-        least = least_displacement(frames, chosen)
+            else:
+                other = f"{name}-{future}"
+                self._save(scene, other, timing.stop, futures[future])
+                candidates.append(Candidate(other, moment, "alternative"))
+        least = least_displacement(pool.frames, chosen)
         return new_item(recipe, scene, timing, candidates, least, distractors="alternative")
 
     def _compare(
@@ -144,17 +194,6 @@ class BalancedPicker(DistractorPicker):
         future = alternative_scene(scene, name, stop, states, self.world)
         future = replace(future, collisions=collisions)
         save_scene(future, scene_path(self.folder, name))
-
-    def _candidate_frames(
-        self, scene: Scene, name: str, stop: int, moments: Sequence[int], futures: np.ndarray
-    ) -> tuple[Scene, list[int]]:
-        """Return the frames from which candidates are chosen as a scene, and their moments: the
-        last observed frame, the scene's own frame at each moment (first the target), and all
-        futures at the first moment, then at the second."""
-        own = scene_states(scene)[[stop, *moments]]
-        others = [futures[:, moment - stop] for moment in moments]
-        frames = scene_with_states(scene, name, np.concatenate([own, *others]), self.world)
-        return frames, [stop, *moments, *np.repeat(moments, len(futures)).tolist()]
 
     def _groups(
         self, scene: Scene, timing: Timing, about: tuple[int, ...], family: str
@@ -193,17 +232,6 @@ class BalancedPicker(DistractorPicker):
         moment = timing.stop + int(lead)
         shift = frame_displacements(scene, about)[timing.target, moment]
         return [moment] if shift >= self.cell.min_displacement else []
-
-
-def _choices(moments: int, futures: int) -> np.ndarray:
-    """Return all choices of candidates (T, 4) as indices of the frames of `_candidate_frames`, the
-    target first. With two moments, a choice has the scene's own and one other future, each at both
-    moments."""
-    first = TARGET + moments
-    if moments == 1:
-        triples = list(combinations(range(first, first + futures), 3))
-        return np.array([[TARGET, *triple] for triple in triples])
-    return np.array([[TARGET, TARGET + 1, first + k, first + futures + k] for k in range(futures)])
 
 
 def distinct_choices(choices: np.ndarray, displacement: np.ndarray, least: float) -> np.ndarray:

@@ -165,7 +165,7 @@ def test_candidates_differ_visibly(store: Store, items: list[SelectionItem]) -> 
 def test_hard_distractors_are_nearer_to_the_target_than_easy_ones() -> None:
     places = np.random.default_rng(0).uniform(0, 100, (14, 2))
     displacement = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    choices = balanced_items._choices(moments=1, futures=12)
+    choices = np.array([[1, *others] for others in combinations(range(2, 14), 3)])
     halves = [
         balanced_items._of_difficulty(choices, displacement, nearest) for nearest in (True, False)
     ]
