@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import IO
 
@@ -13,8 +14,14 @@ from dynapix.data.checks.intervals import Interval
 from dynapix.evaluation.metrics.results import RECALLS, UNTRAINED, RetrievalResult
 from dynapix.evaluation.reporting.reference import COT_STUDENT, cot_student
 
-GRAY = "#999999"
-"""Color of untrained retrievers."""
+GRAYS = ("#999999", "#555555", "#cccccc")
+"""Colors of untrained models."""
+
+
+def choose_colors(labels: Sequence[str]) -> list[str]:
+    """Return a color for each model: a gray for an untrained one."""
+    grays, colors = cycle(GRAYS), cycle(COLORS)
+    return [next(grays if label.startswith(UNTRAINED) else colors) for label in labels]
 
 
 def plot_accuracies(
@@ -29,16 +36,13 @@ def plot_accuracies(
     groups = list(dict.fromkeys(group for by_group in accuracy.values() for group in by_group))
     figure = create_figure(8, 4.4)
     axes = figure.add_subplot()
-    width = 0.84 / (len(accuracy) + 1)
+    width, colors = 0.84 / (len(accuracy) + 1), choose_colors([*accuracy])
     for i, (label, by_group) in enumerate(accuracy.items()):
         bars = [(k, by_group[group]) for k, group in enumerate(groups) if group in by_group]
         xs = [k + (i - len(accuracy) / 2) * width for k, _ in bars]
         heights, low, high = 100 * np.array([(a.value, a.low, a.high) for _, a in bars]).T
-        color = GRAY if label.startswith(UNTRAINED) else COLORS[i % len(COLORS)]
-        hatch = "//" * (i // len(COLORS))
-        axes.bar(
-            xs, heights, width * 0.9, color=color, hatch=hatch, edgecolor="#ffffff", label=label
-        )
+        style = {"color": colors[i], "hatch": "//" * colors[:i].count(colors[i])}
+        axes.bar(xs, heights, width * 0.9, edgecolor="#ffffff", label=label, **style)
         middle, half_length = (high + low) / 2, (high - low) / 2
         axes.errorbar(xs, middle, half_length, fmt="none", ecolor=INK, capsize=3, elinewidth=1.2)
     paper = cot_student() if with_paper else {}
@@ -73,12 +77,11 @@ def plot_recalls(rows: Iterable[tuple[str, RetrievalResult]], file: Path | IO[by
     figure = create_figure(9, 3.8)
     panels = figure.subplots(1, len(RECALLS), sharey=True)
     for axes, k in zip(panels, RECALLS, strict=True):
-        for i, name in enumerate(names):
+        for name, color in zip(names, choose_colors(names), strict=True):
             by_width = sorted(lines[name], key=lambda r: r.width)
             recalls = [r.measures[f"recall@{k}"] for r in by_width]
-            widths, untrained = [r.width for r in by_width], name.startswith(UNTRAINED)
-            color = GRAY if untrained else COLORS[i % len(COLORS)]
-            style = "--o" if untrained else "-o"
+            widths = [r.width for r in by_width]
+            style = "--o" if name.startswith(UNTRAINED) else "-o"
             value, low, high = 100 * np.array([(r.value, r.low, r.high) for r in recalls]).T
             axes.fill_between(widths, low, high, color=color, alpha=0.14, linewidth=0)
             axes.plot(widths, value, style, color=color, markersize=4, label=name)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from tqdm import tqdm
 
 from dynapix.conf.errors import UserError
@@ -102,7 +103,12 @@ class ItemBrowser:
             self.baselines[name] = baseline_results(standard, store, seed)
             letters = {label: {k: a.letters for k, a in r.items()} for label, r in by_label.items()}
             self.future_moment[name] = measure_future_moment(standard, letters, seed)
-        ceilings = self._add_observers(store, models, items, seed)
+        observed = self._load_observers(store)
+        for m in models.values() if observed else ():
+            own = [items[k] for k in m.responses if k in observed[SIMULATES].index]
+            if len(own) == m.result.n and m.item_set not in self.observers:
+                self.observers[m.item_set] = observer_curves(observed, own, seed)
+        ceilings = observed[SIMULATES][CEILING_ERROR].to_dict() if observed else {}
         shown = choose_items(answered, by_label, limit, seed)
         entries = page_entries(shown, by_label, store, name, ceilings)
         frames, errors = encode_frames(shown, store)
@@ -116,30 +122,16 @@ class ItemBrowser:
             more = f" ({len(errors) - 1:,} more scenes)" if errors[1:] else ""
             self.notes.append(f"Frames are missing: {errors[0]}{more}.")
 
-    def _add_observers(
-        self,
-        store: Store,
-        models: Mapping[str, Measurement],
-        items: Mapping[str, SelectionItem],
-        seed: int,
-    ) -> Mapping[str, float]:
-        """Add the curves of the observers on the items of the models, if the store has their
-        results. Return the ceiling of each item: the chance of the observer that simulates."""
-        config = store.manifest["config"]
-        if (results := load_observers(store, "test")) is None:
-            if config["simulator"] == "bullet":
-                self.notes.append(
-                    f"No observers have seen {store.name}: run python -m data.statistics "
-                    f"benchmark={config['name']} world={config['world']['name']} observer=true "
-                    "to report accuracies as errors in px."
-                )
-            return {}
-        seen = results[SIMULATES][CEILING_ERROR].to_dict()
-        for m in models.values():
-            own = [items[name] for name in m.responses if name in seen]
-            if len(own) == m.result.n and m.item_set not in self.observers:
-                self.observers[m.item_set] = observer_curves(results, own, seed)
-        return seen
+    def _load_observers(self, store: Store) -> dict[str, pd.DataFrame] | None:
+        """Return the results of the observers on the test items, if the store has them."""
+        config, results = store.manifest["config"], load_observers(store, "test")
+        if results is None and config["simulator"] == "bullet":
+            self.notes.append(
+                f"No observers have seen {store.name}: run python -m data.statistics "
+                f"benchmark={config['name']} world={config['world']['name']} observer=true "
+                "to report accuracies as errors in px."
+            )
+        return results
 
 
 def browse_items(
