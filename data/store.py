@@ -64,7 +64,8 @@ PARTS = "parts"
 """Folder of the results of a build's jobs; absent from a complete store."""
 SCENES_FOLDER, FRAMES_FOLDER = "scenes", "frames"
 TABLES = ("selection.parquet", "retrieval.parquet", "database.parquet")
-RATIONALES = "rationales.parquet"
+RATIONALES, JOURNAL = "rationales.parquet", "rationales.jsonl"
+"""Files of the accepted rationales, and of all responses of teachers."""
 DATABASES = ("test", "future", "counterfactual")
 """Names of the databases of frames: of the standard test, of the future-state queries and of the
 counterfactual queries. Every frame of `test` is also in `future`."""

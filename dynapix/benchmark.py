@@ -24,10 +24,9 @@ from dynapix.data.records import (
     SelectionItem,
     sample_prefix_frames,
 )
-from dynapix.data.store import MANIFEST, Store, open_store
+from dynapix.data.store import MANIFEST, RATIONALES, Store, load_rows, open_store
 from dynapix.models.student.chat_requests import build_messages
 from dynapix.models.student.prompts import MODES, selection_sample, show_frames_as_images
-from dynapix.teacher.journal import read_accepted
 
 Record = TypeVar("Record")
 
@@ -351,7 +350,14 @@ class Benchmark:
         Raises:
             UserError: There has been no narration of this benchmark.
         """
-        return read_accepted(self.store.folder)
+        path = self.store.folder / RATIONALES
+        if not path.exists():
+            raise UserError(
+                f"{self.store.folder} has no {RATIONALES}: write rationales with "
+                "python -m teacher.narrate",
+                code="no-rationales",
+            )
+        return {row["item_id"]: row["text"] for row in load_rows(path)}
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A worker process opens the benchmark once, instead of receiving it with each item.

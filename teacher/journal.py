@@ -13,7 +13,7 @@ from typing import Any
 from dynapix.conf.errors import UserError
 from dynapix.conf.runs import wait_for_lock
 from dynapix.data.records import Rationale
-from dynapix.data.store import RATIONALES, load_rows, save_rows
+from dynapix.data.store import save_rows
 from dynapix.teacher.sections import SECTIONS
 
 DIGEST = "sha256"
@@ -123,20 +123,3 @@ def save_accepted(rationales: list[Rationale], path: Path) -> None:
     names = [f.name for f in fields(Rationale) if f.name not in ("claims", "sample")]
     schema = pa.schema([(name, types.get(name, pa.string())) for name in names])
     save_rows([vars(r) for r in rationales], path, schema)
-
-
-def read_accepted(folder: Path) -> dict[str, str]:
-    """Return the texts that the last narration accepted, by the id of the item or query.
-
-    Args:
-        folder: The folder of a benchmark.
-
-    Raises:
-        UserError: There has been no narration.
-    """
-    if not (folder / RATIONALES).exists():
-        raise UserError(
-            f"{folder} has no {RATIONALES}: write rationales with python -m teacher.narrate",
-            code="no-rationales",
-        )
-    return {row["item_id"]: row["text"] for row in load_rows(folder / RATIONALES)}

@@ -23,7 +23,7 @@ from dynapix.conf.errors import UserError
 from dynapix.conf.schema import NarrateCommand, TeacherConfig
 from dynapix.data.records import Rationale, SelectionItem
 from dynapix.data.seeded_order import interleave
-from dynapix.data.store import RATIONALES
+from dynapix.data.store import JOURNAL, RATIONALES
 from dynapix.teacher.journal import Journal, save_accepted
 from dynapix.teacher.narrator import write_rationale
 from dynapix.teacher.predicates.grounding import Grounding
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-JOURNAL_FILE = "rationales.jsonl"
 LISTED_REASONS = 3
 """Number of reasons for rejection in the progress bar, which lists the most frequent ones."""
 
@@ -126,7 +125,7 @@ def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) ->
         log.info("narrating a sample: %s", sample)
     unanswered: dict[str, str] = {}
     grader, grounding = RationaleGrader(cfg), Grounding(store, cfg)
-    with Journal(store.folder / JOURNAL_FILE) as journal:
+    with Journal(store.folder / JOURNAL) as journal:
         check_items(journal, every)
         report_other_vocabularies(journal, cfg)
         if cfg.grounding != "oracle":

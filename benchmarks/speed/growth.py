@@ -48,9 +48,9 @@ from dynapix.data import build
 from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.items.cells import family_quotas
 from dynapix.data.parallel import Workers
-from dynapix.data.store import open_store
+from dynapix.data.store import JOURNAL, open_store
 from dynapix.models.precision import resolve_precision
-from dynapix.teacher.narrate import JOURNAL_FILE, narrate_store
+from dynapix.teacher.narrate import narrate_store
 
 BUILD_PARTS = {
     "make_scenes": "scenes",
@@ -134,7 +134,7 @@ def narrate(scenes: int, args: argparse.Namespace) -> Seconds:
     folder, seconds = args.folder / scale_preset(scenes, args.settings).store_name, {}
     if not folder.exists():
         raise SystemExit(f"error: {folder} is missing: run the stage build first")
-    (folder / JOURNAL_FILE).unlink(missing_ok=True)
+    (folder / JOURNAL).unlink(missing_ok=True)
     store = open_store(folder)
     with timed(seconds, "rationales"):
         narrate_store(store, compose("teacher.narrate", NarrateCommand, []).teacher)

@@ -19,11 +19,10 @@ from tqdm import tqdm
 
 from dynapix.conf.errors import UserError
 from dynapix.conf.runs import lock_file
-from dynapix.data.store import FRAMES_FOLDER, MANIFEST, RATIONALES, Store, open_store
+from dynapix.data.store import FRAMES_FOLDER, JOURNAL, MANIFEST, RATIONALES, Store, open_store
 
 log = logging.getLogger(__name__)
 
-JOURNAL = "rationales.jsonl"
 CHUNK = 1 << 20
 """Bytes that are copied at a time."""
 

@@ -68,12 +68,6 @@ def optional_fields(fields: RequestFields) -> RequestFields:
     return {k: v for k, v in fields.get("extra_body", {}).items() if k in OPTIONAL}
 
 
-def without_optional(fields: RequestFields) -> RequestFields:
-    """Return fields without those that a server may refuse."""
-    extra = {k: v for k, v in fields.get("extra_body", {}).items() if k not in OPTIONAL}
-    return {**fields, "extra_body": extra}
-
-
 def constraint_forms(constraint: Constraint) -> dict[str, RequestFields]:
     """Return the fields that ask for a constraint, by the name under which servers know it. For a
     grammar: vLLM, llama.cpp and earlier versions of vLLM. For a JSON schema: OpenAI's API, which

@@ -21,13 +21,14 @@ from dynapix.conf.errors import UserError
 from dynapix.conf.schema import ServersConfig
 from dynapix.teacher.servers.capabilities import (
     CANARY,
+    OPTIONAL,
+    Capabilities,
     Constraint,
     Messages,
     RequestFields,
     describe,
     find_capabilities,
     optional_fields,
-    without_optional,
 )
 from dynapix.teacher.servers.responses import Response, ScoredPrompt
 from dynapix.teacher.servers.server import (
@@ -310,7 +311,7 @@ class ServerPool:
                 try:
                     fields = self.fields | {"max_tokens": 1}
                     if server.found is None:
-                        fields = without_optional(fields)
+                        fields = Capabilities(frozenset(OPTIONAL)).adapt(fields, None)
                     canary = self.canary, 1, fields, self.constraint
                     await self._send(server, lambda s: s.complete(*canary), is_canary=True)
                 except RefusedError as error:

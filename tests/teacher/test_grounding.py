@@ -13,9 +13,9 @@ import pytest
 from dynapix.conf.schema import TeacherConfig
 from dynapix.conf.schema.world import WorldConfig
 from dynapix.data.records import Scene
-from dynapix.data.store import Store
+from dynapix.data.store import JOURNAL, Store
 from dynapix.teacher.journal import read_rationales
-from dynapix.teacher.narrate import JOURNAL_FILE, narrate_store
+from dynapix.teacher.narrate import narrate_store
 from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.grounding import Grounding, extrapolate_scene, extrapolate_target
 from dynapix.teacher.predicates.vocabulary import describe_item
@@ -124,7 +124,7 @@ def test_narration_accepts_false_facts_and_no_false_form(
     assert f"teacher.grounding={grounding}: the facts of the rationales are not" in caplog.text
     # The journal keeps the rationales of both groundings apart.
     assert narrate_store(micro_store, teacher("oracle")).rationales == grounded.rationales
-    journal = read_rationales(micro_store.folder / JOURNAL_FILE)
+    journal = read_rationales(micro_store.folder / JOURNAL)
     assert len({r.predicates for r in journal}) >= 2
     item = items[rationale.item_id]
     facts = describe_item(item, micro_store, cfg)

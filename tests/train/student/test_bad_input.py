@@ -29,12 +29,13 @@ from dynapix.conf.schema import (
     SftCommand,
     StudentConfig,
 )
+from dynapix.data.store import JOURNAL
 from dynapix.evaluation import select
 from dynapix.models import loading, resolved_settings
 from dynapix.models.retriever import embedder
 from dynapix.models.tiny_qwen3_vl import build_model
 from dynapix.teacher.journal import Journal
-from dynapix.teacher.narrate import JOURNAL_FILE, ensure_rationales
+from dynapix.teacher.narrate import ensure_rationales
 from dynapix.train import sft
 from dynapix.train.common.training_loop import newest_checkpoint
 from tests.user_errors import raises_user_error
@@ -195,7 +196,7 @@ def test_rationales_of_another_benchmark_are_refused(settings, micro_store, tmp_
     first, *_ = ensure_rationales(micro_store, settings.teacher)
     store = tmp_path / "micro"
     shutil.copytree(micro_store.folder, store, ignore=shutil.ignore_patterns("frames"))
-    journal = store / JOURNAL_FILE
+    journal = store / JOURNAL
     stranger = micro_store.selection("test")[0].item_id
     with Journal(journal) as opened:
         opened.append([replace(first, item_id=stranger)])
