@@ -123,7 +123,7 @@ def walk_all(folder: str) -> Iterator[tuple[str, list[str]]]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("walks", nargs="*", choices=[[], *WALKS], default=[])
+    parser.add_argument("walks", nargs="*", metavar="WALK", help="all by default")
     asked = parser.parse_args().walks or WALKS
     with tempfile.TemporaryDirectory() as folder:
         for name, files in walk_all(folder):

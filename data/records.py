@@ -101,7 +101,7 @@ class Scene:
             hide it; in MoVi-A and Physion, whether a part of the object is visible.
         visible_fraction: (F, N) visible pixels divided by the pixels that the object would cover
             alone, 0 if it would cover none; NaN where a simulator's record lacks it.
-        collisions: every contact of every pair, in order of frame (`data.oracle.contacts` has what
+        collisions: every contact of every pair, in order of frame (`data.oracle.events` has what
             follows from them, such as the next collision); empty in alternative futures.
         image_size: (width, height) of the image plane that `image_positions` refers to.
         fps: frames per second.

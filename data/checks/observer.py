@@ -31,8 +31,8 @@ from dynapix.conf.runs import lock_file
 from dynapix.conf.schema import WorldConfig
 from dynapix.conf.schema.settings import from_dict
 from dynapix.data.items.futures.simulation import scene_states, simulate_futures
-from dynapix.data.oracle.contacts import touching_pairs
 from dynapix.data.oracle.displacement import DIAGONAL, MODEL_SIZE, visible_positions
+from dynapix.data.oracle.events import touching_pairs
 from dynapix.data.parallel import Workers, batched
 from dynapix.data.records import Scene, SelectionItem, sample_prefix_frames
 from dynapix.data.seeded_order import named_rng

@@ -18,7 +18,7 @@ from dynapix.data.checks.shortcuts import (
     score_simple_strategies,
 )
 from dynapix.data.items.scores import COLLISION_SCORES, SCORES, CandidateFrames, compare_item
-from dynapix.data.oracle.contacts import collisions_in
+from dynapix.data.oracle.events import collisions_in
 from dynapix.data.records import CONTACT, LETTERS, SPLITS, SelectionItem
 from dynapix.data.store import Store
 

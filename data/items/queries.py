@@ -20,12 +20,12 @@ import numpy as np
 from dynapix.conf.schema.benchmark import COUNTERFACTUAL_SECONDS, QUERIES_PER_SCENE
 from dynapix.data.items.pickers import CellInputs
 from dynapix.data.items.recipes import spell_seconds
-from dynapix.data.oracle.contacts import collision_frames, is_next
 from dynapix.data.oracle.displacement import (
     cross_scene_displacement,
     frame_displacements,
     visible_positions,
 )
+from dynapix.data.oracle.events import collision_frames, is_next
 from dynapix.data.oracle.interventions import (
     counterfactual_id,
     last_factual_frame,

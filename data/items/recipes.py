@@ -37,9 +37,8 @@ from dynapix.conf.schema.benchmark import (
     needs_contacts,
 )
 from dynapix.data.items.pickers import DistractorPicker, Pool, Recipe, Timing, visible_objects
-from dynapix.data.oracle.contacts import collision_frames, is_next, next_collision
 from dynapix.data.oracle.displacement import object_match_scores, visible_positions
-from dynapix.data.oracle.events import window_group
+from dynapix.data.oracle.events import collision_frames, is_next, next_collision, window_group
 from dynapix.data.records import SELECTION_SECOND, Candidate, Scene, SelectionItem
 
 EVENT_OBSERVED, WINDOW_OBSERVED = 21, 16

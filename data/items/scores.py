@@ -15,13 +15,13 @@ import numpy as np
 from PIL import Image
 
 from dynapix.data.frames.frame_cache import render_frames
-from dynapix.data.oracle.contacts import next_collision
 from dynapix.data.oracle.displacement import (
     MODEL_SIZE,
     cross_scene_displacement,
     object_displacements,
     visible_positions,
 )
+from dynapix.data.oracle.events import next_collision
 from dynapix.data.oracle.extrapolation import extrapolate
 from dynapix.data.records import CONTACT, FrameRef, Scene, SelectionItem
 from dynapix.data.sim.camera import Camera

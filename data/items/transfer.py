@@ -23,8 +23,12 @@ from dynapix.data.items.recipes import (
     scene_candidates,
     spell_seconds,
 )
-from dynapix.data.oracle.contacts import collision_frames, first_collisions, is_next
-from dynapix.data.oracle.events import find_motion_onsets
+from dynapix.data.oracle.events import (
+    collision_frames,
+    find_motion_onsets,
+    first_collisions,
+    is_next,
+)
 from dynapix.data.records import Scene
 
 SPAN, GAP = 20, 10

@@ -16,7 +16,7 @@ import numpy as np
 
 from dynapix.conf.errors import UserError
 from dynapix.conf.schema import BenchmarkConfig, WorldConfig
-from dynapix.data.oracle.contacts import group_contacts
+from dynapix.data.oracle.events import group_contacts
 from dynapix.data.oracle.interventions import counterfactual_id, removed_object
 from dynapix.data.oracle.visibility import compute_visibility
 from dynapix.data.parallel import Workers

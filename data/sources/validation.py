@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError, conlist
 from pydantic_core import from_json
 
 from dynapix.conf.errors import UserError
-from dynapix.data.oracle.contacts import group_contacts
+from dynapix.data.oracle.events import group_contacts
 from dynapix.data.records import ALTERNATIVE, COUNTERFACTUAL, Collision, Landing, Scene
 
 FLOOR_TOLERANCE = 0.05

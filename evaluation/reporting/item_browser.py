@@ -19,7 +19,7 @@ from dynapix.data.checks.intervals import Interval
 from dynapix.data.checks.observer import SIMULATES, load_observers
 from dynapix.data.checks.observer_curve import CEILING_ERROR, ObserverCurve, observer_curves
 from dynapix.data.frames.frame_cache import FrameReader
-from dynapix.data.oracle.contacts import collisions_in
+from dynapix.data.oracle.events import collisions_in
 from dynapix.data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_prefix_frames
 from dynapix.data.seeded_order import interleave
 from dynapix.data.store import Store, open_store

@@ -8,8 +8,8 @@ from math import dist, hypot
 
 import numpy as np
 
-from dynapix.data.oracle.contacts import collisions_in, next_collision
 from dynapix.data.oracle.displacement import MODEL_SIZE
+from dynapix.data.oracle.events import collisions_in, next_collision
 from dynapix.data.records import CONTACT, LETTERS, Candidate, Scene, SelectionItem
 from dynapix.teacher.predicates.facts import (
     OUT_OF_VIEW,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dynapix.conf.errors import UserError
-from dynapix.data.oracle.contacts import group_contacts
+from dynapix.data.oracle.events import group_contacts
 from dynapix.data.oracle.extrapolation import extrapolate, project
 from dynapix.data.records import ALTERNATIVE, Collision, Scene, SelectionItem, original_scene_id
 from dynapix.data.seeded_order import named_rng

@@ -7,7 +7,7 @@ from math import hypot
 
 import numpy as np
 
-from dynapix.data.oracle.contacts import collisions_in, next_collision, touching_pairs
+from dynapix.data.oracle.events import collisions_in, next_collision, touching_pairs
 from dynapix.data.records import SPEED_BOUNDS, Scene
 from dynapix.teacher.predicates.facts import SPEEDS, VERY_FAST, Meeting
 from dynapix.teacher.predicates.places import (

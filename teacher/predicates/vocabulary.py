@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from dynapix.data.oracle.contacts import next_collision
+from dynapix.data.oracle.events import next_collision
 from dynapix.data.records import CONTACT, Scene, SelectionItem
 from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.facts import Predicates, RelationalPredicates

@@ -9,7 +9,7 @@ import pytest
 
 from dynapix.conf.schema import TeacherConfig
 from dynapix.data.items.futures.contact import LEAD, collision_timings
-from dynapix.data.oracle.contacts import next_collision
+from dynapix.data.oracle.events import next_collision
 from dynapix.data.records import CONTACT, Candidate, Scene, SelectionItem
 from dynapix.teacher.narrator import write_rationale
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary, describe_item

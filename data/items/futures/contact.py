@@ -45,8 +45,8 @@ from dynapix.data.items.scores import (
     CandidateFrames,
     collision_scores,
 )
-from dynapix.data.oracle.contacts import is_next, next_collision, touching_pairs
 from dynapix.data.oracle.displacement import frame_displacements, visible_positions
+from dynapix.data.oracle.events import is_next, next_collision, touching_pairs
 from dynapix.data.records import ALTERNATIVE, CONTACT, GHOST, Candidate, Scene, SelectionItem
 from dynapix.data.sim.camera import Camera
 from dynapix.data.sim.physics import Branch, Motion

@@ -41,8 +41,8 @@ from dynapix.data.items.futures.simulation import (
 from dynapix.data.items.pickers import Recipe, Timing, new_item
 from dynapix.data.items.recipes import EVENT_QUESTION, pair_key
 from dynapix.data.items.scores import Balance
-from dynapix.data.oracle.contacts import group_contacts, next_collision
 from dynapix.data.oracle.displacement import frame_displacements
+from dynapix.data.oracle.events import group_contacts, next_collision
 from dynapix.data.records import (
     ALTERNATIVE,
     GHOST,

@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from dynapix.conf.schema import WorldConfig
-from dynapix.data.oracle.contacts import collisions_in
 from dynapix.data.oracle.displacement import visible_positions
+from dynapix.data.oracle.events import collisions_in
 from dynapix.data.records import Scene
 from dynapix.data.sim.physics import Branch, Motion, shared_simulator
 from dynapix.data.sources.scenes import oracle_arrays

@@ -31,7 +31,7 @@ from dynapix.data.checks.observer_curve import (
     plot_observers,
     summarize_observers,
 )
-from dynapix.data.oracle.contacts import touching_pairs
+from dynapix.data.oracle.events import touching_pairs
 from dynapix.data.parallel import Workers
 from dynapix.data.records import SPLITS
 from dynapix.data.store import Store, open_store

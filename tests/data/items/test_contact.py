@@ -37,8 +37,8 @@ from dynapix.data.items.futures.contact import (
 from dynapix.data.items.futures.simulation import scene_states, simulate_futures
 from dynapix.data.items.pickers import fill_quota
 from dynapix.data.items.scores import compare_item, rank_excess
-from dynapix.data.oracle.contacts import collisions_in, next_collision, touching_pairs
 from dynapix.data.oracle.displacement import cross_scene_displacement
+from dynapix.data.oracle.events import collisions_in, next_collision, touching_pairs
 from dynapix.data.parallel import Workers
 from dynapix.data.records import CONTACT, GHOST, Scene, SelectionItem
 from dynapix.data.sim.physics import Branch, Motion, shared_simulator

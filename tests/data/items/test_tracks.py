@@ -13,14 +13,13 @@ from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.items.database import UniqueFrames, counterfactual_database
 from dynapix.data.items.pickers import Timing, visible_objects
 from dynapix.data.items.recipes import TIME_QUESTION, window_subjects
-from dynapix.data.oracle.contacts import collisions_in, next_collision
 from dynapix.data.oracle.displacement import (
     cross_scene_displacement,
     frame_displacements,
     object_match_scores,
     visible_positions,
 )
-from dynapix.data.oracle.events import window_group
+from dynapix.data.oracle.events import collisions_in, next_collision, window_group
 from dynapix.data.oracle.interventions import removal_displacements
 from dynapix.data.records import FPS, SPLITS, FrameRef, SelectionItem, original_scene_id
 from dynapix.data.store import Store

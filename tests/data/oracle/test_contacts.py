@@ -12,7 +12,7 @@ from dynapix.data.items.pickers import Timing
 from dynapix.data.items.queries import BUILDERS
 from dynapix.data.items.recipes import EVENT_CELLS, MATCHED, make_recipe
 from dynapix.data.items.transfer import make_transfer_recipe
-from dynapix.data.oracle.contacts import first_collisions, next_collision
+from dynapix.data.oracle.events import first_collisions, next_collision
 from dynapix.data.records import FPS, Scene
 from dynapix.data.sim.physics import Touching
 from dynapix.data.sim.sampling import sample_scene

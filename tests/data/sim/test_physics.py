@@ -11,7 +11,7 @@ import pytest
 
 from dynapix.conf.schema import PartConfig, PhysicsConfig, WorldConfig
 from dynapix.conf.schema.world import ByMaterial
-from dynapix.data.oracle.contacts import group_contacts
+from dynapix.data.oracle.events import group_contacts
 from dynapix.data.records import FPS, Collision, Scene, SceneObject
 from dynapix.data.sim.parts import part_box, surface_height
 from dynapix.data.sim.physics import Body, Branch, has_repeated, shared_simulator

@@ -30,8 +30,7 @@ from dynapix.conf.schema.world import (
 )
 from dynapix.data.build import check_quota_names, ensure_items, world_changes
 from dynapix.data.frames.frame_cache import render_frames
-from dynapix.data.oracle.contacts import group_contacts
-from dynapix.data.oracle.events import find_motion_onsets
+from dynapix.data.oracle.events import find_motion_onsets, group_contacts
 from dynapix.data.parallel import Workers
 from dynapix.data.records import FPS, FRAMES, SPEED_BOUNDS, SceneObject
 from dynapix.data.render.bullet import BulletRenderer

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dynapix.data.oracle.contacts import collision_frames, first_collisions
-from dynapix.data.oracle.events import find_motion_onsets
+from dynapix.data.oracle.events import collision_frames, find_motion_onsets, first_collisions
 from dynapix.data.records import Collision, Landing, Scene
 from dynapix.data.sources import physion
 from tests.data.sources.physion_files import COLORS, IDS, physion_trial, write_physion
