@@ -261,6 +261,9 @@ def _find_relation(words: list[str], begin: int, i: int, value: str) -> Found | 
     """Return the relation at word `begin` whose objects begin at word i, if they are there."""
     kind = KINDS[value]
     is_placed = words[begin - 1] in PLACED | LOOKS or isinstance(words[begin - 1], Name)
+    # "Near the center and between the cube and the sphere."
+    follows_place = words[begin] == "between" and words[begin - 1] == "and" and begin > 1
+    is_placed |= follows_place and words[begin - 2] in {*COLUMNS, *ROWS, *MIDDLE, *SIDE_NOUNS}
     if words[begin] in AMBIGUOUS and not is_placed:
         # "A contact between the red cube and the blue sphere" is not a relation.
         return None

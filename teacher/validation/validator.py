@@ -17,7 +17,7 @@ from dynapix.teacher.validation.claim_extraction import extract_claims
 if TYPE_CHECKING:
     from dynapix.conf.schema import TeacherConfig
 
-VALIDATOR_VERSION = "11"
+VALIDATOR_VERSION = "12"
 MAX_QUOTED = 80
 """Maximum number of characters of a sentence in a reason."""
 SMALL_LETTER = re.compile(r"\b[Cc]andidates? [a-d]\b")

@@ -185,6 +185,8 @@ def test_no_true_claim_is_contradicted(rationales, source):
     assert len(rationales[source]) > 30
     for _, text, predicates in rationales[source]:
         assert contradicted(text, predicates) == []
+        if source != "prose":
+            assert "unreadable" not in {claim.kind for claim in extract_claims(text, predicates)}
 
 
 @pytest.mark.slow
