@@ -1,4 +1,4 @@
-"""Runs jobs in worker processes of this machine or of a Ray cluster, with joblib.
+"""Runs jobs in worker processes of this machine, with joblib, or of a Ray cluster.
 
 A job writes its files atomically, so that another worker can repeat the job of a worker that died.
 """
@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -95,24 +96,20 @@ class Workers:
             pass
 
     def _results(self, jobs: Mapping[Name, Job]) -> Iterator[tuple[Name, Any]]:
+        return _run_on_ray(jobs, self.count) if self.engine == "ray" else self._run_here(jobs)
+
+    def _run_here(self, jobs: Mapping[Name, Job]) -> Iterator[tuple[Name, Any]]:
         from joblib import Parallel, delayed
 
-        if self.engine == "ray":
-            _connect_to_ray(self.count)
-            # Ray's backend cannot return results one by one.
-            parallel = Parallel(self.count, backend="ray")
-        else:
-            # A worker that asked for its parent could start too late, after the parent was killed.
-            watch = partial(_exit_with_parent, os.getpid())
-            parallel = Parallel(self.count, return_as="generator_unordered", initializer=watch)
+        # A worker that asked for its parent could start too late, after the parent was killed.
+        watch = partial(_exit_with_parent, os.getpid())
+        parallel = Parallel(self.count, return_as="generator_unordered", initializer=watch)
         # Loky restarts a worker whose memory grows; workers grow because they cache scenes.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs")
         # A caller may stop before the last result.
         warnings.filterwarnings("ignore", r"\d+ tasks have been successfully executed")
-        # Without the block, Ray would start its workers again for each batch.
-        with parallel:
-            for batch in batched(list(jobs.items()), CHUNK * self.count):
-                yield from parallel(delayed(_run_job)(name, job) for name, job in batch)
+        for batch in batched(list(jobs.items()), CHUNK * self.count):
+            yield from parallel(delayed(_run_job)(name, job) for name, job in batch)
 
 
 def batched(elements: list[Element], size: int) -> Iterator[list[Element]]:
@@ -126,22 +123,31 @@ def _run_job(name: Name, job: Job) -> tuple[Name, Any]:
 
 def _death_errors(engine: str) -> tuple[type[Exception], ...]:
     if engine == "ray":
-        from ray.exceptions import RayActorError, WorkerCrashedError
+        from ray.exceptions import OutOfMemoryError, WorkerCrashedError
 
-        return RayActorError, WorkerCrashedError
+        return OutOfMemoryError, WorkerCrashedError
     from joblib.externals.loky import BrokenProcessPool
 
     return (BrokenProcessPool,)
 
 
-def _connect_to_ray(count: int) -> None:
+def _run_on_ray(jobs: Mapping[Name, Job], count: int) -> Iterator[tuple[Name, Any]]:
+    """Run jobs on a Ray cluster, `count` at a time."""
     ray = import_extra("ray", "parallel=ray")
-    from ray.util.joblib import register_ray
-
     if not ray.is_initialized():
         local = {} if os.environ.get("RAY_ADDRESS") else {"num_cpus": count}
         ray.init(log_to_driver=False, include_dashboard=False, **local)
-    register_ray()
+    # `run` repeats the jobs of a worker that dies.
+    submit = ray.remote(_run_job).options(max_retries=0).remote
+    waiting = iter([*jobs.items()])
+    running = [submit(*each) for each in islice(waiting, count)]
+    while running:
+        [finished], running = ray.wait(running)
+        running += [submit(*each) for each in islice(waiting, 1)]
+        try:
+            yield ray.get(finished)
+        except ray.exceptions.RayTaskError as error:
+            raise error.cause from None
 
 
 def _exit_with_parent(parent: int) -> None:

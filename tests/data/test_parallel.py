@@ -45,6 +45,9 @@ def test_workers_that_keep_dying_are_an_error() -> None:
         )
 
 
-def test_exception_of_a_job_is_raised() -> None:
-    with pytest.raises(ZeroDivisionError):
-        list(Workers(2).run({"1": partial(divmod, 1, 0)}, "dividing", "number"))
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["loky", "ray"])
+def test_exception_of_a_job_is_raised(engine) -> None:
+    with pytest.raises(ZeroDivisionError) as raised:
+        list(Workers(2, engine).run({"1": partial(divmod, 1, 0)}, "dividing", "number"))
+    assert raised.type is ZeroDivisionError
