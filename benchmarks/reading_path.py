@@ -125,6 +125,8 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("walks", nargs="*", metavar="WALK", help="all by default")
     asked = parser.parse_args().walks or WALKS
+    if unknown := {*asked} - {*WALKS}:
+        parser.error(f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(WALKS)}")
     with tempfile.TemporaryDirectory() as folder:
         for name, files in walk_all(folder):
             if name in asked:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from itertools import count
+from itertools import count, islice
 from typing import TypeVar
 
 import numpy as np
@@ -24,11 +24,12 @@ def round_robin(queues: Iterable[Iterable[Element]]) -> Iterator[Element]:
     """Yield the next element of each queue in turn, until all are exhausted. Queues are lazy."""
     waiting = [iter(queue) for queue in queues]
     while waiting:
-        for queue in list(waiting):
-            try:
-                yield next(queue)
-            except StopIteration:
-                waiting.remove(queue)
+        remaining = []
+        for queue in waiting:
+            for element in islice(queue, 1):
+                yield element
+                remaining.append(queue)
+        waiting = remaining
 
 
 def interleave(elements: Iterable[Element], key: Callable[[Element], Hashable]) -> list[Element]:
