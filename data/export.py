@@ -1,4 +1,4 @@
-"""Export benchmarks as a Hugging Face dataset, or their training samples for other trainers."""
+"""Export benchmarks as a Hugging Face dataset, as rows for other trainers, or as an archive."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def main(cfg: ExportCommand, run: Run) -> dict[str, float]:
     write_text(run.folder / "report.txt", text + "\n")
     if cfg.push is not None:
         log.info("uploaded: %s", push_folder(Path(cfg.folder), cfg.push))
-    rows = {f"rows/{'/'.join(name)}": float(count) for name, count in summary["rows"].items()}
-    return rows | {"bytes": float(sum(shard["bytes"] for shard in shards))}
+    metrics = {f"rows/{'/'.join(name)}": float(count) for name, count in summary["rows"].items()}
+    return metrics | {"bytes": float(sum(shard["bytes"] for shard in shards))}
 
 
 def export_dataset(cfg: ExportCommand) -> list[Shard]:

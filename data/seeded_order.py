@@ -14,19 +14,20 @@ Element = TypeVar("Element")
 
 
 def named_rng(seed: int, *names: str) -> np.random.Generator:
-    """Return a random generator for a seed and names. Each cell has a generator of its own, so that
-    the quota of a cell does not affect other cells."""
+    """Return a random generator for a seed and names, such as those of a cell. Other names give
+    another generator, so that the quota of a cell does not affect other cells."""
     digest = hashlib.sha256("/".join(names).encode()).digest()
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "big")])
 
 
 def round_robin(queues: Iterable[Iterable[Element]]) -> Iterator[Element]:
-    """Yield the next element of each queue in turn, until all are exhausted. Queues are lazy."""
+    """Yield the next element of each queue in turn, until all are exhausted. An element is computed
+    when its turn comes."""
     waiting = [iter(queue) for queue in queues]
     while waiting:
         remaining = []
         for queue in waiting:
-            for element in islice(queue, 1):
+            for element in islice(queue, 1):  # at most one element
                 yield element
                 remaining.append(queue)
         waiting = remaining

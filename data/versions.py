@@ -17,8 +17,10 @@ READERS = {"clevrer": "3", "movi_a": "3", "physion": "3", "tracks": "2"}
 """Versions of the readers of other simulators' releases."""
 RENDERERS = {"bullet": "bullet-1", "blender": "blender-1, bpy 4.2.23, 32 samples"}
 """Versions of the renderers. Blender gives other pixels with another release or more samples."""
-BUILDERS = {"paper": "9", "balanced": "11", "contact": "1"}
+BUILDERS = {"paper": "9", "balanced": "11", "contact": "2"}
 """Versions of the items and queries, by the recipe of the distractors."""
+INTERVENTIONS = "1"
+"""Version of items about interventions; a change of it concerns benchmarks with them alone."""
 
 
 def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
@@ -31,8 +33,7 @@ def component_versions(config: Mapping[str, Any]) -> dict[str, str]:
     else:
         generator = f"{simulator}-{READERS[simulator]}"
         renderer = f"{simulator}'s own frames"
-    return {
-        "generator": generator,
-        "renderer": renderer,
-        "builders": BUILDERS[config["distractors"]],
-    }
+    builders = BUILDERS[config["distractors"]]
+    if config["selection"].get("interventions"):
+        builders = f"{builders}.{INTERVENTIONS}"
+    return {"generator": generator, "renderer": renderer, "builders": builders}

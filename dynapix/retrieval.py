@@ -183,7 +183,7 @@ def _rows(embeddings: Embeddings, names: Sequence[str], kind: str) -> np.ndarray
         embeddings = [embeddings[name] for name in names]
     try:
         rows = to_array(embeddings, np.float32)
-    except (RuntimeError, TypeError, ValueError) as error:
+    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
         raise UserError(
             f"{kind} embeddings are not an array of numbers: {error}", code="invalid-embeddings"
         ) from error

@@ -78,10 +78,11 @@ class StatisticsCommand(CommandConfig):
 class ExportCommand(CommandConfig):
     benchmark: BenchmarkConfig = MISSING
     also: list[str] = field(default_factory=list)
-    """Further benchmarks in the same dataset, by the names of their presets. The name of a table
-    then begins with that of its benchmark, such as tiny-selection."""
+    """Further benchmarks in the same dataset, by the names of their presets, each in the world of
+    its preset. The name of a table then begins with that of its benchmark, such as
+    tiny-selection."""
     folder: str = path(MISSING)
-    """Folder to write to; it must not contain an earlier export."""
+    """Folder to write to; it must not contain another export."""
     images: bool = True
     """Include the images of the frames; otherwise a row only names its scenes and frames."""
     format: str = setting("dataset", ("dataset", "trl", "sharegpt", "swift", "embedding"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
@@ -23,7 +22,8 @@ FORMATS = {
     ".eval": ("inspect", lambda path: [*read_inspect(path).responses], Result.from_inspect),
     ".json": ("inspect", lambda path: [*read_inspect(path).responses], Result.from_inspect),
 }
-"""For each ending of a log's name: the harness, the ids in a log, and the result."""
+"""For each ending of a log's name: the harness, and functions that read the ids in a log and the
+result. The first ending that fits counts."""
 
 
 def save_log(path: str | Path, store: Path, saved: Path) -> Path:
@@ -53,16 +53,20 @@ def save_log(path: str | Path, store: Path, saved: Path) -> Path:
 
 def find_benchmark(log: Path, ids: Iterable[str], store: Path) -> Benchmark:
     """Return the only benchmark in a folder that has the items or queries with these ids."""
-    found, wanted = [], {*ids}
+    found, wanted, refused = [], {*ids}, ""
+    if not wanted:
+        raise UserError(f"{log} has no responses", code="damaged-file")
     for manifest in sorted(store.glob(f"*/{MANIFEST}")):
-        # A benchmark of another version has other items.
-        with suppress(UserError):
+        try:
             for split, pool in product(SPLITS, POOLS):
                 bench = load(manifest.parent, split, pool=pool)
-                known = {i.item_id for i in (*bench.selection, *bench.interventions)}
-                if wanted and wanted <= known | {query.query_id for query in bench.retrieval}:
+                items = {i.item_id for i in (*bench.selection, *bench.interventions)}
+                if wanted <= items | {query.query_id for query in bench.retrieval}:
                     found.append(bench)
                     break
+        except UserError as error:
+            # A benchmark of another version, which has other items, or a damaged one.
+            refused += f". It cannot be one of these: {error}"
     if len(found) == 1:
         return found[0]
     if found:
@@ -74,6 +78,6 @@ def find_benchmark(log: Path, ids: Iterable[str], store: Path) -> Benchmark:
         )
     raise UserError(
         f"{log} is on none of the benchmarks in {store}: build its benchmark there, or give their "
-        "folder with store=FOLDER",
+        f"folder with store=FOLDER{refused}",
         code="different-builds",
     )

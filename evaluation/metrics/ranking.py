@@ -7,7 +7,8 @@ measure is its mean over all orders of these frames, so that constant scores giv
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -33,9 +34,8 @@ def count_above_and_equal(scores: np.ndarray, targets: np.ndarray) -> tuple[np.n
 
     Args:
         scores: (queries, frames), all columns of the score matrix or a block of them.
-        targets: (queries,) the score of each query's target, as `target_scores` returns it. It must
-            come from the same matrix product as `scores`: a score that is computed separately can
-            differ in its last bit, and then the target would not be equal to itself.
+        targets: (queries,) the score of each query's target, bit-identical to its entry in the
+            matrix of scores: otherwise, the target would not be equal to itself.
 
     Returns:
         Two integer arrays (queries,): above and equal.
@@ -98,7 +98,7 @@ def rank_metrics(
     """Return recall, mean reciprocal rank, median rank and rate of ties of a matrix of scores.
 
     Scores are compared in fp32. If frames tie with the target, each measure is its mean over all
-    orders of the tied frames.
+    orders of the tied frames. A frame whose score is NaN ranks below the target.
 
     Args:
         scores: (queries, frames); a higher score ranks first.
@@ -115,7 +115,7 @@ def rank_metrics(
     """
     try:
         scores, columns = to_array(scores, np.float32), to_array(gold)
-    except (RuntimeError, TypeError, ValueError) as error:
+    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
         raise UserError(
             f"scores or gold are not arrays of numbers: {error}", code="invalid-scores"
         ) from error
@@ -130,16 +130,18 @@ def rank_metrics(
             f"gold must be whole numbers below {scores.shape[1]}, the columns of scores",
             code="invalid-scores",
         )
-    if not ks or min(ks) < 1:
-        raise UserError(f"ks={list(ks)}: give cut-offs of 1 or more", code="invalid-scores")
+    cutoffs = np.atleast_1d(np.asarray(ks, object)).ravel().tolist()
+    if not cutoffs or not all(isinstance(k, Integral) and k >= 1 for k in cutoffs):
+        raise UserError(
+            f"ks={ks}: give cut-offs, whole numbers of 1 or more", code="invalid-scores"
+        )
     targets = np.where(columns >= 0, target_scores(scores, np.maximum(columns, 0)), np.nan)
     above, equal = count_above_and_equal(scores, targets)
-    measures = query_metrics(above, equal - 1, ~np.isnan(targets), scores.shape[1], ks)
-    return {name: float(_average(name)(values)) for name, values in measures.items()}
-
-
-def _average(measure: str) -> Callable[[np.ndarray], float]:
-    return np.median if measure == "median_rank" else np.mean
+    measures = query_metrics(above, equal - 1, ~np.isnan(targets), scores.shape[1], cutoffs)
+    return {
+        name: float(np.median(values) if name == "median_rank" else np.mean(values))
+        for name, values in measures.items()
+    }
 
 
 def to_array(values: Any, dtype: Any = None) -> np.ndarray:

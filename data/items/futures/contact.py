@@ -3,14 +3,14 @@ collision.
 
 The prefix ends shortly before a collision, and the candidates show the same moment after it. In the
 distractors, one thing about the collision differs. `ghost`: the two objects pass through each
-other, as constant velocity predicts. `mass`: one of the two has another mass. `bounce`: both have
-another restitution. `aim`: the faster object comes from a slightly different direction.
+other, as constant velocity predicts. `mass`: one of the two has another mass. `bounce`: all objects
+have another restitution. `aim`: the faster object comes from a slightly different direction.
 
 The true outcome is one more sample of the distribution of the others, and the scores that involve
 no contact physics do not reveal it (`data.items.scores`). The ghost cannot be the target. It stands
 in a share of the items (`GHOST_SHARE`), whose targets are balanced among the other three
-candidates: if it stood in most items, excluding it would reveal too much, and if the targets of
-the items without it made up for this, its absence would.
+candidates. In most items, it would make exclusion pay; if the items without it compensated for
+that, its absence would be a clue.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from dynapix.data.items.scores import (
     collision_scores,
 )
 from dynapix.data.oracle.displacement import frame_displacements, visible_positions
-from dynapix.data.oracle.events import is_next, next_collision, touching_pairs
+from dynapix.data.oracle.events import collisions_in, next_collision, touching_pairs
 from dynapix.data.records import ALTERNATIVE, CONTACT, GHOST, Candidate, Scene, SelectionItem
 from dynapix.data.sim.camera import Camera
 from dynapix.data.sim.physics import Branch, Motion
@@ -69,8 +69,8 @@ DIRECTIONS = np.radians(50)
 GHOST_SHARE = 0.25
 """Share of the items in which the ghost is a distractor."""
 STRAY = 1 / 3
-"""Maximum displacement, as a share of the minimum between candidates, of the target from its
-simulation from the end of the prefix."""
+"""Maximum displacement between the recorded target and its simulation from the end of the prefix,
+as a share of the minimum displacement between candidates."""
 TRUE = TARGET + 1
 """Index of the simulated true outcome among the frames from which candidates are chosen."""
 NO_COLLISION = "no collision after a prefix"
@@ -92,13 +92,13 @@ def make_contact_recipe(subtype: str) -> Recipe:
 
 def collision_timings(gap: int, scene: Scene) -> list[Timing]:
     """Return the timings whose prefix ends `LEAD` frames before the next collision, of two objects
-    that are then visible and apart."""
+    that are then visible and apart, with no other contact that begins up to the same frame."""
     visible, found = visible_positions(scene)[1], []
     for collision in scene.collisions:
         stop, target = collision.frame - LEAD, collision.frame + gap
-        if not OBSERVED <= stop + 1 <= scene.frames - LEAD - gap:
+        if stop - OBSERVED + 1 < 0 or target >= scene.frames:
             continue
-        is_alone = is_next(scene, stop, collision.frame)
+        is_alone = collisions_in(scene, stop + 1, collision.frame) == [collision]
         is_apart = collision.objects not in touching_pairs(scene, stop, stop)
         if is_alone and is_apart and visible[stop, list(collision.objects)].all():
             found.append(Timing(stop - OBSERVED + 1, stop, target, collision.frame))
@@ -147,6 +147,7 @@ class ContactPicker(BalancedPicker):
         choices = [
             (TARGET, *chosen)
             for chosen in combinations(suitable, 3)
+            # The ghost is the last outcome.
             if (sources[chosen[-1] - TRUE] == GHOST) == with_ghost
         ]
         choices = distinct_choices(np.array(choices, int).reshape(-1, 4), displacement, least)
@@ -185,14 +186,14 @@ def sample_outcomes(
     """Sample outcomes of the collision of a pair after frame `stop`, each with what differs in it:
     the true outcome first, and the ghost last.
 
-    As the velocities of balanced items, masses and directions have a random distance from a centre,
-    and so have the true ones.
+    As in `sample_velocities`, masses and directions are drawn around a random centre, so that the
+    true ones are no more central than the others.
     """
     states = scene_states(scene)[stop].astype(float)
     yield "target", Branch(states)
-    heavier = int(rng.choice(pair))
+    changed = int(rng.choice(pair))
     for change in LOG_MASSES * (rng.uniform(size=MASSES) - rng.uniform()):
-        masses = np.where(np.arange(len(states)) == heavier, np.exp(change), 1.0)
+        masses = np.where(np.arange(len(states)) == changed, np.exp(change), 1.0)
         yield "mass", Branch(states, masses=masses.tolist())
     for factor in rng.uniform(0, MAX_BOUNCE, BOUNCES):
         yield "bounce", Branch(states, restitution=float(factor))

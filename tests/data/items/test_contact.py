@@ -40,7 +40,7 @@ from dynapix.data.items.scores import compare_item, rank_excess
 from dynapix.data.oracle.displacement import cross_scene_displacement
 from dynapix.data.oracle.events import collisions_in, next_collision, touching_pairs
 from dynapix.data.parallel import Workers
-from dynapix.data.records import CONTACT, GHOST, Scene, SelectionItem
+from dynapix.data.records import CONTACT, GHOST, Collision, Scene, SelectionItem
 from dynapix.data.sim.physics import Branch, Motion, shared_simulator
 from dynapix.data.store import Store
 from tests.data.simulated import preset_world, simulate_scene
@@ -71,6 +71,15 @@ def items(store: Store) -> list[SelectionItem]:
 def scene() -> Scene:
     """A scene with a collision after a prefix."""
     return next(s for s in (simulate_scene(0, k, WORLD) for k in range(20)) if timings(s))
+
+
+def test_a_collision_that_begins_with_another_has_no_timing(scene: Scene) -> None:
+    """Otherwise, the item could be about the pair whose objects are hidden or touch."""
+    frame, pair = timings(scene)[0].event, colliding_pair(scene)
+    other = tuple(k for k in range(len(scene.objects)) if k not in pair)[:2]
+    both = sorted([*scene.collisions, Collision(frame, other, frame)], key=lambda c: c.frame)
+    found = timings(replace(scene, collisions=tuple(both)))
+    assert frame not in [timing.event for timing in found]
 
 
 def timings(scene: Scene) -> list:

@@ -98,8 +98,16 @@ def test_metrics_without_ties_match_pytrec_eval() -> None:
         (np.ones((1, 3)), [3], (1,), "below 3"),
         (np.ones((1, 3)), [0.0], (1,), "whole numbers"),
         (np.ones((1, 3)), [0], (), "1 or more"),
+        (np.ones((1, 3)), [0], ["a"], "whole numbers"),
+        (np.ones((1, 3)), [0], (1.5,), "whole numbers"),
+        ([[10**400, 0]], [0], (1,), "not arrays of numbers"),
     ],
 )
 def test_invalid_arguments_are_refused(scores, gold, ks, hint) -> None:
     with raises_user_error("invalid-scores", contains=hint):
         rank_metrics(scores, gold, ks)
+
+
+@pytest.mark.parametrize("ks", [2, np.array([2])])
+def test_cut_offs_may_be_a_number_or_an_array(ks) -> None:
+    assert rank_metrics(np.array([[0.1, 0.2]]), [0], ks)["recall@2"] == 1
