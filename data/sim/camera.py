@@ -60,7 +60,7 @@ class Camera:
         along the optical axis."""
         local = (points - np.asarray(self.eye)) @ self.axes.T
         depth = local[..., 2]
-        # Points behind the camera get finite coordinates.
+        # Points behind the camera get finite coordinates that mean nothing: the caller has depths.
         clamped = np.maximum(depth, 1e-3)
         centre = np.array([self.width / 2, self.height / 2])
         return centre + self.focal * local[..., :2] / clamped[..., None], depth

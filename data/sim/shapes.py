@@ -38,7 +38,8 @@ def half_height(shape: str, scale: float) -> float:
 def intersect_object(
     shape: str, scale: float | np.ndarray, origin: np.ndarray, direction: np.ndarray
 ) -> np.ndarray:
-    """Return each ray's parameter at its first intersection with an object, (P,); inf for none.
+    """Return the t at which each ray origin + t x direction first meets an object, (P,); inf if it
+    does not. Rays start outside of the object.
 
     Args:
         scale: Size of the object, or (P,) sizes, one for each ray.
@@ -61,7 +62,7 @@ def intersect_object(
 
 
 def intersect_box(half: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return each ray's parameter at its first intersection with a box, (P,); inf for none.
+    """Return the t at which each ray first meets a box, (P,); see `intersect_object`.
 
     Args:
         half: (3,) halves of the edges; for cubes also (1,), or (P, 1) with one cube for each ray.

@@ -12,7 +12,7 @@ The checksums are not verified: in Python this would take longer than the rest o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,15 @@ HEADER, FOOTER = 12, 4
 
 
 def record_ranges(path: Path) -> list[range]:
-    """Return the range of bytes that contains the data of each record. The last one may reach
-    beyond the end of the file: the records after it cannot be located."""
-    size, start, ranges = path.stat().st_size, 0, []
+    """Return the range of bytes that contains the data of each record. If a length is damaged or
+    the file is cut off, the last range reaches beyond the end of the file."""
+    status = path.stat()
+    return _record_ranges(path, status.st_size, status.st_mtime_ns)
+
+
+@lru_cache(maxsize=16)
+def _record_ranges(path: Path, size: int, modified: int) -> list[range]:
+    start, ranges = 0, []
     with open(path, "rb") as file:
         while start < size:
             file.seek(start)
@@ -37,7 +43,7 @@ def record_ranges(path: Path) -> list[range]:
 
 
 def read_example(path: Path, number: int) -> dict[str, Any]:
-    """Return the features of record `number` by name; `feature_values` converts them."""
+    """Return the features of record `number` (from 0) by name; `feature_values` converts them."""
     from google.protobuf.message import DecodeError
 
     where = f"{path}: record {number}"

@@ -103,12 +103,14 @@ class ItemBrowser:
             self.baselines[name] = baseline_results(standard, store, seed)
             letters = {label: {k: a.letters for k, a in r.items()} for label, r in by_label.items()}
             self.future_moment[name] = measure_future_moment(standard, letters, seed)
-        observed = self._load_observers(store)
-        for m in models.values() if observed else ():
-            own = [items[k] for k in m.responses if k in observed[SIMULATES].index]
-            if len(own) == m.result.n and m.item_set not in self.observers:
-                self.observers[m.item_set] = observer_curves(observed, own, seed)
-        ceilings = observed[SIMULATES][CEILING_ERROR].to_dict() if observed else {}
+        ceilings: Mapping[str, float] = {}
+        if observed := self._load_observers(store):
+            ceilings = observed[SIMULATES][CEILING_ERROR].to_dict()
+            for m in models.values():
+                own = [items[k] for k in m.responses if k in ceilings]
+                # A curve is of the items of a result, so all of them must be observed.
+                if len(own) == m.result.n and m.item_set not in self.observers:
+                    self.observers[m.item_set] = observer_curves(observed, own, seed)
         shown = choose_items(answered, by_label, limit, seed)
         entries = page_entries(shown, by_label, store, name, ceilings)
         frames, errors = encode_frames(shown, store)
@@ -119,7 +121,7 @@ class ItemBrowser:
             "subtypes and over correct and wrong answers. Set items=N to show another number."
         )
         if errors:
-            more = f" ({len(errors) - 1:,} more scenes)" if errors[1:] else ""
+            more = f" (and of {len(errors) - 1:,} other scenes)" if errors[1:] else ""
             self.notes.append(f"Frames are missing: {errors[0]}{more}.")
 
     def _load_observers(self, store: Store) -> dict[str, pd.DataFrame] | None:
