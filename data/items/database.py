@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import chain, islice
+from itertools import chain, islice, product
 
 import numpy as np
 
@@ -45,12 +45,17 @@ class UniqueFrames:
             return False
         appearances = list(_appearances(self.scene_of(frame.scene_id), frame.frame))
         for objects, positions in appearances:
-            steps = (np.abs(other - positions) for other in self._positions[objects])
+            x, y = _first_place(positions)
+            near = product((x - 1, x, x + 1), (y - 1, y, y + 1))
+            others = chain.from_iterable(
+                self._positions.get((objects, place), ()) for place in near
+            )
+            steps = (np.abs(other - positions) for other in others)
             if any(step.max(initial=0) < DUPLICATE_DISTANCE for step in steps):
                 self.left_out += 1
                 return False
         for objects, positions in appearances:
-            self._positions[objects].append(positions)
+            self._positions[objects, _first_place(positions)].append(positions)
         self.frames[frame] = None
         return True
 
@@ -64,6 +69,12 @@ class UniqueFrames:
             return (frame for frame in frames if self.add(frame))
 
         return list(islice(round_robin(map(new_frames, names)), max(wanted, 0)))
+
+
+def _first_place(positions: np.ndarray) -> tuple[int, int]:
+    """Return the first object's position in units of `DUPLICATE_DISTANCE`, rounded down. In
+    near-duplicates, these differ by at most 1."""
+    return tuple(int(x // DUPLICATE_DISTANCE) for x in positions[0]) if len(positions) else (0, 0)
 
 
 def _appearances(scene: Scene, frame: int) -> Iterable[tuple[tuple, np.ndarray]]:
