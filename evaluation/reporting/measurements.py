@@ -241,7 +241,9 @@ def compare_models(
         seed: Seed of the bootstrap over scenes.
     """
     comparisons: list[PairedComparison] = []
-    for pair in permutations(models, 2):
+    # The responses of a run may be damaged or deleted.
+    answered_by = [label for label, m in models.items() if m.responses]
+    for pair in permutations(answered_by, 2):
         if not _is_paper_comparison(*(models[label] for label in pair)):
             continue
         credits = [

@@ -84,7 +84,12 @@ def find_damage(checkpoint: Path) -> str | None:
     """Return a phrase that says what is missing or incomplete in a checkpoint, or None.
 
     The trainer writes its state last, but if the machine crashes, any file may be lost.
+
+    Raises:
+        UserError: A file cannot be read. The checkpoint may be complete; without it, the run would
+            start again.
     """
+    _check_access(checkpoint)
     for part, patterns in PARTS.items():
         if not any(True for pattern in patterns for _ in checkpoint.glob(pattern)):
             return f"its {part} is missing"
@@ -94,13 +99,28 @@ def find_damage(checkpoint: Path) -> str | None:
                 read(path)
         except (OSError, ValueError, SafetensorError, zipfile.BadZipFile) as error:
             if isinstance(error, OSError) and error.errno in ACCESS_ERRNOS:
-                # The checkpoint may be complete; without it, the run would start again.
-                raise UserError(
-                    f"{path} cannot be read ({error}): correct this and run the same command again",
-                    code="unreadable-checkpoint",
-                ) from error
+                raise _unreadable(path, error) from error
             return f"{path.relative_to(checkpoint)} is incomplete"
     return None
+
+
+def _check_access(checkpoint: Path) -> None:
+    # glob skips a folder that it may not read, and safetensors hides why it cannot open a file.
+    for path in (checkpoint, *sorted(checkpoint.rglob("*"))):
+        try:
+            if path.is_dir():
+                os.listdir(path)
+            else:
+                open(path, "rb").close()
+        except OSError as error:
+            raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: OSError) -> UserError:
+    return UserError(
+        f"{path} cannot be read ({error}): correct this and run the same command again",
+        code="unreadable-checkpoint",
+    )
 
 
 def common_arguments(
@@ -116,8 +136,8 @@ def common_arguments(
         checkpoints = max(train.evaluations, MIN_CHECKPOINTS)
         # The trainer reads a value below 1 as a share of all steps, but 1 as every step.
         steps = {
-            "eval_steps": min(1 / train.evaluations, 0.9999),
-            "save_steps": min(1 / checkpoints, 0.9999),
+            "eval_steps": min(1 / train.evaluations, 1 - 1e-9),
+            "save_steps": 1 / checkpoints,
         }
     else:
         # The numbers of steps that the trainer computed from the shares when the run started.

@@ -181,6 +181,11 @@ def test_a_checkpoint_that_cannot_be_read_stops_the_run(tmp_path, monkeypatch) -
     with raises_user_error("unreadable-checkpoint", contains=("trainer_state.json", "denied")):
         newest_checkpoint(tmp_path)
 
+    monkeypatch.undo()
+    monkeypatch.setattr(training_loop.os, "listdir", fail)
+    with raises_user_error("unreadable-checkpoint", contains=("checkpoint-2", "denied")):
+        newest_checkpoint(tmp_path)
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [None, LateConfig(width=24)], ids=["one vector", "many"])
