@@ -153,8 +153,9 @@ class CellInputs:
     """The inputs for making the items or queries of one cell.
 
     Attributes:
-        min_displacement: Between any two candidates, the position of at least one object must
-            differ by this many px at 336 x 336.
+        min_displacement: Between any two candidates, the position of at least one object (of the
+            subjects, if both are frames of the item's scene) must differ by this many px at
+            336 x 336.
         hard_negatives: Number of hard negatives of a query.
     """
 
@@ -206,8 +207,8 @@ def shuffle_candidates(
     items: Sequence[SelectionItem], rng: np.random.Generator
 ) -> list[SelectionItem]:
     """Return items with their candidates in a random order, each letter being the answer equally
-    often. Where the number of items is not divisible by 4, a random first letter decides which
-    letters are the answer once more."""
+    often. If 4 does not divide their number, random letters are the answer once more than the
+    others."""
     positions = rng.permutation((np.arange(len(items)) + rng.integers(4)) % 4)
     shuffled = []
     for item, position in zip(items, positions.tolist(), strict=True):

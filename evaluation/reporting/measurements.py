@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from dynapix.conf.runs import RESULT_NEUTRAL_KEYS, flatten
 from dynapix.conf.schema.benchmark import store_name
 from dynapix.data.checks.intervals import Interval
 from dynapix.data.records import SelectionItem
@@ -318,10 +319,10 @@ def _bootstrap(ids: Sequence[str], items: Mapping[str, SelectionItem]) -> SeedBo
 
 
 def _without_seed(m: Measurement) -> str:
-    """Return the settings of the run that trained a model, without its seed. The run that it
-    continues, if any, has the seed at the end of its name."""
-    names = ("seed", "run", "workers", "store", "checkpoints")
-    settings = {name: value for name, value in m.run.recipe.items() if name not in names}
+    """Return the settings that decide the result of the run that trained a model, without its seed.
+    The run that it continues, if any, has the seed in its name."""
+    names = RESULT_NEUTRAL_KEYS | {"seed"}
+    settings = {name: value for name, value in flatten(m.run.recipe).items() if name not in names}
     if "model" in settings:
         settings["model"] = _strip_seed(str(settings["model"]), m.run.recipe["seed"])
     return json.dumps(settings, sort_keys=True, default=str)
@@ -332,8 +333,10 @@ def _name_without_seed(m: Measurement) -> str:
 
 
 def _strip_seed(name: str, seed: int) -> str:
-    """Return a name without a seed at its end, such as "cot" for "cot-0" and "cot_seed0"."""
-    return re.sub(rf"(?:[\W_]+(?:seed)?[\W_]*|seed){seed}$", "", name) or name
+    """Return a name without a seed: "cot" for "cot-0" and "cot_seed0", and "cot+lr-1" for
+    "cot+seed-0+lr-1"."""
+    stripped = re.sub(rf"[\W_]*seed[\W_]*{seed}(?!\d)", "", name)
+    return (re.sub(rf"[\W_]+{seed}$", "", name) if stripped == name else stripped) or name
 
 
 def _is_paper_comparison(m: Measurement, other: Measurement) -> bool:

@@ -67,11 +67,12 @@ def test_trainings_with_several_seeds_are_compared(runs, micro, micro_store, rep
     ("name", "seed", "stripped"),
     [
         ("cot-0", 0, "cot"), ("cot_seed1", 1, "cot"), ("cot, seed=2", 2, "cot"),
+        ("exp-cot+seed-4+train.lr-1e-4", 4, "exp-cot+train.lr-1e-4"), ("seed-10+x", 1, "seed-10+x"),
         ("cot_300", 0, "cot_300"), ("lr-10", 0, "lr-10"), ("v2", 2, "v2"), ("3", 3, "3"),
         ("checkpoints/sft/qwen3_vl_2b-cot-2", 2, "checkpoints/sft/qwen3_vl_2b-cot"),
     ],
 )  # fmt: skip
-def test_only_the_seed_at_the_end_of_a_name_is_left_out(name, seed, stripped) -> None:
+def test_only_the_seed_of_a_name_is_left_out(name, seed, stripped) -> None:
     assert measurements._strip_seed(name, seed) == stripped
 
 
