@@ -2,7 +2,8 @@ r"""Measures how time and memory grow with the amount of work, from a scene to a
 
     python -m benchmarks.speed.growth
     python -m benchmarks.speed.growth build --sizes 10000 100000 --parallel ray \
-        --settings world=falling benchmark.world.objects.{min,max}_count=3
+        --settings world=falling benchmark.world.objects.{min,max}_count=3 \
+        benchmark.world.physics.substeps=5
 
 Each stage doubles one size: the scenes of a build without frames and of its narration, the samples
 and the queries of a training step, the frames that a retriever embeds, the frames of a database,

@@ -3,9 +3,11 @@
     python -m benchmarks.speed.profile student
     python -m benchmarks.speed.profile retriever --avx2
 
-The script profiles our trainer of the tiny models after its first step. It prints the share of the
-time in each kind of operation and, for matrix products, their rate as a share of the rate of one
-large product, which the same process measures.
+The script trains the tiny model with our trainer: one step that is not measured, one whose
+floating-point operations are counted, three that are timed, and one that is profiled. For each
+timed step, it prints the operations per second, and their share of the rate of one large matrix
+product that the process computes after the step. Then it prints the share of each kind of operation
+in the time of the profiled step.
 """
 
 from __future__ import annotations
@@ -13,11 +15,13 @@ from __future__ import annotations
 import argparse
 import time
 from collections import defaultdict
+from contextlib import ExitStack
 from typing import Any
 from unittest.mock import patch
 
 import torch
 from torch.profiler import ProfilerActivity, profile
+from torch.utils.flop_counter import FlopCounterMode
 from transformers import Trainer, TrainerCallback
 
 from benchmarks.speed import comparison, contrastive, sft
@@ -25,8 +29,8 @@ from benchmarks.speed.comparison import AVX2, Measurements, run_in_process
 from dynapix.conf.failures import report_failures
 from dynapix.models.precision import resolve_precision
 
-STEPS = 2
-"""Profiled steps, after a first one."""
+COUNTED, TIMED, PROFILED = 2, (3, 4, 5), 6
+"""Numbers of the steps, from 1."""
 TRAIN = comparison.train
 LARGE = 2048
 """Rows and columns of the large product."""
@@ -34,51 +38,62 @@ KINDS = {
     "matrix products": ("aten::mm", "aten::addmm", "aten::bmm", "aten::baddbmm", "mkldnn_linear"),
     "attention": ("scaled_dot_product", "flash_attention"),
     "convolutions": ("convolution",),
-    "copies and casts": ("aten::copy_", "aten::cat", "aten::index", "aten::clone"),
     "softmax and norms": ("softmax", "norm", "aten::mean", "aten::rsqrt"),
-}
+    "copies and casts": ("aten::copy_", "aten::cat", "aten::index", "aten::clone"),
+    "elementwise": ("aten::mul", "aten::add", "aten::sub", "aten::div", "silu", "gelu", "aten::sum",
+                    "aten::neg", "aten::fill_", "aten::pow"),
+}  # fmt: skip
 """Parts of the names of operations, by kind. The first kind that fits counts."""
 
 
-class ProfiledSteps(TrainerCallback):
-    """Profiles the steps after the first one."""
+class StepProfile(TrainerCallback):
+    """Counts the operations of one step, times others, and profiles the last one."""
 
-    def __init__(self) -> None:
-        self.profiler = profile(activities=[ProfilerActivity.CPU], with_flops=True)
-        self.seconds = 0.0
+    def __init__(self, dtype: torch.dtype) -> None:
+        self._dtype = dtype
+        self.counter = FlopCounterMode(display=False)
+        self.profiler = profile(activities=[ProfilerActivity.CPU])
+        self.seconds: list[float] = []
+        self.limits: list[float] = []
+        self._stack = ExitStack()
+        self._start = 0.0
+
+    def on_step_begin(self, _: Any, state: Any, *rest: Any, **__: Any) -> None:
+        step = state.global_step + 1
+        if step in (COUNTED, PROFILED):
+            self._stack.enter_context(self.counter if step == COUNTED else self.profiler)
 
     def on_step_end(self, _: Any, state: Any, *rest: Any, **__: Any) -> None:
-        if state.global_step == 1:
-            self.profiler.start()
-            self.seconds = -time.perf_counter()
-
-    def on_train_end(self, *_: Any, **__: Any) -> None:
-        self.seconds += time.perf_counter()
-        self.profiler.stop()
+        self._stack.close()
+        if state.global_step in TIMED:
+            self.seconds.append(time.perf_counter() - self._start)
+            # The processor's rate changes with other programs, so each step has its own limit.
+            self.limits.append(large_product_rate(self._dtype))
+        self._start = time.perf_counter()
 
 
 def profile_training(trainer: Trainer, batch: int) -> Measurements:
     """Train as `comparison.train` does, and print the profile."""
-    steps = ProfiledSteps()
+    steps = StepProfile(torch.bfloat16 if trainer.args.bf16 else torch.float32)
     trainer.add_callback(steps)
     measured = TRAIN(trainer, batch)
-    seconds, operations = defaultdict(float), defaultdict(float)
+    operations = steps.counter.get_total_flops()
+    for seconds, limit in zip(steps.seconds, steps.limits, strict=True):
+        print(
+            f"{batch / seconds:.1f} samples or queries a second: {operations / seconds / 1e9:.0f} "
+            f"GFLOP/s, {operations / seconds / limit:.0%} of one large product's"
+        )
+    shares = defaultdict(float)
     for event in steps.profiler.key_averages():
-        kind = next((k for k, parts in KINDS.items() if any(p in event.key for p in parts)), "")
-        seconds[kind or "other operations"] += event.self_cpu_time_total / 1e6
-        operations[kind] += event.flops
-    print(f"{steps.seconds / STEPS:.1f} s a step, {measured.rate:.1f} a second")
-    for kind, duration in sorted(seconds.items(), key=lambda item: -item[1]):
-        print(f"{100 * duration / sum(seconds.values()):5.1f}%  {kind}")
-    products = next(iter(KINDS))
-    rate = operations[products] / seconds[products]
-    limit = large_product_rate(torch.bfloat16 if trainer.args.bf16 else torch.float32)
-    print(f"{products}: {rate / 1e9:.0f} GFLOP/s, one large product: {limit / 1e9:.0f} GFLOP/s")
+        kind = next((k for k, parts in KINDS.items() if any(p in event.key for p in parts)), "rest")
+        shares[kind] += event.self_cpu_time_total
+    for kind, share in sorted(shares.items(), key=lambda item: -item[1]):
+        print(f"{100 * share / sum(shares.values()):5.1f}%  {kind}")
     return measured
 
 
 def large_product_rate(dtype: torch.dtype) -> float:
-    """Return the operations per second of one large product."""
+    """Return the floating-point operations per second of one large product."""
     one, other = torch.randn(2, LARGE, LARGE).to(dtype)
     seconds = []
     for _ in range(6):
@@ -94,9 +109,9 @@ def profile_model(model: str, precision: str, store: str) -> None:
     with patch.object(comparison, "train", profile_training):
         if model == "student":
             settings += ["+exp=cot", "train.generated_items=0"]
-            sft.measure(settings, sft.Variant(), STEPS, False)
+            sft.measure(settings, sft.Variant(), PROFILED - 1, False)
         else:
-            contrastive.measure(settings, contrastive.Variant(), STEPS)
+            contrastive.measure(settings, contrastive.Variant(), PROFILED - 1)
 
 
 def main() -> None:
@@ -106,7 +121,7 @@ def main() -> None:
     parser.add_argument("--store", default="store", help="folder of the built benchmarks")
     args = parser.parse_args()
     precision = "fp32" if args.avx2 else resolve_precision("auto")
-    environment = AVX2 if args.avx2 else {}
+    environment = {"KINETO_LOG_LEVEL": "5", **(AVX2 if args.avx2 else {})}
     run_in_process(profile_model, args.model, precision, args.store, environment=environment)
 
 
