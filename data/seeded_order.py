@@ -27,7 +27,7 @@ def round_robin(queues: Iterable[Iterable[Element]]) -> Iterator[Element]:
     while waiting:
         remaining = []
         for queue in waiting:
-            for element in islice(queue, 1):  # at most one element
+            for element in islice(queue, 1):
                 yield element
                 remaining.append(queue)
         waiting = remaining

@@ -66,7 +66,7 @@ def find_benchmark(log: Path, ids: Iterable[str], store: Path) -> Benchmark:
                     break
         except UserError as error:
             # A benchmark of another version, which has other items, or a damaged one.
-            refused += f". It cannot be one of these: {error}"
+            refused += f". Not searched: {error}"
     if len(found) == 1:
         return found[0]
     if found:
