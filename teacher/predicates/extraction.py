@@ -21,6 +21,7 @@ from dynapix.teacher.predicates.facts import (
     RelationalPredicates,
     View,
 )
+from dynapix.teacher.predicates.margins import find_changes, find_relations
 from dynapix.teacher.predicates.motion import (
     describe_meeting,
     find_collision_courses,
@@ -36,13 +37,7 @@ from dynapix.teacher.predicates.places import (
     object_sight,
     square_displacement,
 )
-from dynapix.teacher.predicates.relations import (
-    CLEARLY,
-    DISPLACED,
-    Places,
-    find_changes,
-    find_relations,
-)
+from dynapix.teacher.predicates.relations import CLEARLY, DISPLACED, Places
 
 STAYS, SHIFTS = 8.0, 60.0
 """Upper bounds of the displacement (px of the square image) of an object that "stays", and of one

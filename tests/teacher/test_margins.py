@@ -11,14 +11,8 @@ import pytest
 from dynapix.teacher.predicates import statement_choice
 from dynapix.teacher.predicates.extraction import extract_predicates
 from dynapix.teacher.predicates.facts import REGIONS, Relation, RelationalPredicates
-from dynapix.teacher.predicates.margins import measure_margin
-from dynapix.teacher.predicates.relations import (
-    CHANGES,
-    VALUES,
-    Places,
-    find_relations,
-    normalize_relation,
-)
+from dynapix.teacher.predicates.margins import find_relations, measure_margin
+from dynapix.teacher.predicates.relations import CHANGES, VALUES, Places, normalize_relation
 from dynapix.teacher.predicates.statement_choice import choose_statements
 from dynapix.teacher.prompts import format_facts
 from tests.teacher import synthetic

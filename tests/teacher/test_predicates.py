@@ -9,9 +9,10 @@ import numpy as np
 
 from dynapix.teacher.predicates.extraction import extract_facts, extract_predicates
 from dynapix.teacher.predicates.facts import COMPASS, REGIONS
+from dynapix.teacher.predicates.margins import find_relations
 from dynapix.teacher.predicates.motion import find_collision_courses, find_cut
 from dynapix.teacher.predicates.places import close_pairs
-from dynapix.teacher.predicates.relations import Places, find_relations
+from dynapix.teacher.predicates.relations import Places
 from tests.teacher import synthetic
 
 

@@ -10,14 +10,13 @@ import pytest
 
 from dynapix.conf.schema import TeacherConfig
 from dynapix.teacher.predicates.facts import Relation
+from dynapix.teacher.predicates.margins import find_changes, find_relations
 from dynapix.teacher.predicates.relations import (
     KINDS,
     OPPOSITES,
     SYMMETRIC,
     Places,
     describe_distance,
-    find_changes,
-    find_relations,
     flip_relation,
     normalize_relation,
 )

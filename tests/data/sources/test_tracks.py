@@ -34,8 +34,9 @@ from dynapix.data.sources.scenes import make_scenes
 from dynapix.data.store import Store
 from dynapix.teacher.narrate import narrate_store
 from dynapix.teacher.predicates.extraction import extract_facts
+from dynapix.teacher.predicates.margins import find_relations
 from dynapix.teacher.predicates.places import close_pairs
-from dynapix.teacher.predicates.relations import Places, find_relations
+from dynapix.teacher.predicates.relations import Places
 from tests.data.sources.pictures import write_video
 from tests.data.sources.tracks_files import SIZE, box_lines, write_tracked_video
 from tests.user_errors import raises_user_error
