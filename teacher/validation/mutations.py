@@ -26,20 +26,7 @@ MOVING = [*SPEEDS, VERY_FAST]
 
 Mutation = tuple[str, tuple[int, int]]
 """A text with a false word, and the span of this word."""
-
-
-def replace_words(
-    text: str, words: Sequence[str], rng: Random, predicates: Predicates | None = None
-) -> Iterator[Mutation]:
-    """Yield one text for each occurrence of one of `words`, in which another of them replaces it.
-
-    With `predicates`, a word about an object whose motion is unknown is not replaced, because no
-    word for this motion would be false.
-    """
-    pattern = "|".join(sorted(words, key=len, reverse=True))
-    for match in re.finditer(rf"\b(?:{pattern})\b(?!-)", text):
-        if predicates is None or is_motion_known(text, match.start(), predicates):
-            yield replace_match(text, match, rng.choice([w for w in words if w != match[0]]))
+Mutate = Callable[[str, Predicates, Random], Iterator[Mutation]]
 
 
 def replace_match(text: str, match: re.Match[str], word: str) -> Mutation:
@@ -85,31 +72,6 @@ def replace_partners(text: str, predicates: Predicates, rng: Random) -> Iterator
                 yield replace_match(text, inside[1], rng.choice(free))
 
 
-def replace_relations(
-    text: str, phrases: Mapping[str, Sequence[str]], rng: Random
-) -> Iterator[Mutation]:
-    """Yield one text for each relation of these phrases, with another value that excludes it.
-    Relations that are denied are left as they are.
-
-    Args:
-        phrases: For each phrase, those that are false if it is true.
-    """
-    pattern = "|".join(map(re.escape, sorted(phrases, key=len, reverse=True)))
-    for match in re.finditer(rf"(?<!not )\b({pattern}) (?=the |it\b)", text):
-        if _names_object(text, match.end()) or _is_possessed(text, match.start()):
-            yield replace_match(text, match, rng.choice(phrases[match[1]]) + " ")
-
-
-def _names_object(text: str, position: int) -> bool:
-    """Return whether "the red metal cube" follows, and not "the left"."""
-    return bool(re.match(rf"the (?:{'|'.join(COLORS)}) ", text[position : position + 20]))
-
-
-def _is_possessed(text: str, position: int) -> bool:
-    """Return whether "with the red metal cube" or "has the red metal cube" precedes."""
-    return bool(re.search(rf"(?:with|has|have) {OBJECT} $", text[max(0, position - 60) : position]))
-
-
 OBJECT = rf"the (?:{'|'.join(COLORS)}) (?:metal|rubber) \w+"
 SIDES = {
     "left of": ["right of", "vertically aligned with"],
@@ -146,43 +108,65 @@ FALSE_EXTENTS = {
 
 
 def replace_by(
-    words: Mapping[str, str | Sequence[str]], before: str = "", after: str = ""
-) -> Callable[[str, Predicates, Random], Iterator[Mutation]]:
+    words: Mapping[str, str | Sequence[str]],
+    before: str = "",
+    after: str = "",
+    of_motion: bool = False,
+) -> Mutate:
     """Return a mutation that replaces each of `words` by its false word, or by one of several.
 
     Args:
         before: Regular expression of what precedes the word, such as `(?<!not )`.
         after: The same for what follows it.
+        of_motion: Whether words about an object whose motion is unknown are left as they are,
+            because no word for this motion would be false.
     """
     pattern = rf"{before}\b(?:{'|'.join(words)})\b{after}"
 
     def mutate(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
         for match in re.finditer(pattern, text):
-            false = words[match[0]]
-            yield replace_match(text, match, false if isinstance(false, str) else rng.choice(false))
+            if not of_motion or is_motion_known(text, match.start(), predicates):
+                false = words[match[0]]
+                word = false if isinstance(false, str) else rng.choice(false)
+                yield replace_match(text, match, word)
 
     return mutate
 
 
-def swap_subjects(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """In "a is between b and c" or "a comes between b and c", exchange a and b: then b lies at an
-    end."""
-    pattern = rf"({OBJECT})( (?:is |will be |comes )?between )({OBJECT})(?= and )"
-    for match in re.finditer(pattern, text, re.IGNORECASE):
-        yield replace_match(text, match, f"{match[3]}{match[2]}{match[1]}")
+def list_others(words: Sequence[str]) -> dict[str, list[str]]:
+    """Return the other words for each of `words`."""
+    return {word: [other for other in words if other != word] for word in words}
 
 
-def swap_distances(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """In "nearer to b than to c", exchange b and c."""
-    pattern = rf"(?<!not )((?:nearer|closer) to )({OBJECT})( than to )({OBJECT})"
-    for match in re.finditer(pattern, text):
-        yield replace_match(text, match, f"{match[1]}{match[4]}{match[3]}{match[2]}")
+def replace_relations(phrases: Mapping[str, Sequence[str]]) -> Mutate:
+    """Return a mutation that replaces each relation of these phrases by another value that excludes
+    it. Relations that are denied are left as they are.
+
+    Args:
+        phrases: For each phrase, those that are false if it is true.
+    """
+    pattern = "|".join(sorted(phrases, key=len, reverse=True))
+    # "The red metal cube" and not "the left" follows, or "with the red metal cube" precedes.
+    named = re.compile(rf"the (?:{'|'.join(COLORS)}) ")
+    possessed = re.compile(rf"(?:with|has|have) {OBJECT} $")
+
+    def mutate(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+        for match in re.finditer(rf"(?<!not )\b({pattern}) (?=the |it\b)", text):
+            start, stop = match.span()
+            if named.match(text, stop) or possessed.search(text[max(0, start - 60) : start]):
+                yield replace_match(text, match, rng.choice(phrases[match[1]]) + " ")
+
+    return mutate
 
 
-def unbalance_distances(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    """Replace "about as near to b as to c" with "nearer to b than to c"."""
-    for match in re.finditer(rf"about as near to ({OBJECT}) as to ({OBJECT})", text):
-        yield replace_match(text, match, f"nearer to {match[1]} than to {match[2]}")
+def rewrite(pattern: str, template: str) -> Mutate:
+    """Return a mutation that replaces each match of a pattern by a template with its groups."""
+
+    def mutate(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
+        for match in re.finditer(pattern, text):
+            yield replace_match(text, match, match.expand(template))
+
+    return mutate
 
 
 def replace_passed(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
@@ -200,11 +184,6 @@ def replace_passed(text: str, predicates: Predicates, rng: Random) -> Iterator[M
             yield text[:start] + name + text[stop:], (start, start + len(name))
 
 
-def replace_answer(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
-    for match in re.finditer(r"(?<=^Answer: )[A-D]", text, re.MULTILINE):
-        yield replace_match(text, match, rng.choice([c for c in LETTERS if c != match[0]]))
-
-
 def swap_candidates(text: str, predicates: Predicates, rng: Random) -> Iterator[Mutation]:
     """Exchange the letters of the target and of another candidate after the word "candidate", from
     the candidate analysis up to the answer."""
@@ -217,25 +196,33 @@ def swap_candidates(text: str, predicates: Predicates, rng: Random) -> Iterator[
         yield text[:start] + body + text[stop:], (start, stop)
 
 
-MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = {
-    "direction": lambda text, p, rng: replace_words(text, COMPASS, rng, p),
-    "region": lambda text, p, rng: replace_words(text, ALL_REGIONS, rng),
-    "speed": lambda text, p, rng: replace_words(text, MOVING, rng, p),
+MUTATIONS: dict[str, Mutate] = {
+    "direction": replace_by(list_others(COMPASS), after="(?!-)", of_motion=True),
+    "region": replace_by(list_others(ALL_REGIONS), after="(?!-)"),
+    "speed": replace_by(list_others(MOVING), after="(?!-)", of_motion=True),
     "time": replace_by(FALSE_TIMES, after="(?!-)"),
     "color": replace_colors,
     "pair": replace_partners,
-    "answer": replace_answer,
+    "answer": replace_by(list_others(LETTERS), before="(?m:(?<=^Answer: ))"),
     "candidate": swap_candidates,
 }
 """For each kind of word, a function that yields texts in which one such word is false."""
-RELATION_MUTATIONS: dict[str, Callable[[str, Predicates, Random], Iterator[Mutation]]] = {
-    "side": lambda text, p, rng: replace_relations(text, SIDES, rng),
-    "height": lambda text, p, rng: replace_relations(text, HEIGHTS, rng),
-    "gap": lambda text, p, rng: replace_relations(text, GAPS, rng),
-    "cover": lambda text, p, rng: replace_relations(text, COVERS, rng),
-    "between": swap_subjects,
-    "nearer": swap_distances,
-    "as near": unbalance_distances,
+RELATION_MUTATIONS: dict[str, Mutate] = {
+    "side": replace_relations(SIDES),
+    "height": replace_relations(HEIGHTS),
+    "gap": replace_relations(GAPS),
+    "cover": replace_relations(COVERS),
+    # In "a is between b and c" or "a comes between b and c", exchange a and b: b lies at an end.
+    "between": rewrite(
+        rf"(?i:({OBJECT})( (?:is |will be |comes )?between )({OBJECT})(?= and ))", r"\3\2\1"
+    ),
+    # In "nearer to b than to c", exchange b and c.
+    "nearer": rewrite(
+        rf"(?<!not )((?:nearer|closer) to )({OBJECT})( than to )({OBJECT})", r"\1\4\3\2"
+    ),
+    "as near": rewrite(
+        rf"about as near to ({OBJECT}) as to ({OBJECT})", r"nearer to \1 than to \2"
+    ),
     "extreme": replace_by(EXTREMES, before="(?<!not )"),
     "edge": replace_by(OPPOSITE_EDGES, before="(?<=reaches the )", after="(?= edge)"),
     "passing": replace_passed,
