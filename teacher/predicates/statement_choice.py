@@ -88,8 +88,12 @@ def choose_statements(
         if s.kind not in CHANGES and not all(s in view.statements for view in wrong)
     ]
     holds = np.array([_probability_of_truth(s, predicates) for s in statements])
-    excludes = np.array([[_probability_of_falsity(s, v) for v in wrong] for s in statements])
-    excludes = excludes.reshape(len(statements), len(wrong))
+    # A statement that is true of a distractor does not exclude it.
+    excludes = [
+        [0.0 if s in view.statements else _probability_of_sight(s, view) for view in wrong]
+        for s in statements
+    ]
+    excludes = np.array(excludes).reshape(len(statements), len(wrong))
     possible = excludes.any(axis=0)
     place = _choose_place(predicates, shown)
     left = possible & [place is None or place in view.statements for view in wrong]
@@ -169,12 +173,6 @@ def _choose_set(holds: np.ndarray, excludes: np.ndarray) -> tuple[int, ...]:
         return first, second
     # Each statement excludes one distractor only.
     return tuple(int(k) for k in (holds[:, None] * excludes).argmax(axis=0))
-
-
-def _probability_of_falsity(statement: Relation, view: View) -> float:
-    """Return the probability that a reader finds a statement false of a candidate; 0 if it is
-    true."""
-    return 0.0 if statement in view.statements else _probability_of_sight(statement, view)
 
 
 def _probability_of_sight(statement: Relation, view: View) -> float:

@@ -149,7 +149,7 @@ class ServerPool:
         end = time.monotonic() + self.cfg.unreachable_timeout
         for failures in itertools.count(1):
             try:
-                return await server.load_adapter(folder)
+                return await server.change_adapter("load", self.cfg.model, folder)
             except RequestError as error:
                 if isinstance(error, RefusedError) or time.monotonic() > end:
                     raise NoResponseError(f"{server.url}: {error}") from error
@@ -160,7 +160,7 @@ class ServerPool:
         for server in self.servers:
             # A server that was started again does not have it.
             with suppress(RequestError):
-                await server.unload_adapter(name)
+                await server.change_adapter("unload", name)
 
     async def _request(self, send: Callable[[ServerClient], Awaitable[Reply]]) -> Reply:
         """Return the reply of the first server that answers a request."""

@@ -187,20 +187,15 @@ class ServerClient:
 
         return await self._translate_errors(request)
 
-    async def load_adapter(self, folder: Path) -> None:
-        """Load an adapter under the name `cfg.model`.
+    async def change_adapter(self, action: str, name: str, folder: Path | None = None) -> None:
+        """Load the adapter in a folder under a name, or unload it (`action`).
 
         Raises:
             RequestError: The request failed.
             UserError: The server loads no adapters, or rejects the API key.
         """
-        await self._change_adapters("load", {"lora_name": self.cfg.model, "lora_path": str(folder)})
+        body = {"lora_name": name} | ({"lora_path": str(folder)} if folder else {})
 
-    async def unload_adapter(self, name: str) -> None:
-        """Unload the adapter `name`. It raises the errors of `load_adapter`."""
-        await self._change_adapters("unload", {"lora_name": name})
-
-    async def _change_adapters(self, action: str, body: dict[str, str]) -> None:
         async def request() -> None:
             try:
                 await self.client.post(f"/{action}_lora_adapter", cast_to=str, body=body)
@@ -208,7 +203,7 @@ class ServerClient:
                 raise
             except openai.NotFoundError as error:
                 # vLLM also answers 404 if it finds no adapters in the folder.
-                if body["lora_name"] in error.message:
+                if name in error.message:
                     raise RefusedError(error.message) from error
                 raise UserError(
                     f"{self.url} loads no adapters while it runs: start it with python -m "
