@@ -34,10 +34,13 @@ POSSESSIVE = {"is": "has", "will be": "will have"}
 """For each verb, the one to use if the other object is named before the relation: "the cube *has*
 the sphere left of it"."""
 CHANGE_VERBS = {
-    "passes": ("pass", "passing"), "crosses": ("cross", "crossing"),
-    "comes": ("come", "coming"), "reaches": ("reach", "reaching"),
-}  # fmt: skip
-"""Infinitive and participle of the first word of each phrase for a change."""
+    "passes": {"is": "passes", "will be": "will pass", "being": "passing"},
+    "crosses": {"is": "crosses", "will be": "will cross", "being": "crossing"},
+    "comes": {"is": "comes", "will be": "will come", "being": "coming"},
+    "reaches": {"is": "reaches", "will be": "will reach", "being": "reaching"},
+}
+"""For the first word of each phrase for a change, the form that stands in the place of a form of
+"be" before the phrases of other relations."""
 
 
 def leave_out_unseen(p: RelationalPredicates, named: Collection[str] = ()) -> RelationalPredicates:
@@ -138,21 +141,15 @@ class RelationalWriter(Writer):
         return f"the {relation.objects[0]} {verb} {self.place(relation)}"
 
     def change(self, relation: Relation, verb: str) -> str:
-        """Return what an object does, with the verb in the present or the future.
-
-        Args:
-            verb: "is" for "reaches the left edge", "will be" for "will reach the left edge".
-        """
+        """Return what an object does; `verb` is a key of the inner dictionaries of `CHANGE_VERBS`,
+        such as "will be" for "will reach the left edge"."""
         present, rest = self.place(relation).split(" ", 1)
-        infinitive, _ = CHANGE_VERBS[present]
-        return f"{present if verb == 'is' else f'will {infinitive}'} {rest}"
+        return f"{CHANGE_VERBS[present][verb]} {rest}"
 
     def attribute(self, relation: Relation, true: bool = True) -> str:
         """Return what follows the subject in `shown`, for a relation that is true or false."""
         if relation.kind in CHANGES:
-            present, rest = self.place(relation).split(" ", 1)
-            _, participle = CHANGE_VERBS[present]
-            return f"{'' if true else 'not '}{participle} {rest}"
+            return f"{'' if true else 'not '}{self.change(relation, 'being')}"
         if not true:
             return f"not {self.place(relation)}"
         if relation.kind in SYMMETRIC:
