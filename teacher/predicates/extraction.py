@@ -10,14 +10,13 @@ import numpy as np
 
 from dynapix.data.oracle.displacement import MODEL_SIZE
 from dynapix.data.oracle.events import collisions_in, next_collision
-from dynapix.data.records import CONTACT, LETTERS, Candidate, Scene, SelectionItem
+from dynapix.data.records import CONTACT, LETTERS, Scene, SelectionItem
 from dynapix.teacher.predicates.facts import (
     OUT_OF_VIEW,
     CandidateFacts,
     Difference,
     Facts,
     ObjectFacts,
-    Relation,
     RelationalPredicates,
     View,
 )
@@ -100,21 +99,30 @@ def extract_predicates(
             for meetings in (facts.courses, facts.contacts)
         )
         facts = replace(facts, courses=courses, contacts=contacts)
-    candidates = tuple(
-        CandidateFacts(letter, True, False, ())
-        if letter == item.letter
-        else _candidate_facts(letter, scene, item.target_frame, candidate, scene_of)
-        for letter, candidate in zip(LETTERS, item.candidates, strict=True)
-    )
+    shown = {
+        letter: (scene if c.scene_id == scene.scene_id else scene_of(c.scene_id), c.frame)
+        for letter, c in zip(LETTERS, item.candidates, strict=True)
+    }
     cut = find_cut(scene, item.prefix_start, item.prefix_stop)
-    observed, paths, views = _describe_views(item, facts.objects, scene, scene_of, cut)
+    earlier = Places.from_frame(scene, cut)
+    views = tuple(
+        _describe_view(letter, facts.objects, scene, cut, earlier, other, frame)
+        for letter, (other, frame) in shown.items()
+    )
+    at_target = views[item.answer].places.image
+    both = sorted(earlier.image.keys() & at_target.keys())
     order = np.argsort(scene.image_positions[cut, :, 0], kind="stable")
     return RelationalPredicates(
         **vars(facts),
-        candidates=candidates,
+        candidates=tuple(
+            CandidateFacts(letter, True, False, ())
+            if letter == item.letter
+            else _candidate_facts(letter, scene, item.target_frame, other, frame)
+            for letter, (other, frame) in shown.items()
+        ),
         left_to_right=tuple(scene.objects[k].noun_phrase for k in order),
-        paths=paths,
-        observed=observed,
+        paths={name: dist(earlier.image[name], at_target[name]) for name in both},
+        observed=tuple(sorted(find_relations(earlier))),
         views=views,
     )
 
@@ -130,37 +138,30 @@ def name_moment(item: SelectionItem) -> str:
     )
 
 
-def _describe_views(
-    item: SelectionItem,
+def _describe_view(
+    letter: str,
     seen: Sequence[ObjectFacts],
     scene: Scene,
-    scene_of: Callable[[str], Scene],
     cut: int,
-) -> tuple[tuple[Relation, ...], dict[str, float], tuple[View, ...]]:
-    """Return the relations at the cut, the paths of the objects, and the views of the candidates.
+    earlier: Places,
+    other: Scene,
+    frame: int,
+) -> View:
+    """Return the view of a candidate, a frame of the scene `other`.
 
     Args:
-        seen: The facts of the scene's objects, with the item's target.
+        seen: The facts of the objects of `scene`, with the item's target.
+        earlier: The places at the cut.
     """
-    earlier = Places.from_frame(scene, cut)
-    views = []
-    for letter, candidate in zip(LETTERS, item.candidates, strict=True):
-        other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
-        index = {key: k for k, key in enumerate(other.object_keys)}
-        objects = tuple(
-            replace(o, **_target_fields(scene, k, cut, other, index.get(key), candidate.frame))
-            for k, (o, key) in enumerate(zip(seen, scene.object_keys, strict=True))
-        )
-        later = Places.from_frame(other, candidate.frame)
-        at_rest = {o.object for o in objects if o.extent == "stays"}
-        relations = find_relations(later)
-        relations |= find_changes(earlier, later, at_rest)
-        close = close_pairs(other, candidate.frame)
-        views.append(View(letter, objects, close, tuple(sorted(relations)), later))
-    at_target = views[item.answer].places.image
-    both = earlier.image.keys() & at_target.keys()
-    paths = {name: dist(earlier.image[name], at_target[name]) for name in sorted(both)}
-    return tuple(sorted(find_relations(earlier))), paths, tuple(views)
+    index = {key: k for k, key in enumerate(other.object_keys)}
+    objects = tuple(
+        replace(o, **_target_fields(scene, k, cut, other, index.get(key), frame))
+        for k, (o, key) in enumerate(zip(seen, scene.object_keys, strict=True))
+    )
+    later = Places.from_frame(other, frame)
+    at_rest = {o.object for o in objects if o.extent == "stays"}
+    relations = find_relations(later) | find_changes(earlier, later, at_rest)
+    return View(letter, objects, close_pairs(other, frame), tuple(sorted(relations)), later)
 
 
 def _cut_fields(scene: Scene, index: int, cut: int) -> dict[str, str | None]:
@@ -214,14 +215,8 @@ def _target_fields(
 
 
 def _candidate_facts(
-    letter: str,
-    scene: Scene,
-    target: int,
-    candidate: Candidate,
-    scene_of: Callable[[str], Scene],
+    letter: str, scene: Scene, target: int, other: Scene, frame: int
 ) -> CandidateFacts:
-    other = scene if candidate.scene_id == scene.scene_id else scene_of(candidate.scene_id)
-    frame = candidate.frame
     in_target, in_candidate = (
         {key: k for k, key in enumerate(s.object_keys)} for s in (scene, other)
     )
