@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from jsonschema import Draft202012Validator
@@ -129,16 +129,7 @@ def _fill(sentence: Mapping[str, Any], facts: Mapping[str, str]) -> str:
     if len(literals) != len(cited) + 1:
         raise CitationError(f"{len(literals) - 1} slots for {len(cited)} facts")
     for literal in literals:
-        if stated := next(_find_statements(literal), None):
-            raise CitationError(f"only connecting words may stand outside slots: {stated!r}")
-    filled = literals[0]
-    for fact, literal in zip(cited, literals[1:], strict=True):
-        filled += facts[fact] + literal
-    return filled
-
-
-def _find_statements(literal: str) -> Iterator[str]:
-    """Yield the words and other characters around slots that may not stand there."""
-    words = re.findall(r"\w+", literal)
-    yield from (word for word in words if word.lower() not in CONNECTIVES)
-    yield from re.findall(r"[^\w ,;:-]", literal)
+        words = (w for w in re.findall(r"\w+", literal) if w.lower() not in CONNECTIVES)
+        if stated := [*words, *re.findall(r"[^\w ,;:-]", literal)]:
+            raise CitationError(f"only connecting words may stand outside slots: {stated[0]!r}")
+    return text.format(*(facts[fact] for fact in cited))

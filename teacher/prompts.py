@@ -36,27 +36,20 @@ def build_messages(
 ) -> list[dict[str, str]]:
     """Return the chat messages that request an item's rationale."""
     if cfg.form == "cited":
-        return _build_cited_messages(predicates, item, cfg)
-    relational = RELATIONAL if isinstance(predicates, RelationalPredicates) else ""
-    system = SYSTEM.format(
-        sections=", ".join(SECTIONS), low=cfg.min_words, high=cfg.max_words, relations=relational
-    )
-    facts = json.dumps(format_facts(predicates), separators=(",", ":"))
-    user = f"Question: {item.question}\nFacts: {facts}\nAnswer to reach: {item.letter}"
-    return [{"role": "system", "content": system}, {"role": "user", "content": user}]
-
-
-def _build_cited_messages(
-    predicates: Predicates, item: SelectionItem, cfg: TeacherConfig
-) -> list[dict[str, str]]:
-    system = CITED.format(
+        system = CITED
+        clauses = list_facts(predicates, item).items()
+        facts = "\n" + "\n".join(f"{key}: {clause}" for key, clause in clauses)
+    else:
+        system = SYSTEM
+        facts = " " + json.dumps(format_facts(predicates), separators=(",", ":"))
+    system = system.format(
         sections=", ".join(SECTIONS),
         low=cfg.min_words,
         high=cfg.max_words,
+        relations=RELATIONAL if isinstance(predicates, RelationalPredicates) else "",
         connectives=", ".join(sorted(CONNECTIVES)),
     )
-    facts = "\n".join(f"{key}: {clause}" for key, clause in list_facts(predicates, item).items())
-    user = f"Question: {item.question}\nFacts:\n{facts}\nAnswer to reach: {item.letter}"
+    user = f"Question: {item.question}\nFacts:{facts}\nAnswer to reach: {item.letter}"
     return [{"role": "system", "content": system}, {"role": "user", "content": user}]
 
 

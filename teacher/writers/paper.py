@@ -184,14 +184,18 @@ class Writer:
         return self.say(statement, o=o, toward=toward_phrase(o.travel))
 
     def prediction(self) -> list[str]:
-        close = self.facts.close[: self.detail.pairs]
-        parts = [f"{name_pair(c.objects)} will be very close {c.region}" for c in close]
-        key_first = sorted(self.ranked, key=lambda o: o is not self.key)
-        parts += [self.expected(o) for o in key_first[: self.detail.predicted]]
+        parts = self.predicted()
         parts[0] = f"{self.facts.moment}, {parts[0]}"
         if self.padded:
             parts.append("the layout at the target moment follows from these motions")
         return parts
+
+    def predicted(self) -> list[str]:
+        """Return what is said of the target moment; one clause at least."""
+        close = self.facts.close[: self.detail.pairs]
+        parts = [f"{name_pair(c.objects)} will be very close {c.region}" for c in close]
+        key_first = sorted(self.ranked, key=lambda o: o is not self.key)
+        return parts + [self.expected(o) for o in key_first[: self.detail.predicted]]
 
     def expected(self, o: ObjectFacts) -> str:
         if o.target_sight != "shown":

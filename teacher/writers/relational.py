@@ -225,16 +225,12 @@ class RelationalWriter(Writer):
             parts.append(f"the {change.objects[0]} {self.place(change)}")
         return parts
 
-    def prediction(self) -> list[str]:
+    def predicted(self) -> list[str]:
         parts = [self.statement(s, "will be") for s in self.statements]
         stated = {s.objects[0] for s in self.statements if s.kind in ("region", "sight")}
         places = [self.expected(o) for o in self.ranked if o.object not in stated]
         parts += places[: max(self.detail.predicted - len(stated), 0)]
-        parts = parts or places[:1]
-        parts[0] = f"{self.facts.moment}, {parts[0]}"
-        if self.padded:
-            parts.append("the layout at the target moment follows from these motions")
-        return parts
+        return parts or places[:1]
 
     def judgement(self, candidate: CandidateFacts) -> str:
         if not self.statements:
