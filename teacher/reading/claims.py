@@ -190,8 +190,9 @@ class IndexedPredicates:
         if claim.kind == "displaced" and claim.value in ("", *EXTENTS):
             extent = self._find_extent(letter, name)
             if extent is not None:
-                return not claim.value or _has_extent(extent, claim.value)
-        return SHOWN_CHECKS[claim.kind](self.objects.get(name), differences.get(name), claim.value)
+                # An object that is far off is also clearly off.
+                return claim.value in ("", extent) or (claim.value, extent) == ("clearly", "far")
+        return _shown(claim, self.objects.get(name), differences.get(name))
 
     def _find_extent(self, letter: str, name: str) -> str | None:
         """Return how far from its place at the target a candidate shows an object, in words; None
@@ -379,44 +380,28 @@ PAIR_CHECKS: dict[str, Callable[[IndexedPredicates, Claim], bool | None]] = {
 """The check of each kind of claim about a pair."""
 
 
-def _shown_region(
-    facts: ObjectFacts | None, difference: Difference | None, value: str
-) -> bool | None:
-    if difference is None or difference.kind == "displaced":
-        return None if facts is None else _same(value, facts.target_region)
-    if difference.kind == "region":
-        return _same(value, difference.region)
-    return None if difference.kind == "extra" else False
+def _shown(claim: Claim, facts: ObjectFacts | None, difference: Difference | None) -> bool | None:
+    """Return whether a claim about an object in a candidate holds.
 
-
-def _lacks(facts: ObjectFacts | None, difference: Difference | None, value: str) -> bool | None:
-    if facts is None:
-        return None
-    return facts.target_sight != "shown" if difference is None else difference.kind == "missing"
-
-
-def _extra(facts: ObjectFacts | None, difference: Difference | None, value: str) -> bool | None:
-    return difference is not None and difference.kind == "extra"
-
-
-def _has_extent(extent: str, value: str) -> bool:
-    """Return whether a word for a distance describes an extent. An object that is far off is
-    clearly off."""
-    return value == extent or (value == "clearly" and extent == "far")
-
-
-def _displaced(facts: ObjectFacts | None, difference: Difference | None, value: str) -> bool | None:
-    if difference is None or difference.kind == "missing":
+    Args:
+        facts: The object in the scene, if it is there.
+        difference: How the candidate shows it differently from the target, if it does.
+    """
+    kind = None if difference is None else difference.kind
+    if claim.kind == "extra":
+        return kind == "extra"
+    if claim.kind == "lacks":
+        if facts is None:
+            return None
+        return facts.target_sight != "shown" if kind is None else kind == "missing"
+    if claim.kind == "region":
+        if kind in (None, "displaced"):
+            return None if facts is None else _same(claim.value, facts.target_region)
+        if kind == "region":
+            return _same(claim.value, difference.region)
+        return None if kind == "extra" else False
+    if kind in (None, "missing"):
         return False
-    if difference.kind != "displaced":
+    if kind != "displaced":
         return None
-    return True if not value else _same(value, difference.heading)
-
-
-SHOWN_CHECKS: dict[str, Callable[[ObjectFacts | None, Difference | None, str], bool | None]] = {
-    "region": _shown_region,
-    "lacks": _lacks,
-    "extra": _extra,
-    "displaced": _displaced,
-}
-"""For each kind of claim about an object in a candidate, the check of its value."""
+    return _same(claim.value, difference.heading) if claim.value else True
