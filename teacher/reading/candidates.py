@@ -4,13 +4,14 @@ displace, and which candidate agrees with the target."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 from dynapix.data.records import LETTERS
 from dynapix.teacher.predicates.relations import KINDS
 from dynapix.teacher.reading.claims import EITHER, TARGET, Claim, IndexedPredicates
 from dynapix.teacher.reading.reader import SEPARATORS, VERBS, Reader, UnreadableError
 from dynapix.teacher.reading.scenes import SceneReader
-from dynapix.teacher.reading.tagging import RelationPhrase, Tag
+from dynapix.teacher.reading.tagging import Tag
 
 CHOOSING = {
     *("agree", "be", "visible", "which", "with", "expected", "future", "show", "break", "comma"),
@@ -68,15 +69,15 @@ class CandidateReader(Reader):
                 return
         elif first.name == "other_candidates":
             self.at += 1
-            named = {str(tag.value) for tag in self.tags if tag.name == "candidate"}
+            named = {tag.value for tag in self.tags if tag.name == "candidate"}
             self._begin_topic([letter for letter in LETTERS if letter not in named])
         elif first.name == "pronoun" and first.value == "it":
             self.at += 1
         elif first.name == "agree" and not self.letters:
             self._read_choice()
             return
-        elif self._find_trailing() is not None:
-            self._begin_topic(self._find_trailing() or [])
+        elif trailing := self._find_trailing():
+            self._begin_topic(trailing)
         elif not self.letters:
             self._read_scene_clauses()
             return
@@ -88,26 +89,23 @@ class CandidateReader(Reader):
         self.letters, self.objects, self.adding = letters, [], False
 
     def _read_letters(self) -> list[str]:
-        letters = [str(self.peek().value)]
-        self.at += 1
-        while True:
-            start = self.at
+        letters = []
+        while tag := self.take("candidate"):
+            letters.append(tag.value)
+            end = self.at
             self.skip({"comma", "and"})
-            if self.peek().name != "candidate":
-                self.at = start
-                return letters
-            letters.append(str(self.peek().value))
-            self.at += 1
+        self.at = end
+        return letters
 
-    def _find_trailing(self) -> list[str] | None:
-        """Return the candidate of a clause such as "the red cube is missing from candidate A"."""
-        for index in range(self.at, self.stop):
-            if self.tags[index].name in ("stop", "semicolon", "break", "comma", "agree"):
+    def _find_trailing(self) -> list[str]:
+        """Return the candidate of a clause such as "the red cube is missing from candidate A", if
+        it has one."""
+        for before, tag in pairwise(self.tags[self.at : self.stop]):
+            if {before.name, tag.name} & {"stop", "semicolon", "break", "comma", "agree"}:
                 break
-            if self.tags[index].name == "candidate":
-                placing = index > self.at and self.tags[index - 1].words in PLACING
-                return [str(self.tags[index].value)] if placing else None
-        return None
+            if tag.name == "candidate":
+                return [tag.value] if before.words in PLACING else []
+        return []
 
     def _read_choice(self) -> None:
         """Read "this layout is that of candidate B"."""
@@ -125,9 +123,8 @@ class CandidateReader(Reader):
         ends = [k for k in range(self.at, min(named, default=0)) if self.tags[k].name in SEPARATORS]
         if self.keeps_topic or not ends:
             raise UnreadableError
-        claims = SceneReader(self.predicates, TARGET, self.known).read(
-            self.tags[self.at : ends[-1]]
-        )
+        scene = SceneReader(self.predicates, TARGET, self.known)
+        claims = scene.read(self.tags[self.at : ends[-1]])
         if any(claim.kind == "unreadable" for claim in claims):
             raise UnreadableError
         self.claims += [claim for claim in claims if claim.kind != "mention"]
@@ -177,48 +174,40 @@ class CandidateReader(Reader):
                 self.objects = []
             self.denied, self.lacking = False, True
             return
-        self.objects = self.read_list() if self.peek(-1).name != "and" else self.read_noun()
+        self.objects = self.read_noun() if self.peek(-1).name == "and" else self.read_list()
         self.unplaced = tag
         if self.adding:
             self.show("extra", "", tag)
 
-    def on_still_noun(self, tag: Tag) -> None:
-        raise UnreadableError
-
     def on_region(self, tag: Tag) -> None:
         if self.denied and self.unplaced is not None:
             # "In candidate A, the cube is not near the top."
-            self.show("region", str(tag.value), tag)
+            self.show("region", tag.value, tag)
         elif self.denied or self.contrasted or self.expected:
             # "Shows the cube near the left, not near the top": it should be near the top.
             if not self.objects or (self.denied and self.expected):
                 raise UnreadableError
-            self.expect("region", str(tag.value), tag)
+            self.expect("region", tag.value, tag)
         else:
-            self.show("region", str(tag.value), tag)
+            self.show("region", tag.value, tag)
             if self.correct:
-                self.expect("region", str(tag.value), tag)
+                self.expect("region", tag.value, tag)
 
     on_into = on_region
 
     def on_relation(self, tag: Tag) -> None:
-        phrase = tag.value
-        assert isinstance(phrase, RelationPhrase)
-        partners, kind = self.find_partners(tag), KINDS[phrase.value]
+        partners, value = self.find_partners(tag), tag.value.value
         if self.expected and not self.denied:
-            self.expect(kind, phrase.value, tag, partners)
+            self.expect(KINDS[value], value, tag, partners)
         else:
             self.denied |= self.contrasted
-            self.show(kind, phrase.value, tag, partners)
+            self.show(KINDS[value], value, tag, partners)
 
     def on_meet(self, tag: Tag) -> None:
         if tag.words not in TOUCHING or len(self.objects) != 1:
             raise UnreadableError
         self.take("with")
-        objects = self.objects
-        partners = self.read_noun()
-        self.objects = objects
-        self.show("gap", "against", tag, partners)
+        self.show("gap", "against", tag, self.read_noun())
 
     def on_with(self, tag: Tag) -> None:
         if self.peek().name == "other_objects":
@@ -264,7 +253,7 @@ class CandidateReader(Reader):
     def on_direction(self, tag: Tag) -> None:
         if not any(c.kind == "displaced" for c in self.claims):
             raise UnreadableError
-        self.show("displaced", str(tag.value), tag)
+        self.show("displaced", tag.value, tag)
 
     def on_lack(self, tag: Tag) -> None:
         if self.denied:

@@ -24,11 +24,13 @@ from dynapix.teacher.predicates.relations import (
     describe_distance,
     normalize_relation,
 )
-from dynapix.teacher.reading.phrases import COARSE
 
 CUT, BETWEEN, TARGET, EITHER = "cut", "between", "target", "either"
 """The moment of a claim: the cut (the last frame that the predicates treat as observed), the time
 from the cut to the target, the target, or, if the text leaves it open, the cut or the target."""
+COARSE = "~"
+"""Prefix of a value that the text states only roughly. "Leftward" has the value "~west": true for
+west, unknown for northwest and southwest, and false for the other directions."""
 JOINT = " or "
 """Between the names of the objects of which the text may mean any."""
 VERDICTS = ("supported", "contradicted", "unknown")

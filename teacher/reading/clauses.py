@@ -8,10 +8,10 @@ from itertools import product
 
 from dynapix.teacher.predicates.facts import OUT_OF_VIEW
 from dynapix.teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
-from dynapix.teacher.reading.reader import SEPARATORS, Reader, UnreadableError
-from dynapix.teacher.reading.tagging import END, Tag
+from dynapix.teacher.reading.reader import ENDS, SEPARATORS, Reader, UnreadableError
+from dynapix.teacher.reading.tagging import Tag
 
-NOUN_STARTS = {"object", "both", "pronoun", "unnamed", "all", "none", "paths", "other_objects"}
+SUBJECT_STARTS = {"object", "both", "pronoun", "unnamed", "all", "none", "paths", "other_objects"}
 """Tags that may begin a subject."""
 FRONTED = {
     *("region", "from", "direction", "speed", "still", "moving", "out", "hidden", "be", "slight"),
@@ -74,9 +74,9 @@ class ClauseReader(Reader):
         """Whether nothing was said of the last subject; whether an earlier clause had a verb."""
         while True:
             separators = self.skip(SEPARATORS)
-            if self.peek() is END or self.peek().name == "stop":
+            if self.peek().name == "stop":
                 break
-            self.read_clause(separators)
+            self._read_clause(separators)
         if self.is_bare or self.clause is None:
             raise UnreadableError
 
@@ -85,14 +85,14 @@ class ClauseReader(Reader):
 
     # Subjects.
 
-    def read_clause(self, separators: Sequence[str] = ()) -> None:
+    def _read_clause(self, separators: Sequence[str]) -> None:
         self._read_opening()
         is_there = self._read_there()
         if self.take("between"):
             self.frame = self.read_list()
             return
-        if self.peek().name == "which":
-            self.on_which(self.peek())
+        if which := self.take("which"):
+            self.on_which(which)
             self.is_bare = False
             return
         is_struck = self.peek().words.startswith(OPENING)
@@ -102,7 +102,7 @@ class ClauseReader(Reader):
 
     def _read_opening(self) -> None:
         """Read "at the target moment," or "soon,"."""
-        follows = self.peek(1).name in NOUN_STARTS | {"comma", "contact"}
+        follows = self.peek(1).name in SUBJECT_STARTS | {"comma", "contact"}
         if follows and (tag := self.take("future", "time", "past", "expected")):
             self.take("comma")
             self.opening = tag
@@ -131,9 +131,9 @@ class ClauseReader(Reader):
         elif tag.words == "with":
             self.at += 1
             self.begin(self.read_subject())
-        elif self._is_fronted(separators, nominal=is_there):
-            self._read_fronted()
-        elif tag.name in NOUN_STARTS or tag.words == "neither":
+        elif self._read_fronted(separators, nominal=is_there):
+            return
+        elif tag.name in SUBJECT_STARTS or tag.words == "neither":
             if self.clause is None and tag.name == "pronoun" and "break" in separators:
                 # "As it moves west, the cube leaves": "it" is the cube.
                 raise UnreadableError
@@ -178,7 +178,7 @@ class ClauseReader(Reader):
             self.take("with", "between")
             return Clause(self.read_list())
         if tag.name in ("pronoun", "both"):
-            return Clause(self._find_antecedents(str(tag.value)))
+            return Clause(self._find_antecedents(tag.value))
         if tag.name == "none":
             return Clause([], "none")
         if tag.name != "all":
@@ -198,31 +198,26 @@ class ClauseReader(Reader):
             raise UnreadableError
         return last.subjects
 
-    def _is_fronted(self, separators: Sequence[str], nominal: bool) -> bool:
-        """Return whether the next words precede their subject, also as in "there is a slight shift
-        of the cube" if `nominal` is true."""
-        end = self.at
-        while end < self.stop and self.tags[end].name in FRONTED | (
-            {"moves"} if nominal else set()
-        ):
-            end += 1
-        end += nominal and end < self.stop and self.tags[end].words == "of"
-        direct = end < self.stop and self.tags[end].name in NOUN_STARTS
-        comma = self.tags[end : end + 1] and self.tags[end].name == "comma"
-        late = comma and self.tags[end + 1 : end + 2] and self.tags[end + 1].name in NOUN_STARTS
-        first = self.clause is None or (separators and separators[-1] in ("break", "semicolon"))
-        return end > self.at and bool(direct or (late and first))
-
-    def _read_fronted(self) -> None:
+    def _read_fronted(self, separators: Sequence[str], nominal: bool) -> bool:
+        """Read words that precede their subject, also as in "there is a slight shift of the cube"
+        if `nominal` is true, and the subject. Return False, without moving on, if there are none.
+        """
         start = self.at
-        self.skip(FRONTED | {"moves"})
+        self.skip(FRONTED | {"moves"} if nominal else FRONTED)
         end = self.at
-        self.take("comma", "with")
+        if nominal and self.peek().words == "of":
+            self.at += 1
+        elif end > start and (self.clause is None or separators[-1:] in (["break"], ["semicolon"])):
+            self.take("comma")
+        if self.at == start or self.peek().name not in SUBJECT_STARTS:
+            self.at = start
+            return False
         self.begin(self.read_subject())
         resume, last = self.at, self.stop
         self.at, self.stop = start, end
         self._read_predicate()
         self.at, self.stop = resume, last
+        return True
 
     def _read_contact(self) -> None:
         """Read "the contact between the cube and the sphere" as a subject."""
@@ -231,22 +226,22 @@ class ClauseReader(Reader):
         self.begin(Clause([], "contact"))
         if self.take("between", "with", "links"):
             kind = "course" if tag.name == "course" else "meeting"
-            self._add_event(kind, tag, self.read_list(), [], tag.name != "no_contact")
+            self.add_event(kind, tag, self.read_list(), [], tag.name != "no_contact")
         elif tag.name != "contact":
             raise UnreadableError
         elif last is not None and (last.pairs or len(last.subjects) == 2):
             # "They are on a collision course, and contact is imminent."
-            self._add_event("meeting", tag, [*(last.pairs or [last.subjects])[0]], [])
+            self.add_event("meeting", tag, [*(last.pairs or [last.subjects])[0]], [])
 
     # Predicates.
 
     def _read_predicate(self) -> int:
         """Read what the clause says of its subject, and return the number of tags."""
         count = self.read_tags()
-        self._end_predicate()
+        self.end_predicate()
         return count
 
-    def _end_predicate(self) -> None:
+    def end_predicate(self) -> None:
         clause = self.clause
         if clause.slight is not None:
             if not clause.moving:
@@ -302,7 +297,6 @@ class ClauseReader(Reader):
 
     def on_which(self, tag: Tag) -> None:
         """Read a relative clause about the object before it."""
-        self.take("which")
         outer, names = self.clause, self.last_nouns
         if len(names) > 1 and self.peek().words not in ("are", "both"):
             names = []
@@ -311,13 +305,13 @@ class ClauseReader(Reader):
             raise UnreadableError
         self.clause = Clause([*names])
         start, count = self.at, len(self.claims)
-        while self.peek().name not in SEPARATORS | {"stop"} or self._continues():
+        while self.peek().name not in ENDS or self._continues():
             verbs = self.clause.has_verb and self.at > start + 1
             if verbs and self.peek().name in FINITE and self.peek(-1).name not in FINITE | {"not"}:
                 break
             self.take("and")
             self.read_tag()
-        self._end_predicate()
+        self.end_predicate()
         if len(self.claims) == count:
             raise UnreadableError
         self.clause = outer
@@ -325,14 +319,18 @@ class ClauseReader(Reader):
     def _continues(self) -> bool:
         """Return whether "and" continues a relative clause, as in "which stops and rests"."""
         return self.peek().name == "and" and self.peek(1).name not in {
-            *(*NOUN_STARTS, *SEPARATORS, "region", "from"),
+            *(*SUBJECT_STARTS, *SEPARATORS, "region", "from"),
         }
+
+    def read_partners(self, *starts: str) -> list[str]:
+        """Return the objects after a verb if a tag with one of these names follows, else none."""
+        return self.read_list(True) if self.peek().name in starts else []
 
     def on_struck(self, tag: Tag) -> None:
         partners = self.read_list(True) if self.take("with") else []
-        self._add_event("meeting", tag, self.clause.subjects, partners, alone=not partners)
+        self.add_event("meeting", tag, self.clause.subjects, partners, alone=not partners)
 
-    def _add_event(
+    def add_event(
         self,
         kind: str,
         tag: Tag,
@@ -366,6 +364,6 @@ class ClauseReader(Reader):
         for pair in pairs:
             self.add(kind, pair, value, affirmed, when, tag)
             if clause.time and affirmed and kind == "meeting":
-                self.add("time", pair, str(clause.time.value), True, BETWEEN, clause.time)
+                self.add("time", pair, clause.time.value, True, BETWEEN, clause.time)
         clause.event, clause.pairs = kind, pairs if affirmed else []
         clause.has_complement = bool(partners)

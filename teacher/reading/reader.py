@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Container, Sequence
+from itertools import pairwise
 
 from dynapix.teacher.reading.claims import CUT, EITHER, JOINT, Claim, IndexedPredicates
-from dynapix.teacher.reading.tagging import END, Noun, RelationPhrase, Tag
+from dynapix.teacher.reading.tagging import END, Noun, Tag
 
 SEPARATORS = {"comma", "semicolon", "and", "break", "moment"}
 """Tags that may lie between clauses."""
+ENDS = SEPARATORS | {"stop"}
+"""Tags that end a clause."""
 VERBS = {
     *("be", "moves", "stays", "future", "expected", "still", "show", "across", "leaves", "enters"),
     *("past", "meet", "not", "in_place"),
@@ -95,21 +98,21 @@ class Reader:
             self.at += 1
         return [tag.name for tag in self.tags[start : self.at]]
 
+    def read_tags(self) -> int:
+        """Read the tags up to the next separator or stop, and return their number."""
+        start = self.at
+        while self.peek().name not in ENDS:
+            self.read_tag()
+        return self.at - start
+
     def read_tag(self) -> None:
-        """Call the method of the current tag, and move on."""
+        """Move on, and call the method of the tag."""
         tag = self.peek()
+        self.at += 1
         handler = getattr(self, f"on_{tag.name}", None)
         if handler is None:
             raise UnreadableError
-        self.at += 1
         handler(tag)
-
-    def read_tags(self, ends: Container[str] = SEPARATORS) -> int:
-        """Read the tags up to one of `ends`, and return the number of these tags."""
-        start = self.at
-        while self.peek().name not in ends and self.peek().name != "stop":
-            self.read_tag()
-        return self.at - start
 
     def add(
         self,
@@ -134,7 +137,7 @@ class Reader:
     def _find_mentions(self) -> list[Claim]:
         """Return a claim for each object that the sentence names: that it exists."""
         found: list[Claim] = []
-        for previous, tag in zip((END, *self.tags), self.tags, strict=False):
+        for previous, tag in pairwise((END, *self.tags)):
             if not isinstance(noun := tag.value, Noun):
                 continue
             fitting, span = self.find_fitting(noun), (tag.start, tag.stop)
@@ -172,7 +175,7 @@ class Reader:
     def read_noun(self) -> list[str]:
         """Return the objects of the noun phrase at the current tag, and move on."""
         tag = self.take("object")
-        if tag is None or not isinstance(tag.value, Noun):
+        if tag is None:
             raise UnreadableError
         self.last_nouns = self.find_objects(tag.value)
         if tag.value.still:
@@ -192,36 +195,33 @@ class Reader:
                 no part of it: "hits the red cube, and the sphere stays".
         """
         self.take("both")
-        ends, index, complete = [self.at], self.at + 1, False
+        places, complete = [self.at], False
         while not complete:
-            separators = []
-            while self.tags[index : index + 1] and self.tags[index].name in ("comma", "and"):
-                separators.append(self.tags[index].name)
-                index += 1
-            if is_complement and "and" in separators and self.tags[index : index + 1]:
+            self.at = places[-1] + 1
+            separators = self.skip({"comma", "and"})
+            last = "and" in separators
+            if is_complement and last and self.peek().words in ("to", "with"):
                 # "Close to the cube and to the sphere."
-                index += self.tags[index].words in ("to", "with")
-            tag = self.tags[index] if index < self.stop else END
-            if tag.name != "object" or separators not in (["comma"], ["and"], ["comma", "and"]):
+                self.at += 1
+            is_joined = separators in (["comma"], ["and"], ["comma", "and"])
+            if self.peek().name != "object" or not is_joined:
                 break
-            ends.append(index)
-            complete = "and" in separators
-            index += 1
-        if is_complement and complete and (index < self.stop and self.tags[index].name in VERBS):
-            complete, ends = False, ends[:1]
+            places.append(self.at)
+            complete = last
+        if is_complement and self.peek(1).name in VERBS:
+            complete = False
         names: list[str] = []
-        for end in ends if complete else ends[:1]:
-            self.at = end
+        for place in places if complete else places[:1]:
+            self.at = place
             names += self.read_noun()
         self.last_nouns = names
         return names
 
     def find_partners(self, tag: Tag) -> list[str]:
         """Return the other objects of a relation."""
-        assert isinstance(tag.value, RelationPhrase)
         if None in tag.value.nouns:
             raise UnreadableError
-        return [name for noun in tag.value.nouns if noun for name in self.find_objects(noun)]
+        return [name for noun in tag.value.nouns for name in self.find_objects(noun)]
 
     def read_possession(self, owner: Sequence[str]) -> tuple[list[str], Tag] | None:
         """Read "the sphere left of it" after "the cube has" or "with", and return the objects of
@@ -247,7 +247,7 @@ def _leave_out_fillers(tags: Sequence[Tag]) -> list[Tag]:
     kept: list[Tag] = []
     for tag, following in zip(tags, (*tags[1:], END), strict=True):
         if tag.name == "word" and tag.words == "still":
-            if following.name in SEPARATORS | {"stop"}:
+            if following.name in ENDS:
                 kept.append(tag._replace(name="still"))
         elif tag.name != "filler" and (tag.name, following.name) != ("with", "direction"):
             kept.append(tag)

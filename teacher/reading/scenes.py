@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from dynapix.teacher.predicates.facts import COMPASS
+from dynapix.teacher.predicates.facts import COMPASS, OUT_OF_VIEW
 from dynapix.teacher.predicates.relations import CHANGES, KINDS
-from dynapix.teacher.reading.claims import BETWEEN, CUT, EITHER, TARGET
+from dynapix.teacher.reading.claims import BETWEEN, COARSE, CUT, EITHER, TARGET
 from dynapix.teacher.reading.clauses import ClauseReader
-from dynapix.teacher.reading.phrases import COARSE
-from dynapix.teacher.reading.reader import SEPARATORS, UnreadableError
-from dynapix.teacher.reading.tagging import (
-    COLOR_WORDS,
-    COLUMNS,
-    MATERIAL_WORDS,
-    ROWS,
-    Noun,
-    RelationPhrase,
-    Tag,
-)
+from dynapix.teacher.reading.reader import ENDS, UnreadableError
+from dynapix.teacher.reading.tagging import COLOR_WORDS, MATERIAL_WORDS, Tag
 
 STILL_VERBS = {
-    *("is", "was", "does", "has", "do", "did", "are", "have", "shows", "show", "keep", "keeps"),
-    *("rests", "rest", "stands", "stand", "sits", "sit", "lies", "lie"),
-    *("stays", "stay", "remains", "remain"),
+    *("is", "are", "was", "do", "does", "did", "have", "has", "show", "shows", "keep", "keeps"),
+    *("rest", "rests", "stand", "stands", "sit", "sits", "lie", "lies"),
+    *("stay", "stays", "remain", "remains"),
 }
 """First words of the phrases of the tag "still" that contain a verb."""
 OF_MATERIAL = ("of", "in", "made of", "made from")
@@ -30,6 +21,8 @@ AFTER_HAVE = {
     *("enters", "leaves"),
 }
 """Tags after "has" where it is an auxiliary."""
+OF_MOTION = {"from", "into", "speed", "direction"}
+"""Tags after "comes" where it is a verb of motion."""
 SIDES = {"left": "west", "right": "east", "top": "north", "bottom": "south"}
 
 
@@ -66,26 +59,25 @@ class SceneReader(ClauseReader):
         if clause.event == "close":
             self._add_close_region(tag)
         elif clause.kind == "contact":
-            self.add("close region", [], str(tag.value), True, self.moment, tag)
+            self.add("close region", [], tag.value, True, self.moment, tag)
         elif clause.event and self.peek(-2).name == "object":
             # "Meets the red cube near the top": the place of either.
             raise UnreadableError
         else:
-            self.state("region", str(tag.value), self.when, tag)
+            self.state("region", tag.value, self.when, tag)
 
     def on_into(self, tag: Tag) -> None:
         side = tag.last_word
         if not self.clause.moving:
-            value = tag.value if side not in SIDES else f"{COARSE}{str(tag.value).lstrip(COARSE)}"
-            self.state("region", str(value), self.when, tag)
-        elif side in SIDES and "near" not in tag.words and "-" not in str(tag.value):
+            value = COARSE + tag.value.lstrip(COARSE) if side in SIDES else tag.value
+            self.state("region", value, self.when, tag)
+        elif side in SIDES and "near" not in tag.words and "-" not in tag.value:
             self._add_direction(COARSE + SIDES[side], tag)
         else:
-            self.state("region", str(tag.value), TARGET, tag)
+            self.state("region", tag.value, TARGET, tag)
 
     def on_toward(self, tag: Tag) -> None:
-        words = str(tag.value).replace("-", " ").split()
-        heading = "".join(SIDES.get(word, "") for word in words if word in {*ROWS, *COLUMNS})
+        heading = "".join(SIDES.get(word, "") for word in tag.value.replace("-", " ").split())
         if heading not in COMPASS:
             raise UnreadableError
         self._add_direction(COARSE + heading, tag)
@@ -93,17 +85,14 @@ class SceneReader(ClauseReader):
     def on_from(self, tag: Tag) -> None:
         if self.clause.negated:
             raise UnreadableError
-        self.state("region", str(tag.value), CUT, tag)
+        self.state("region", tag.value, CUT, tag)
 
     def on_relation(self, tag: Tag) -> None:
-        phrase = tag.value
-        assert isinstance(phrase, RelationPhrase)
-        if phrase.value == "passes" and self.peek().name == "no_contact":
-            denial = self.take("no_contact")
-            self._add_event("meeting", denial, self.clause.subjects, self.find_partners(tag), False)
+        value, partners = tag.value.value, self.find_partners(tag)
+        if value == "passes" and (denial := self.take("no_contact")):
+            self.add_event("meeting", denial, self.clause.subjects, partners, False)
             return
-        partners, kind = self.find_partners(tag), KINDS[phrase.value]
-        self.last_nouns = partners
+        kind, self.last_nouns = KINDS[value], partners
         if kind in CHANGES:
             self.verb(tag._replace(name="moves"))
         if self.clause.kind != "objects":
@@ -111,8 +100,7 @@ class SceneReader(ClauseReader):
         when = BETWEEN if kind in CHANGES else self.when
         self.clause.has_complement = True
         for name in self.clause.subjects:
-            affirmed = not self.clause.negated
-            self.add(kind, [name, *partners], phrase.value, affirmed, when, tag)
+            self.add(kind, [name, *partners], value, not self.clause.negated, when, tag)
 
     def on_show(self, tag: Tag) -> None:
         if tag.last_word not in ("has", "have", "having"):
@@ -143,21 +131,21 @@ class SceneReader(ClauseReader):
         if possessed := self.read_possession(self.clause.subjects):
             self._add_possession(*possessed)
             return
-        self._end_predicate()
+        self.end_predicate()
         self.begin(self.read_subject())
 
     def on_word(self, tag: Tag) -> None:
         """Read the color or material in "is gray" and "of rubber"."""
-        if tag.words not in {**COLOR_WORDS, **MATERIAL_WORDS} or self.clause.negated:
+        look = (COLOR_WORDS | MATERIAL_WORDS).get(tag.words)
+        if look is None or self.clause.negated:
             raise UnreadableError
-        look = {**COLOR_WORDS, **MATERIAL_WORDS}[tag.words]
         for name in self.clause.subjects:
             named = name if look in name.split() else f"{look} {name}"
             self.add("mention", [named], "", True, CUT, tag)
         self.clause.said.add("mention")
 
     def on_direction(self, tag: Tag) -> None:
-        self._add_direction(str(tag.value), tag)
+        self._add_direction(tag.value, tag)
 
     def _add_direction(self, value: str, tag: Tag) -> None:
         clause = self.clause
@@ -169,12 +157,12 @@ class SceneReader(ClauseReader):
         self.state("direction", value, when, tag)
 
     def on_speed(self, tag: Tag) -> None:
-        self.state("speed", str(tag.value), CUT, tag)
+        self.state("speed", tag.value, CUT, tag)
 
     def on_moves(self, tag: Tag) -> None:
         self.verb(tag)
         self.clause.moving = True
-        if self.peek().name in SEPARATORS | {"stop"} and self.clause.slight is None:
+        if self.peek().name in ENDS and self.clause.slight is None:
             when = BETWEEN if self.clause.future else CUT if self.moment == CUT else EITHER
             self.state("still", "", when, tag, affirmed=False)
 
@@ -185,7 +173,7 @@ class SceneReader(ClauseReader):
     def on_still(self, tag: Tag) -> None:
         if tag.words.split()[0] in STILL_VERBS:
             self.verb(tag._replace(name="stays"))
-        if "not" in tag.words and self.peek().name not in {*SEPARATORS, "stop", "region"}:
+        if "not" in tag.words and self.peek().name not in ENDS | {"region"}:
             # "Does not move east."
             raise UnreadableError
         later = self.clause.staying or self.clause.future
@@ -193,10 +181,9 @@ class SceneReader(ClauseReader):
         self.state("still", "", when, tag)
 
     def on_still_noun(self, tag: Tag) -> None:
-        noun = tag.value
-        assert isinstance(noun, Noun)
+        when = CUT if self.moment == CUT else EITHER
         for name in self.last_nouns:
-            self.add("still", [name], "", True, CUT if self.moment == CUT else EITHER, tag)
+            self.add("still", [name], "", True, when, tag)
 
     def on_stays(self, tag: Tag) -> None:
         self.verb(tag)
@@ -204,7 +191,7 @@ class SceneReader(ClauseReader):
 
     def on_in_place(self, tag: Tag) -> None:
         self.verb(tag._replace(name="stays"))
-        if self.peek().name not in SEPARATORS | {"stop", "region"}:
+        if self.peek().name not in ENDS | {"region"}:
             # "Where it is close to the sphere."
             raise UnreadableError
         if self.moment == CUT and not self.clause.future:
@@ -231,13 +218,10 @@ class SceneReader(ClauseReader):
     on_enters = on_leaves
 
     def on_out(self, tag: Tag) -> None:
-        self.state("sight", "out of view", self.when, tag)
+        self.state("sight", OUT_OF_VIEW if tag.name == "out" else tag.name, self.when, tag)
 
-    def on_hidden(self, tag: Tag) -> None:
-        self.state("sight", "hidden", self.when, tag)
-
-    def on_unseen(self, tag: Tag) -> None:
-        self.state("sight", "unseen", self.when, tag)
+    on_hidden = on_out
+    on_unseen = on_out
 
     def on_visible(self, tag: Tag) -> None:
         self.state("sight", "unseen", self.when, tag, affirmed=False)
@@ -246,47 +230,40 @@ class SceneReader(ClauseReader):
 
     def on_course(self, tag: Tag) -> None:
         self.verb(tag)
-        has_partners = self.take("with") or self.peek().name == "object"
-        partners = self.read_list(True) if has_partners else []
-        alone = len(self.clause.subjects) == 1 and not partners
-        value = str(tag.value)
-        self._add_event("course", tag, self.clause.subjects, partners, value=value, alone=alone)
+        partners = self.read_list(True) if self.take("with") else self.read_partners("object")
+        subjects = self.clause.subjects
+        alone = len(subjects) == 1 and not partners
+        self.add_event("course", tag, subjects, partners, value=tag.value, alone=alone)
 
     def on_approach(self, tag: Tag) -> None:
         self.verb(tag._replace(name="moves"))
         partners = self.read_list(True)
-        self._add_event("course", tag, self.clause.subjects, partners, value=COARSE)
+        self.add_event("course", tag, self.clause.subjects, partners, value=COARSE)
 
     def on_meet(self, tag: Tag) -> None:
         self.verb(tag)
         self.take("with")
-        at_object = self.peek().name in ("object", "both")
-        partners = self.read_list(True) if at_object else []
-        self._add_event("meeting", tag, self.clause.subjects, partners)
+        partners = self.read_partners("object", "both")
+        self.add_event("meeting", tag, self.clause.subjects, partners)
 
     def on_no_contact(self, tag: Tag) -> None:
         self.verb(tag._replace(name="meet"))
         self.take("with")
-        partners = self.read_list(True) if self.peek().name == "object" else []
-        self._add_event("meeting", tag, self.clause.subjects, partners, False)
+        partners = self.read_partners("object")
+        self.add_event("meeting", tag, self.clause.subjects, partners, False)
 
     def on_close(self, tag: Tag) -> None:
-        partners = self.read_list(True) if self.peek().name == "object" else []
-        self._add_event("close", tag, self.clause.subjects, partners, value=str(tag.value))
+        partners = self.read_partners("object")
+        self.add_event("close", tag, self.clause.subjects, partners, value=tag.value)
 
     def on_contact(self, tag: Tag) -> None:
         """Read "on the verge of contact"."""
         if self.clause.time is None:
             raise UnreadableError
-        self._add_event("meeting", tag, self.clause.subjects, [])
+        self.add_event("meeting", tag, self.clause.subjects, [])
 
     def on_occurs(self, tag: Tag) -> None:
-        if self.clause.kind == "objects" and self.peek().name in (
-            "from",
-            "into",
-            "speed",
-            "direction",
-        ):
+        if self.clause.kind == "objects" and self.peek().name in OF_MOTION:
             # "Comes from near the left."
             self.verb(tag._replace(name="moves"))
             self.clause.moving = True
@@ -299,7 +276,7 @@ class SceneReader(ClauseReader):
         clause.time = tag
         if clause.event == "meeting":
             for pair in clause.pairs:
-                self.add("time", pair, str(tag.value), True, BETWEEN, tag)
+                self.add("time", pair, tag.value, True, BETWEEN, tag)
 
     def _add_close_region(self, tag: Tag) -> None:
         """Record the region of a close pair, as in "they are very close near the top"."""
@@ -308,4 +285,4 @@ class SceneReader(ClauseReader):
         when = TARGET if self.moment == TARGET or self.clause.future else EITHER
         after_object = self.peek(-2).name != "close"
         kind = "place of either" if after_object else "close region"
-        self.add(kind, self.clause.pairs[0], str(tag.value), True, when, tag)
+        self.add(kind, self.clause.pairs[0], tag.value, True, when, tag)

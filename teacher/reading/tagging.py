@@ -8,13 +8,17 @@ these prepositions), "relation" ("left of the red cube"), "candidate" (a letter)
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Iterable
+from importlib.resources import files
 from typing import NamedTuple
 
+import yaml
+
 from dynapix.data.records import COLORS, LETTERS, MATERIALS, SHAPES
-from dynapix.teacher.predicates.facts import REGIONS
+from dynapix.teacher.predicates.facts import COMPASS, REGIONS
 from dynapix.teacher.predicates.relations import KINDS
-from dynapix.teacher.reading.phrases import COARSE, PHRASES_BY_FIRST_WORD
+from dynapix.teacher.reading.claims import COARSE
 
 WORD = re.compile(r"[^\W\d_]+(?:['’][^\W\d_]+)?|[.,;:!?()—–]")
 ARTICLES = {"the", "a", "an", "its", "their", "that", "this"}
@@ -85,6 +89,35 @@ REGION_STARTS = {*PREPOSITIONS, *ROWS, *COLUMNS, *MIDDLE, "the", "close", "very"
 LOOKS = {*COLOR_WORDS, *MATERIAL_WORDS, *SHAPE_WORDS, *PLURALS}
 NOUN_STARTS = ARTICLES | QUALITIES | LOOKS
 ADJECTIVES = LOOKS | QUALITIES - {"still", "only", "same"}
+
+
+ENDINGS = ("", "ern", "ward", "wards", "erly", "bound", "wardly")
+"""Endings of a compass direction, as in "eastward" and "eastbound"."""
+Phrase = tuple[tuple[str, ...], str, str]
+"""The words of a phrase, the name of its tag, and the value of the tag ("" if it has none)."""
+
+
+def _read_phrases() -> dict[str, list[Phrase]]:
+    source = (files("dynapix.teacher.reading") / "phrases.yaml").read_text(encoding="utf-8")
+    phrases: dict[str, list[Phrase]] = defaultdict(list)
+    for tag, listed in yaml.safe_load(source).items():
+        values = listed if isinstance(listed, dict) else {"": listed}
+        for value, text in values.items():
+            for phrase in text.split(";"):
+                words = tuple(phrase.split())
+                phrases[words[0]].append((words, tag, value))
+    for direction in COMPASS:
+        # "Northeastern" may also be two words.
+        for stem in {direction, re.sub("^(north|south)(?=east|west)", r"\1 ", direction)}:
+            for ending in ENDINGS:
+                words = tuple((stem + ending).split())
+                phrases[words[0]].append((words, "direction", direction))
+    return {first: sorted(found, key=lambda p: -len(p[0])) for first, found in phrases.items()}
+
+
+PHRASES_BY_FIRST_WORD = _read_phrases()
+"""All phrases of phrases.yaml, and the compass directions, by their first word, the longest
+first."""
 
 
 class Name(str):

@@ -27,7 +27,7 @@ from dynapix.teacher.predicates.extraction import EVENT_MOMENTS
 from dynapix.teacher.predicates.facts import REGIONS
 from dynapix.teacher.predicates.relations import DISPLACED, describe_distance
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary
-from dynapix.teacher.reading.phrases import PHRASES_BY_FIRST_WORD
+from dynapix.teacher.reading.tagging import PHRASES_BY_FIRST_WORD
 from dynapix.teacher.sections import SECTIONS
 from dynapix.teacher.validation.claim_extraction import extract_claims
 from dynapix.teacher.validation.mutations import MUTATIONS, RELATION_MUTATIONS
