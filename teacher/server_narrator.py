@@ -18,7 +18,7 @@ from dynapix.teacher.predicates.grounding import Grounding
 from dynapix.teacher.predicates.vocabulary import choose_vocabulary, describe_item
 from dynapix.teacher.prompts import build_messages
 from dynapix.teacher.sections import GRAMMAR
-from dynapix.teacher.servers.capabilities import Constraint, RequestFields
+from dynapix.teacher.servers.capabilities import RequestFields
 from dynapix.teacher.servers.pool import NoResponseError, ServerPool, run_limited
 from dynapix.teacher.servers.responses import Response
 from dynapix.teacher.validation.grader import RationaleGrader
@@ -79,8 +79,11 @@ async def request_rationales(
             attempt += len(rationales)
         finish_item()
 
+    constraint = GRAMMAR if cfg.grammar else None
+    if cfg.form == "cited":
+        constraint = cited_schema()
     samples = min(cfg.samples, max(cfg.attempts - 1, 1))
-    options = {"constraint": constraint(cfg), "samples": samples, "show": show}
+    options = {"constraint": constraint, "samples": samples, "show": show}
     async with ServerPool(cfg, request_fields(cfg), **options) as pool:
         await run_limited(jobs, cfg.concurrency, narrate)
     return unanswered
@@ -107,10 +110,3 @@ def request_fields(cfg: TeacherConfig) -> RequestFields:
         "max_tokens": cfg.max_tokens,
         "extra_body": extra,
     }
-
-
-def constraint(cfg: TeacherConfig) -> Constraint | None:
-    """Return what the settings constrain a rationale to."""
-    if cfg.form == "cited":
-        return cited_schema()
-    return GRAMMAR if cfg.grammar else None
