@@ -29,6 +29,25 @@ Pool = tuple[Iterable[Candidate], int]
 
 
 @dataclass(frozen=True)
+class CellInputs:
+    """The inputs for making the items or queries of one cell.
+
+    Attributes:
+        min_displacement: Between any two candidates, the position of at least one object (of the
+            subjects, if both are frames of the item's scene) must differ by this many px at
+            336 x 336.
+        hard_negatives: Number of hard negatives of a query.
+    """
+
+    scene_ids: dict[str, list[str]]
+    scene_of: Callable[[str], Scene]
+    quota: Quota
+    seed: int
+    min_displacement: float
+    hard_negatives: int = 0
+
+
+@dataclass(frozen=True)
 class Timing:
     """Frame indices of an item: its prefix (`stop` included), its target, and its event, if any."""
 
@@ -146,25 +165,6 @@ def new_item(
         min_displacement=min_displacement,
         **values,
     )
-
-
-@dataclass(frozen=True)
-class CellInputs:
-    """The inputs for making the items or queries of one cell.
-
-    Attributes:
-        min_displacement: Between any two candidates, the position of at least one object (of the
-            subjects, if both are frames of the item's scene) must differ by this many px at
-            336 x 336.
-        hard_negatives: Number of hard negatives of a query.
-    """
-
-    scene_ids: dict[str, list[str]]
-    scene_of: Callable[[str], Scene]
-    quota: Quota
-    seed: int
-    min_displacement: float
-    hard_negatives: int = 0
 
 
 def fill_quota(

@@ -12,111 +12,38 @@ of easy items futures far from it.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 
-from dynapix.conf.schema import WorldConfig
+from dynapix.data.items.futures.options import TRIES, FuturesPicker, Options, distinct_choices
 from dynapix.data.items.futures.simulation import (
     Group,
-    alternative_scene,
     branches_of_velocities,
     joint_groups,
     moving_objects,
+    own_motion,
     sample_velocities,
-    scene_states,
-    scene_with_states,
     simulate_futures,
 )
-from dynapix.data.items.pickers import DistractorPicker, Recipe, Timing, new_item
-from dynapix.data.items.scores import Balance, CandidateFrames, render_small
+from dynapix.data.items.pickers import Recipe, Timing
+from dynapix.data.items.scores import Balance
 from dynapix.data.oracle.displacement import frame_displacements
-from dynapix.data.records import ALTERNATIVE, Candidate, Collision, Scene, SelectionItem
-from dynapix.data.store import save_scene, scene_path
+from dynapix.data.records import ALTERNATIVE, Candidate, Scene, SelectionItem
 
 FUTURES = {"event": 10, "time": 12, "window": 12}
 """Number of alternative futures from which the distractors of an item are chosen, by family."""
 IS_HARD = {"same_obj_match": True, "same_near": True, "cross_scene": False, "same_far": False}
 """Whether the items of a subtype are hard, by the distractors that it has in the paper's recipe.
 Items of other subtypes are neither hard nor easy."""
-TRIES = 3
-"""Number of times that futures of a scene are simulated in one cell: for different timings or, in
-the time family, for different wrong moments of its only timing."""
-TARGET = 1
-"""Index of the target among the frames from which candidates are chosen."""
 LARGEST_SHARE = 0.9
 """Maximum time to the earlier of two moments, as a share of the time to the later one."""
 
 
-@dataclass(frozen=True)
-class FramePool:
-    """The frames from which the candidates of an item are chosen.
-
-    Attributes:
-        frames: A scene with these frames: the last observed one, the scene's own at each moment
-            (first the target), and all futures at the first moment, then at the second.
-        moments: The target's moment and, in the time family, a wrong one.
-        stop: The moment of the last observed frame.
-        futures: Number of futures.
-    """
-
-    frames: Scene
-    moments: Sequence[int]
-    stop: int
-    futures: int
-
-    @classmethod
-    def collect(
-        cls,
-        scene: Scene,
-        name: str,
-        stop: int,
-        moments: Sequence[int],
-        futures: np.ndarray,
-        world: WorldConfig,
-    ) -> FramePool:
-        """Collect the frames of a scene and of its futures from frame `stop` on (K, F, N, 13)."""
-        own = scene_states(scene)[[stop, *moments]]
-        others = [futures[:, moment - stop] for moment in moments]
-        frames = scene_with_states(scene, name, np.concatenate([own, *others]), world)
-        return cls(frames, moments, stop, len(futures))
-
-    @property
-    def moments_of_frames(self) -> list[int]:
-        return [self.stop, *self.moments, *np.repeat(self.moments, self.futures).tolist()]
-
-    def choices(self) -> np.ndarray:
-        """Return all choices of candidates (T, 4) as indices of frames, the target first. With two
-        moments, a choice has the scene's own and one other future, each at both moments."""
-        first = TARGET + len(self.moments)
-        at_target = range(first, first + self.futures)
-        if len(self.moments) == 1:
-            return np.array([[TARGET, *triple] for triple in combinations(at_target, 3)])
-        return np.array([[TARGET, TARGET + 1, k, k + self.futures] for k in at_target])
-
-    def future_of(self, frame: int) -> int | None:
-        """Return which future a frame shows; None for the scene's own."""
-        first = TARGET + len(self.moments)
-        return (frame - first) % self.futures if frame >= first else None
-
-
 @dataclass(kw_only=True)
-class BalancedPicker(DistractorPicker):
-    """Makes the balanced items of one cell and one split. It uses the timings and the subjects of
-    the paper's recipe, but not its distractors.
-
-    Attributes:
-        folder: The store or partial build in which alternative futures are saved.
-    """
-
-    world: WorldConfig
-    folder: Path
-    balance: Balance = field(init=False)
-    _tries: Counter[str] = field(default_factory=Counter)
+class BalancedPicker(FuturesPicker):
+    """Makes the balanced items of one cell and one split."""
 
     def __post_init__(self) -> None:
         self.balance = Balance(self.rng)
@@ -124,96 +51,51 @@ class BalancedPicker(DistractorPicker):
     def make_item(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
     ) -> SelectionItem | None:
-        groups = self._groups(scene, timing, about, recipe.family)
-        if not groups:
+        """As in `FuturesPicker`. Timings at which nothing moves visibly do not count as tries."""
+        shift = frame_displacements(scene, about)[timing.stop, timing.target]
+        if shift < self.cell.min_displacement or not moving_objects(scene, timing.stop, about):
             return None
-        for _ in range(TRIES if recipe.family == "time" else 1):
-            if item := self._try_item(recipe, scene, timing, groups):
-                return item
-        self.dropped["no suitable distractors"] += 1
-        return None
+        return super().make_item(recipe, scene, timing, about)
 
-    def _try_item(
-        self, recipe: Recipe, scene: Scene, timing: Timing, groups: Sequence[Group]
+    def _make_from_futures(
+        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+    ) -> SelectionItem | str:
+        # A time item has a single timing, but each try has another wrong moment.
+        count = TRIES if recipe.family == "time" else 1
+        tries = (self._try_futures(recipe, scene, timing, about) for _ in range(count))
+        return next(filter(None, tries), "no suitable distractors")
+
+    def _try_futures(
+        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
     ) -> SelectionItem | None:
-        """Make an item from new futures, or return None if no choice of them is suitable."""
-        family, fields, about = recipe.family, recipe.fields(timing), recipe.subjects(scene, timing)
-        moments = [timing.target]
-        if family == "time":
+        stop, moments = timing.stop, [timing.target]
+        if recipe.family == "time":
             moments += self._wrong_moment(scene, timing, about)
             if len(moments) == 1:
                 return None
-        count, quarter = FUTURES[family], int(self.balance.excess_of("nearness").argmin())
-        velocities = sample_velocities(scene, timing.stop, groups, count, quarter, self.rng)
-        branches = branches_of_velocities(scene, timing.stop, velocities)
-        motions = simulate_futures(scene, timing.stop, max(moments), branches, self.world)
-        futures = np.stack([motion.states for motion in motions])
-        name = f"{scene.scene_id}{ALTERNATIVE}{fields['subtype']}-{timing.stop}"
-        pool = FramePool.collect(scene, name, timing.stop, moments, futures, self.world)
-        displacement = frame_displacements(pool.frames, about)
-        choices = distinct_choices(pool.choices(), displacement, self.cell.min_displacement)
-        choices = _of_difficulty(choices, displacement, IS_HARD.get(fields["distractors"]))
+        groups = changed_groups(recipe.family, scene, timing, about)
+        count, quarter = FUTURES[recipe.family], int(self.balance.excess_of("nearness").argmin())
+        velocities = sample_velocities(scene, stop, groups, count, quarter, self.rng)
+        branches = branches_of_velocities(scene, stop, velocities)
+        motions = simulate_futures(scene, stop, max(moments), branches, self.world)
+        fields = recipe.fields(timing)
+        name = f"{scene.scene_id}{ALTERNATIVE}{fields['subtype']}-{stop}"
+        futures = {f"{name}-{k}": motion for k, motion in enumerate(motions)}
+        candidates = [Candidate(scene.scene_id, timing.target)]
+        candidates += [Candidate(scene.scene_id, m, "same_time") for m in moments[1:]]
+        candidates += [Candidate(own, m, "alternative") for m in moments for own in futures]
+        futures[scene.scene_id] = own_motion(scene, stop, max(moments))
+        options = Options(scene, timing, candidates, futures, self.world)
+        displacement = options.displacement(about)
+        choices = list_choices(len(moments), count)
+        choices = distinct_choices(choices, displacement, self.cell.min_displacement)
+        choices = choices_of_difficulty(choices, displacement, IS_HARD.get(fields["distractors"]))
         if not len(choices):
             return None
-        scores = self._compare(pool.frames, pool.moments_of_frames).scores(choices)
-        best = self.balance.choose(scores)
+        best = self.balance.choose(options.scores(choices))
         if best is None:
             return None
-        chosen = choices[best].tolist()
-        candidates = []
-        for frame in chosen:
-            moment, future = pool.moments_of_frames[frame], pool.future_of(frame)
-            if future is None:
-                source = "target" if frame == TARGET else "same_time"
-                candidates.append(Candidate(scene.scene_id, moment, source))
-            else:
-                other = f"{name}-{future}"
-                self._save(scene, other, timing.stop, futures[future])
-                candidates.append(Candidate(other, moment, "alternative"))
-        least = least_displacement(pool.frames, chosen)
-        return new_item(recipe, scene, timing, candidates, least, distractors="alternative")
-
-    def _compare(
-        self, frames: Scene, moments: Sequence[int], further: Sequence[np.ndarray] = ()
-    ) -> CandidateFrames:
-        """Compare the frames from which candidates are chosen, the last observed one first, given
-        their frame indices in time and further scores."""
-        states = [(frames, k) for k in range(frames.frames)]
-        images = render_small(frames, range(frames.frames), {"world": asdict(self.world)})
-        return CandidateFrames.compare(states, moments, images, further)
-
-    def _save(
-        self,
-        scene: Scene,
-        name: str,
-        stop: int,
-        states: np.ndarray,
-        collisions: tuple[Collision, ...] = (),
-    ) -> None:
-        """Save an alternative future: a scene with the states (F, N, 13) from frame `stop` on."""
-        future = alternative_scene(scene, name, stop, states, self.world)
-        future = replace(future, collisions=collisions)
-        save_scene(future, scene_path(self.folder, name))
-
-    def _groups(
-        self, scene: Scene, timing: Timing, about: tuple[int, ...], family: str
-    ) -> list[Group]:
-        """Return the groups of objects whose velocities may be changed to make distractors.
-
-        Their objects move at the end of the prefix, and visibly until the target. In event and
-        window items, objects that collide change by one velocity: otherwise the target would often
-        be the only candidate in which objects touch. Return none after `TRIES` timings of a scene.
-        """
-        shift = frame_displacements(scene, about)[timing.stop, timing.target]
-        moving = moving_objects(scene, timing.stop, about)
-        if not moving or shift < self.cell.min_displacement:
-            return []
-        self._tries[scene.scene_id] += 1
-        if self._tries[scene.scene_id] > TRIES:
-            return []
-        if family != "time":
-            return joint_groups(scene, timing.stop, timing.target, moving)
-        return [(k,) for k in moving]
+        return self._make_from_options(recipe, options, choices[best], distractors="alternative")
 
     def _wrong_moment(self, scene: Scene, timing: Timing, about: tuple[int, ...]) -> list[int]:
         """Sample a moment after the prefix that differs visibly from the target, on the side of the
@@ -234,29 +116,38 @@ class BalancedPicker(DistractorPicker):
         return [moment] if shift >= self.cell.min_displacement else []
 
 
-def distinct_choices(choices: np.ndarray, displacement: np.ndarray, least: float) -> np.ndarray:
-    """Return the choices (T, 4) of frames that all differ by at least `least` px."""
-    pairs = displacement[choices[:, :, None], choices[:, None, :]]
-    pairs[:, np.arange(4), np.arange(4)] = np.inf
-    return choices[pairs.min(axis=(1, 2)) >= least]
+def changed_groups(
+    family: str, scene: Scene, timing: Timing, about: tuple[int, ...]
+) -> list[Group]:
+    """Return the groups of objects whose velocities are changed to make distractors. Their objects
+    move at the end of the prefix.
+
+    In event and window items, objects that collide change by one velocity: otherwise the target
+    would often be the only candidate in which objects touch.
+    """
+    moving = moving_objects(scene, timing.stop, about)
+    if family == "time":
+        return [(k,) for k in moving]
+    return joint_groups(scene, timing.stop, timing.target, moving)
 
 
-def least_displacement(
-    frames: Scene, chosen: Sequence[int], about: tuple[int, ...] | None = None
-) -> float:
-    """Return the smallest displacement of an object of `about` (all by default) between two of the
-    chosen frames, px."""
-    pairs = frame_displacements(frames, about)[np.ix_(chosen, chosen)]
-    return float(pairs[np.triu_indices(len(chosen), 1)].min())
+def list_choices(moments: int, futures: int) -> np.ndarray:
+    """Return all choices (T, 4), the target first, of these options: the scene's own frame at each
+    moment, then all futures at the first moment, and at the second. With two moments, a choice has
+    the scene's own and one other future, each at both moments."""
+    own, others = np.arange(moments), moments + np.arange(moments * futures).reshape(moments, -1)
+    if moments == 1:
+        return np.array([[*own, *triple] for triple in combinations(others[0], 3)])
+    return np.array([[*own, *pair] for pair in others.T])
 
 
-def _of_difficulty(
-    choices: np.ndarray, displacement: np.ndarray, nearest: bool | None
+def choices_of_difficulty(
+    choices: np.ndarray, displacement: np.ndarray, is_hard: bool | None
 ) -> np.ndarray:
-    """Return the half of the choices whose distractors are nearer to the target, or the other half;
-    all choices if `nearest` is None."""
-    if nearest is None or len(choices) < 2:
+    """Return the half of the choices whose distractors are nearer to the target if they should be
+    hard, the other half if they should be easy, and all choices if `is_hard` is None."""
+    if is_hard is None or len(choices) < 2:
         return choices
-    order = np.argsort(displacement[TARGET, choices[:, 1:]].max(axis=-1), kind="stable")
+    order = np.argsort(displacement[0, choices[:, 1:]].max(axis=-1), kind="stable")
     half = (len(choices) + 1) // 2
-    return choices[np.sort(order[:half] if nearest else order[-half:])]
+    return choices[np.sort(order[:half] if is_hard else order[-half:])]

@@ -22,30 +22,17 @@ from itertools import combinations
 
 import numpy as np
 
-from dynapix.data.items.futures.balanced import (
-    TARGET,
-    TRIES,
-    BalancedPicker,
-    distinct_choices,
-    least_displacement,
-)
+from dynapix.data.items.futures.options import FuturesPicker, Options, distinct_choices
 from dynapix.data.items.futures.simulation import (
-    future_frames,
     own_motion,
     scene_states,
     simulate_futures,
     turn_velocity,
 )
-from dynapix.data.items.pickers import Recipe, Timing, new_item
+from dynapix.data.items.pickers import Recipe, Timing
 from dynapix.data.items.recipes import EVENT_QUESTION
-from dynapix.data.items.scores import (
-    COLLISION_SCORES,
-    SCORES,
-    Balance,
-    CandidateFrames,
-    collision_scores,
-)
-from dynapix.data.oracle.displacement import frame_displacements, visible_positions
+from dynapix.data.items.scores import COLLISION_SCORES, SCORES, Balance, collision_scores
+from dynapix.data.oracle.displacement import visible_positions
 from dynapix.data.oracle.events import collisions_in, next_collision, touching_pairs
 from dynapix.data.records import ALTERNATIVE, CONTACT, GHOST, Candidate, Scene, SelectionItem
 from dynapix.data.sim.camera import Camera
@@ -71,8 +58,6 @@ GHOST_SHARE = 0.25
 STRAY = 1 / 3
 """Maximum displacement between the recorded target and its simulation from the end of the prefix,
 as a share of the minimum displacement between candidates."""
-TRUE = TARGET + 1
-"""Index of the simulated true outcome among the frames from which candidates are chosen."""
 NO_COLLISION = "no collision after a prefix"
 """Why there is no item in a scene without timings."""
 APART = 0.95
@@ -106,73 +91,52 @@ def collision_timings(gap: int, scene: Scene) -> list[Timing]:
 
 
 @dataclass(kw_only=True)
-class ContactPicker(BalancedPicker):
+class ContactPicker(FuturesPicker):
     """Makes the contact items of one cell and one split."""
 
     def __post_init__(self) -> None:
         names = (*SCORES, *COLLISION_SCORES)
         self.balances = {with_ghost: Balance(self.rng, names) for with_ghost in (False, True)}
 
-    def make_item(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
-    ) -> SelectionItem | None:
-        self._tries[scene.scene_id] += 1
-        if self._tries[scene.scene_id] > TRIES:
-            return None
-        made = self._make_from_outcomes(recipe, scene, timing, about)
-        if isinstance(made, SelectionItem):
-            return made
-        self.dropped[made] += 1
-        return None
-
-    def _make_from_outcomes(
+    def _make_from_futures(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
     ) -> SelectionItem | str:
-        """Make an item from new outcomes, or return why no choice of them is suitable."""
         stop, target, least = timing.stop, timing.target, self.cell.min_displacement
         pair = next_collision(scene, stop).objects
         sources, branches = zip(*sample_outcomes(scene, stop, pair, self.rng), strict=True)
-        motions = simulate_futures(scene, stop, target, branches, self.world)
-        own = own_motion(scene, stop, target)
-        frames = future_frames(scene, stop, [own, *motions], self.world)
-        displacement = frame_displacements(frames, about)
-        if displacement[TARGET, TRUE] > STRAY * least:
+        outcomes = simulate_futures(scene, stop, target, branches, self.world)
+        name = f"{scene.scene_id}{ALTERNATIVE}{recipe.fields(timing)['subtype']}-{stop}"
+        motions = {scene.scene_id: own_motion(scene, stop, target)}
+        motions |= {f"{name}-{k}": outcome for k, outcome in enumerate(outcomes)}
+        # The scene's own outcome, then the same one simulated again, and the others.
+        named = zip(motions, ["target", *sources], strict=True)
+        candidates = [Candidate(own, target, source) for own, source in named]
+        options = Options(scene, timing, candidates, motions, self.world)
+        displacement = options.displacement(about)
+        if displacement[0, 1] > STRAY * least:
             return "target cannot be simulated again"
         suitable = [
-            TRUE + k
-            for k, (source, motion) in enumerate(zip(sources, motions, strict=True))
-            if k and is_suitable(source, pair, motion, frames.object_radii)
+            k
+            for k, each in enumerate(candidates)
+            if k > 1 and is_suitable(each.source, pair, motions[each.scene_id], scene.object_radii)
         ]
         with_ghost = self._wants_ghost()
         choices = [
-            (TARGET, *chosen)
+            (0, *chosen)
             for chosen in combinations(suitable, 3)
             # The ghost is the last outcome.
-            if (sources[chosen[-1] - TRUE] == GHOST) == with_ghost
+            if (candidates[chosen[-1]].source == GHOST) == with_ghost
         ]
         choices = distinct_choices(np.array(choices, int).reshape(-1, 4), displacement, least)
         if not len(choices):
             return "outcomes too alike"
-        compared = self._compare_outcomes(scene, timing, frames)
-        eligible = eligible_candidates(with_ghost)
-        best = self.balances[with_ghost].choose(compared.scores(choices), eligible)
+        shown = [(options.frames, k) for k in range(options.frames.frames)]
+        camera = Camera.from_settings(self.world.camera)
+        scores = options.scores(choices, [*collision_scores(scene, stop, target, shown, camera)])
+        best = self.balances[with_ghost].choose(scores, eligible_candidates(with_ghost))
         if best is None:
             return "refused by the balance"
-        chosen = choices[best].tolist()
-        candidates = [Candidate(scene.scene_id, target)]
-        for k in (frame - TRUE for frame in chosen[1:]):
-            name = f"{scene.scene_id}{ALTERNATIVE}{recipe.fields(timing)['subtype']}-{stop}-{k}"
-            self._save(scene, name, stop, motions[k].states)
-            candidates.append(Candidate(name, target, sources[k]))
-        return new_item(recipe, scene, timing, candidates, least_displacement(frames, chosen))
-
-    def _compare_outcomes(self, scene: Scene, timing: Timing, frames: Scene) -> CandidateFrames:
-        """Compare frames of the target's moment, with the last observed one first."""
-        moments = [timing.stop, *[timing.target] * (frames.frames - 1)]
-        shown = [(frames, k) for k in range(frames.frames)]
-        camera = Camera.from_settings(self.world.camera)
-        further = collision_scores(scene, timing.stop, timing.target, shown, camera)
-        return self._compare(frames, moments, [*further])
+        return self._make_from_options(recipe, options, choices[best])
 
     def _wants_ghost(self) -> bool:
         """Return whether the next item should have the ghost, to keep its share."""

@@ -21,27 +21,24 @@ import numpy as np
 
 from dynapix.conf.schema import WorldConfig
 from dynapix.conf.schema.benchmark import INTERVENTIONS
-from dynapix.data.items.futures.balanced import distinct_choices, least_displacement
 from dynapix.data.items.futures.contact import (
     DIRECTIONS,
     STRAY,
-    ContactPicker,
     collision_timings,
     sample_outcomes,
 )
+from dynapix.data.items.futures.options import FuturesPicker, Options, distinct_choices
 from dynapix.data.items.futures.simulation import (
     MAX_LOG_FACTOR,
     MOVING,
-    future_frames,
     own_motion,
     scene_states,
     simulate_futures,
     turn_velocity,
 )
-from dynapix.data.items.pickers import Recipe, Timing, new_item
+from dynapix.data.items.pickers import Recipe, Timing
 from dynapix.data.items.recipes import EVENT_QUESTION, pair_key
 from dynapix.data.items.scores import Balance
-from dynapix.data.oracle.displacement import frame_displacements
 from dynapix.data.oracle.events import group_contacts, next_collision
 from dynapix.data.records import (
     ALTERNATIVE,
@@ -80,10 +77,6 @@ CLEAR = 1.1
 radii."""
 FAR = 100.0
 """Distance behind the camera to which an object that vanishes is moved, simulator units."""
-ACTUAL, CHANGED, UNCHANGED = 1, 2, 3
-"""Indices of the scene's own future, the changed one and the own one simulated again among the
-frames at the target's moment. Candidates are the first two, and two of the further frames."""
-SOURCES = {ACTUAL: "target", CHANGED: INTERVENTION}
 
 
 def make_intervention_recipe(change: str) -> Recipe:
@@ -159,16 +152,15 @@ def move_away(states: np.ndarray, index: int, world: WorldConfig) -> np.ndarray:
 
 
 @dataclass(kw_only=True)
-class InterventionPicker(ContactPicker):
+class InterventionPicker(FuturesPicker):
     """Makes the items about the scene's own future in the pairs of one subtype and one split."""
 
     def __post_init__(self) -> None:
         self.balance = Balance(self.rng)
 
-    def _make_from_outcomes(
+    def _make_from_futures(
         self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
     ) -> SelectionItem | str:
-        """Make an item from new futures, or return why no choice of them is suitable."""
         stop, target, least = timing.stop, timing.target, self.cell.min_displacement
         subtype = recipe.fields(timing)["subtype"]
         possible = [*find_interventions(subtype, scene, stop, self.world)]
@@ -177,45 +169,41 @@ class InterventionPicker(ContactPicker):
         chosen = possible[self.rng.integers(len(possible))]
         branches = [chosen.branch, *sample_variations(scene, stop, chosen, self.rng)]
         simulated = simulate_futures(scene, stop, target, branches, self.world)
-        motions = [own_motion(scene, stop, target), *simulated]
+        name = f"{scene.scene_id}{ALTERNATIVE}{subtype}-{chosen.changed}-{stop}-{target}"
+        own = f"{name}-1" if chosen.vanishes else scene.scene_id
+        # The scene's own future, the changed one, the own one simulated again, and variations.
+        motions = {own: own_motion(scene, stop, target)}
+        motions |= {f"{name}-{k}": motion for k, motion in enumerate(simulated, 2)}
+        question = EVENT_QUESTION
         if chosen.vanishes:
-            motions = [without_object(motion, chosen.changed, self.world) for motion in motions]
+            motions = {
+                key: without_object(motion, chosen.changed, self.world)
+                for key, motion in motions.items()
+            }
             about = tuple(k for k in about if k != chosen.changed)
-        frames = future_frames(scene, stop, motions, self.world)
-        displacement = frame_displacements(frames, about)
-        if displacement[ACTUAL, UNCHANGED] > STRAY * least:
+            question = UNSEEN.format(scene.objects[chosen.changed].noun_phrase) + question
+        sources = ["target", INTERVENTION, *["alternative"] * (len(motions) - 2)]
+        named = zip(motions, sources, strict=True)
+        candidates = [Candidate(key, target, source) for key, source in named]
+        options = Options(scene, timing, candidates, motions, self.world)
+        displacement = options.displacement(about)
+        if displacement[0, 2] > STRAY * least:
             return "target cannot be simulated again"
-        pairs = combinations(range(UNCHANGED + 1, frames.frames), 2)
-        choices = np.array([(ACTUAL, CHANGED, *pair) for pair in pairs])
+        pairs = combinations(range(3, len(candidates)), 2)
+        choices = np.array([(0, 1, *pair) for pair in pairs])
         choices = distinct_choices(choices, displacement, least)
         if not len(choices):
             return "futures too alike"
-        compared = self._compare(frames, [stop, *[target] * len(motions)])
         # The changed future is often beyond the scene's own one, such as that of a faster object,
         # so that only the ranks of both together can be even.
-        best = self.balance.choose(compared.scores(choices), targets=(0, 1))
+        best = self.balance.choose(options.scores(choices), targets=(0, 1))
         if best is None:
             return "refused by the balance"
-        candidates = []
-        for frame in choices[best].tolist():
-            source = SOURCES.get(frame, "alternative")
-            if frame == ACTUAL and not chosen.vanishes:
-                candidates.append(Candidate(scene.scene_id, target, source))
-                continue
-            motion = motions[frame - ACTUAL]
-            collisions = scene.collisions
-            if frame != ACTUAL:
-                collisions = join_collisions(scene, stop, motion)
-            name = (
-                f"{scene.scene_id}{ALTERNATIVE}{subtype}-{chosen.changed}-{stop}-{target}-{frame}"
-            )
-            self._save(scene, name, stop, motion.states, collisions)
-            candidates.append(Candidate(name, target, source))
-        question = EVENT_QUESTION
-        if chosen.vanishes:
-            question = UNSEEN.format(scene.objects[chosen.changed].noun_phrase) + question
-        least = least_displacement(frames, choices[best], about)
-        return new_item(recipe, scene, timing, candidates, least, question=question)
+        collisions = {key: join_collisions(scene, stop, each) for key, each in motions.items()}
+        collisions[own] = scene.collisions
+        return self._make_from_options(
+            recipe, options, choices[best], about, collisions, question=question
+        )
 
 
 def sample_variations(

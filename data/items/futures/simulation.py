@@ -127,12 +127,6 @@ def own_motion(scene: Scene, frame: int, last: int) -> Motion:
     return Motion(scene_states(scene)[frame : last + 1].astype(float), {})
 
 
-def future_frames(scene: Scene, stop: int, motions: Sequence[Motion], world: WorldConfig) -> Scene:
-    """Return as a scene the frame `stop` and the last frame of each motion."""
-    states = [scene_states(scene)[stop], *(motion.states[-1] for motion in motions)]
-    return scene_with_states(scene, "futures", np.stack(states), world)
-
-
 def scene_with_states(scene: Scene, name: str, states: np.ndarray, world: WorldConfig) -> Scene:
     """Return a scene with the objects of another one and the states (F, N, 13) of each frame. Its
     collisions and landings are empty."""

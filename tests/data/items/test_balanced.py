@@ -163,16 +163,17 @@ def test_candidates_differ_visibly(store: Store, items: list[SelectionItem]) -> 
 
 
 def test_hard_distractors_are_nearer_to_the_target_than_easy_ones() -> None:
-    places = np.random.default_rng(0).uniform(0, 100, (14, 2))
+    places = np.random.default_rng(0).uniform(0, 100, (13, 2))
     displacement = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    choices = np.array([[1, *others] for others in combinations(range(2, 14), 3)])
+    choices = balanced_items.list_choices(moments=1, futures=12)
     halves = [
-        balanced_items._of_difficulty(choices, displacement, nearest) for nearest in (True, False)
+        balanced_items.choices_of_difficulty(choices, displacement, is_hard)
+        for is_hard in (True, False)
     ]
-    near, far = (displacement[1, half[:, 1:]].max(axis=-1) for half in halves)
+    near, far = (displacement[0, half[:, 1:]].max(axis=-1) for half in halves)
     assert near.max() <= far.min()
     assert len(near) == len(far) == len(choices) / 2
-    assert balanced_items._of_difficulty(choices, displacement, None) is choices
+    assert balanced_items.choices_of_difficulty(choices, displacement, None) is choices
 
 
 @pytest.mark.slow
