@@ -6,7 +6,7 @@ from collections import Counter
 
 from dynapix.conf.schema import BenchmarkConfig
 from dynapix.conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR, PAIRED
-from dynapix.data.items.cells import builder_name, cell_quotas
+from dynapix.data.items.cells import builder_name, split_quotas
 from dynapix.data.records import CONTACT, SPLITS, FrameRef, RetrievalQuery, SelectionItem
 from dynapix.data.store import Store
 
@@ -41,11 +41,7 @@ def count_records(
     counts["retrieval/standard test"] = sum(
         query.pool == "future" and query.split == "test" for query in queries
     )
-    quotas = {
-        f"{cell}/{split}": getattr(quota, split)
-        for cell, quota in cell_quotas(cfg).items()
-        for split in SPLITS
-    }
+    quotas = split_quotas(cfg)
     if cfg.test_scenes is not None:
         cells["scenes/test"], quotas["scenes/test"] = len(scene_ids["test"]), cfg.test_scenes
     track = cfg.retrieval

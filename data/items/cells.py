@@ -44,7 +44,15 @@ from dynapix.data.items.pickers import (
 from dynapix.data.items.queries import make_counterfactual_queries, make_future_queries
 from dynapix.data.items.scores import compare_item
 from dynapix.data.parallel import Workers
-from dynapix.data.records import CONTACT, FAMILIES, GHOST, RetrievalQuery, Scene, SelectionItem
+from dynapix.data.records import (
+    CONTACT,
+    FAMILIES,
+    GHOST,
+    SPLITS,
+    RetrievalQuery,
+    Scene,
+    SelectionItem,
+)
 from dynapix.data.seeded_order import named_rng
 from dynapix.data.store import PARTS, SCENES_FOLDER, hash_files, load_scene, part_path, scene_path
 from dynapix.data.versions import component_versions
@@ -205,6 +213,12 @@ def cell_quotas(cfg: BenchmarkConfig) -> dict[str, Quota]:
     quotas |= {f"builder {b}": quota for b, quota in cfg.retrieval.builders.items()}
     quotas[COUNTERFACTUAL] = cfg.retrieval.counterfactual
     return {name: quota for name, quota in quotas.items() if quota.train + quota.test}
+
+
+def split_quotas(cfg: BenchmarkConfig) -> dict[str, int]:
+    """Return the quotas of all cells and builders in each split, such as `builder 1/test`."""
+    quotas = cell_quotas(cfg).items()
+    return {f"{cell}/{split}": getattr(quota, split) for cell, quota in quotas for split in SPLITS}
 
 
 def builder_name(builder: int | None) -> str:

@@ -9,8 +9,8 @@ queries have another one (paper, Table 1 and "Query constructions").
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain, islice, product
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from dynapix.conf.schema import BenchmarkConfig
 from dynapix.conf.schema.benchmark import POOLS
-from dynapix.data.items.cells import builder_name, cell_quotas
+from dynapix.data.items.cells import builder_name, split_quotas
 from dynapix.data.oracle.displacement import visible_positions
 from dynapix.data.records import FrameRef, RetrievalQuery, Scene
 from dynapix.data.seeded_order import named_rng, round_robin
@@ -26,8 +26,9 @@ from dynapix.data.seeded_order import named_rng, round_robin
 DUPLICATE_DISTANCE = 1.0
 """Near-duplicates differ by less than this in all coordinates of objects, px at 336 x 336."""
 VISIBLE_FRACTIONS = (0.02, 0.08)
-"""Thresholds of the visible fraction of a visible object. Frames that agree under either threshold
-are near-duplicates, so that a fraction close to one threshold makes no difference."""
+"""Least visible fractions of a visible object. The visible objects of a frame are listed for both,
+and two frames are near-duplicates if they have a list in common, so that a fraction close to one of
+the bounds makes no difference."""
 
 
 @dataclass
@@ -43,8 +44,8 @@ class UniqueFrames:
         """Add a frame unless it or a near-duplicate is in the set; return whether it was added."""
         if frame in self.frames:
             return False
-        appearances = list(_appearances(self.scene_of(frame.scene_id), frame.frame))
-        for objects, positions in appearances:
+        visible = _list_visible(self.scene_of(frame.scene_id), frame.frame)
+        for objects, positions in visible:
             x, y = _first_place(positions)
             near = product((x - 1, x, x + 1), (y - 1, y, y + 1))
             others = chain.from_iterable(
@@ -54,7 +55,7 @@ class UniqueFrames:
             if any(step.max(initial=0) < DUPLICATE_DISTANCE for step in steps):
                 self.left_out += 1
                 return False
-        for objects, positions in appearances:
+        for objects, positions in visible:
             self._positions[objects, _first_place(positions)].append(positions)
         self.frames[frame] = None
         return True
@@ -77,16 +78,15 @@ def _first_place(positions: np.ndarray) -> tuple[int, int]:
     return tuple(int(x // DUPLICATE_DISTANCE) for x in positions[0]) if len(positions) else (0, 0)
 
 
-def _appearances(scene: Scene, frame: int) -> Iterable[tuple[tuple, np.ndarray]]:
-    """Yield a frame's visible objects and their positions for each of `VISIBLE_FRACTIONS`."""
-    visible = scene.visible_fraction[frame]
+def _list_visible(scene: Scene, frame: int) -> list[tuple[tuple, np.ndarray]]:
+    """Return the visible objects of a frame and their positions (K, 2), px at 336 x 336, for each
+    of `VISIBLE_FRACTIONS`. Appearances alone determine the order of the objects."""
     # NaN means that the simulator records only whether the object is in view.
-    visible = np.where(np.isnan(visible), 1.0, visible) * scene.in_view[frame]
-    positions = visible_positions(scene)[0][frame]
+    fraction = np.nan_to_num(scene.visible_fraction[frame], nan=1.0) * scene.in_view[frame]
     order = sorted(range(len(scene.objects)), key=lambda k: str(scene.objects[k]))
-    for bound in VISIBLE_FRACTIONS:
-        present = [k for k in order if visible[k] >= bound]
-        yield tuple(scene.objects[k] for k in present), positions[present]
+    lists = [[k for k in order if fraction[k] >= least] for least in VISIBLE_FRACTIONS]
+    positions = visible_positions(scene)[0][frame]
+    return [(tuple(scene.objects[k] for k in each), positions[each]) for each in lists]
 
 
 def make_databases(
@@ -121,13 +121,12 @@ def choose_queries(
     """Return the queries of a pool up to their quotas, test queries first, and add their targets to
     `unique`. A query whose target is a near-duplicate of another query's target is left out: both
     frames would be right answers."""
-    quotas, kept, chosen = cell_quotas(cfg), Counter(), set()
+    room, chosen = split_quotas(cfg), set()
     own = [q for q in queries if q.pool == pool]
     for query in sorted(own, key=lambda q: q.split != "test"):
-        cell = builder_name(query.builder), query.split
-        is_full = kept[cell] >= getattr(quotas[cell[0]], query.split)
-        if not is_full and (query.target in unique.frames or unique.add(query.target)):
-            kept[cell] += 1
+        cell = f"{builder_name(query.builder)}/{query.split}"
+        if room[cell] and (query.target in unique.frames or unique.add(query.target)):
+            room[cell] -= 1
             chosen.add(query.query_id)
     return [q for q in own if q.query_id in chosen]
 
