@@ -12,7 +12,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dynapix.data.oracle.displacement import DIAGONAL, MODEL_SIZE, cross_scene_displacement
+from dynapix.data.oracle.displacement import (
+    MODEL_SIZE,
+    cross_scene_displacement,
+    distances_from,
+)
 from dynapix.data.oracle.extrapolation import extrapolate, project
 from dynapix.data.records import (
     Candidate,
@@ -38,13 +42,8 @@ def constant_velocity_error(item: SelectionItem, candidate: Candidate, store: St
     expected = project(positions, scene, store.manifest["config"])
     if expected is None:
         return np.nan
-    actual = dict(zip(other.object_keys, other.image_positions[candidate.frame], strict=True))
-    scale = MODEL_SIZE / np.array(scene.image_size)
-    distances = [
-        np.linalg.norm((expected[k] - actual[key]) * scale) if key in actual else DIAGONAL
-        for k, key in enumerate(scene.object_keys)
-    ]
-    return float(np.minimum(distances, DIAGONAL).mean())
+    expected = expected * (MODEL_SIZE / np.array(scene.image_size))
+    return float(distances_from(expected, scene, other, candidate.frame).mean())
 
 
 def score_velocity(item: SelectionItem, store: Store) -> float:

@@ -31,7 +31,7 @@ from dynapix.conf.runs import lock_file
 from dynapix.conf.schema import WorldConfig
 from dynapix.conf.schema.settings import from_dict
 from dynapix.data.items.futures.simulation import scene_states, simulate_futures
-from dynapix.data.oracle.displacement import DIAGONAL, MODEL_SIZE, visible_positions
+from dynapix.data.oracle.displacement import MODEL_SIZE, distances_from, visible_positions
 from dynapix.data.oracle.events import touching_pairs
 from dynapix.data.parallel import Workers, batched
 from dynapix.data.records import Scene, SelectionItem, sample_prefix_frames
@@ -207,14 +207,9 @@ def candidate_distances(
     """Return the sum of the distances of the known objects between K predictions (K, N, 2) and each
     of the four candidates, (K, 4) px at 336 x 336; the image's diagonal for a missing object. The
     candidates tie where no object is known."""
-    scene, distances = store.scene(item.scene_id), []
-    for candidate in item.candidates:
-        other = store.scene(candidate.scene_id)
-        places = other.image_positions[candidate.frame] * (MODEL_SIZE / np.array(other.image_size))
-        actual = dict(zip(other.object_keys, places, strict=True))
-        away = np.full(predicted.shape[:2], DIAGONAL)
-        for k, key in enumerate(scene.object_keys):
-            if key in actual:
-                away[:, k] = np.linalg.norm(predicted[:, k] - actual[key], axis=-1)
-        distances.append(np.minimum(away, DIAGONAL)[:, known].sum(axis=-1))
+    scene = store.scene(item.scene_id)
+    distances = [
+        distances_from(predicted, scene, store.scene(c.scene_id), c.frame)[:, known].sum(axis=-1)
+        for c in item.candidates
+    ]
     return np.stack(distances, axis=-1)

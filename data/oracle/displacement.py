@@ -67,6 +67,16 @@ def object_displacements(scene: Scene, frame: int, other: Scene, other_frame: in
     return displacements
 
 
+def distances_from(expected: np.ndarray, scene: Scene, other: Scene, frame: int) -> np.ndarray:
+    """Return the distances (..., N) of the objects of a scene in a frame of another one from their
+    expected image positions (..., N, 2), px at 336 x 336. The image's diagonal is the maximum, also
+    for an object that the other scene lacks."""
+    places = other.image_positions[frame] * (MODEL_SIZE / np.array(other.image_size))
+    actual = dict(zip(other.object_keys, places, strict=True))
+    found = np.stack([actual.get(key, np.full(2, np.inf)) for key in scene.object_keys])
+    return np.minimum(np.linalg.norm(expected - found, axis=-1), DIAGONAL)
+
+
 @lru_cache(maxsize=256)
 def _positions_by_appearance(
     scene: Scene, frame: int
