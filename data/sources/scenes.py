@@ -1,7 +1,7 @@
-"""Simulates the scenes of a benchmark or reads them from a release, in two splits.
+"""The scenes of a benchmark, in two splits: simulated by Bullet, or read from a release.
 
-A simulated scene records its contacts, the positions of its objects in the image, and which of them
-are visible.
+For the first, `data.sim` samples bodies and simulates their motion. This module adds what the
+camera sees of them, divides the scenes between the splits, and writes one file for each scene.
 """
 
 from __future__ import annotations
@@ -38,8 +38,14 @@ Element = TypeVar("Element")
 def make_scenes(
     cfg: BenchmarkConfig, folder: Path, workers: Workers, strict: bool
 ) -> tuple[dict[str, list[str]], dict[str, int]]:
-    """Write every missing scene below `folder`. Return scene ids by split, in a stable order, and
-    the number of invalid records, which stop a build if `strict` is set."""
+    """Write one file below `folder` for each scene of a benchmark that has none yet.
+
+    Args:
+        strict: Raise UserError at an invalid record of a release, instead of leaving it out.
+
+    Returns:
+        Scene ids by split, in a stable order, and the number of invalid records of a release.
+    """
     if cfg.simulator != "bullet":
         videos = split_scenes(cfg, list_release(cfg))
         splits = {split: [*chain.from_iterable(own)] for split, own in videos.items()}
@@ -58,17 +64,20 @@ def make_scenes(
 
 
 def scene_prefix(cfg: BenchmarkConfig) -> str:
-    """Return the start of the ids of a benchmark's scenes, so that ids differ between worlds."""
+    """Return what the ids of a benchmark's simulated scenes begin with: the name of the suite or of
+    the world, or nothing in the standard world. So ids differ between worlds."""
     if cfg.item_recipe != "dynapix":
         return f"{cfg.suite}-"
     return "" if cfg.world.name == "clevrer" else f"{cfg.world.name}-"
 
 
 def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, list[Element]]:
-    """Assign a random share of every `SPLIT_BLOCK` scenes to the test split; the order is kept.
+    """Divide scenes (or videos, as lists of clips) between the splits, in their order.
 
-    A scene's split depends only on its index, the seed and the test share, not on the number of
-    scenes, unless a split would be empty: it then gets a scene of the other one.
+    Of every `SPLIT_BLOCK` consecutive scenes, random ones go to the test split, as many as
+    `cfg.test_share` asks for. So the split of a scene depends on its index, the seed and the test
+    share, and not on the number of scenes. A split that would be empty gets the last scene of the
+    other one. Raises UserError if there is no other scene.
     """
     splits: dict[str, list[Element]] = {split: [] for split in SPLITS}
     for first in range(0, len(scenes), SPLIT_BLOCK):
@@ -93,7 +102,8 @@ def split_scenes(cfg: BenchmarkConfig, scenes: Sequence[Element]) -> dict[str, l
 
 
 def keep_test_scenes(cfg: BenchmarkConfig, scene_ids: dict[str, list[str]]) -> dict[str, list[str]]:
-    """Keep `cfg.test_scenes` random scenes of the test split, in the same order."""
+    """Return the ids with `cfg.test_scenes` random ones of the test split, or with all if that is
+    None. Their order stays."""
     test = scene_ids["test"]
     order = named_rng(cfg.seed, "test scenes").permutation(len(test))
     chosen = {*order[: cfg.test_scenes].tolist()}
@@ -101,7 +111,8 @@ def keep_test_scenes(cfg: BenchmarkConfig, scene_ids: dict[str, list[str]]) -> d
 
 
 def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> None:
-    """Simulate a scene and, for counterfactual queries, the scene without one of its objects."""
+    """Sample scene `index` of the world, and write it to `path`. If its split has counterfactual
+    queries, one object is removed, and the scene without it is written beside it."""
     sample = sample_scene(cfg.world, cfg.seed, index)
     scene = record_scene(path.stem, split, sample, cfg.world)
     has_queries = getattr(cfg.retrieval.counterfactual, split)
@@ -116,14 +127,15 @@ def _simulate_one(cfg: BenchmarkConfig, index: int, split: str, path: Path) -> N
 def simulate_without(
     name: str, split: str, bodies: list[Body], removed: int, world: WorldConfig
 ) -> Scene:
-    """Simulate a scene again without object `removed`. Objects that it never affects, directly or
-    through others, move bit-identically."""
+    """Return the scene that the same initial bodies give without body `removed`. Objects that it
+    never affects, directly or through others, move bit-identically."""
     rest = bodies[:removed] + bodies[removed + 1 :]
     return record_scene(name, split, Sample(rest, shared_simulator().simulate(rest, world)), world)
 
 
 def record_scene(name: str, split: str, sample: Sample, world: WorldConfig) -> Scene:
-    """Return the oracle of a sampled scene, with image positions and visibility."""
+    """Return the oracle of a sampled scene: its motion with contacts and landings, and where and
+    how much of each object the camera of the world sees."""
     scales = tuple(body.scale for body in sample.bodies)
     bounds = tuple(world.speed_bounds)
     return Scene(
