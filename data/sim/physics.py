@@ -184,25 +184,22 @@ class Simulator:
     @contextmanager
     def _changed(self, handles: Sequence[int], branch: Branch) -> Iterator[None]:
         """Apply what a branch changes besides the states, which a saved state does not include."""
-        bullet = self._bullet
-        infos = [bullet.getDynamicsInfo(handle, -1) for handle in handles]
-        masses = branch.masses or [1.0] * len(handles)
-        for handle, info, factor in zip(handles, infos, masses, strict=True):
-            if factor != 1:
-                bullet.changeDynamics(handle, -1, mass=info[0] * factor)
-            if branch.restitution != 1:
-                bullet.changeDynamics(handle, -1, restitution=info[5] * branch.restitution)
-        if branch.passing:
-            one, two = (handles[k] for k in branch.passing)
-            bullet.setCollisionFilterPair(one, two, -1, -1, 0)
+        bullet, changes = self._bullet, []
+        for handle, factor in zip(handles, branch.masses or [1.0] * len(handles), strict=True):
+            info = bullet.getDynamicsInfo(handle, -1)
+            changes.append((handle, "mass", info[0], factor))
+            changes.append((handle, "restitution", info[5], branch.restitution))
+        changes = [change for change in changes if change[-1] != 1]
+        pairs = [[handles[k] for k in branch.passing]] if branch.passing else []
+        for handle, name, value, factor in changes:
+            bullet.changeDynamics(handle, -1, **{name: value * factor})
+        for pair in pairs:
+            bullet.setCollisionFilterPair(*pair, -1, -1, 0)
         yield
-        for handle, info, factor in zip(handles, infos, masses, strict=True):
-            if factor != 1:
-                bullet.changeDynamics(handle, -1, mass=info[0])
-            if branch.restitution != 1:
-                bullet.changeDynamics(handle, -1, restitution=info[5])
-        if branch.passing:
-            bullet.setCollisionFilterPair(one, two, -1, -1, 1)
+        for handle, name, value, _ in changes:
+            bullet.changeDynamics(handle, -1, **{name: value})
+        for pair in pairs:
+            bullet.setCollisionFilterPair(*pair, -1, -1, 1)
 
     def _run(
         self,
