@@ -27,8 +27,7 @@ from dynapix.conf.help import help_text
 from dynapix.conf.multirun.sweep import run_sweep
 from dynapix.conf.runs import Run, lock_folder, open_run, rank, run_name, world_size
 
-Metrics = dict[str, float]
-Main = Callable[[Any, Run], Metrics | None]
+Main = Callable[[Any, Run], dict[str, float] | None]
 
 
 def command(name: str, schema: type, ranks: bool = False) -> Callable[[Main], Callable[[], None]]:
@@ -138,12 +137,13 @@ def format_settings(cfg: DictConfig, kind: str, package: str | None, resolve: bo
     return OmegaConf.to_yaml(shown, resolve=resolve)
 
 
-def _run(name: str, main: Main, settings: Any, run: Run) -> Metrics | None:
+def _run(name: str, main: Main, settings: Any, run: Run) -> None:
     """Run one job: lock and open its folder, call `main`, write its metrics."""
     if rank() > 0:
         # Only the main rank locks and opens the folder. The other ranks log only errors.
         logging.disable(logging.WARNING)
-        return main(settings, run)
+        main(settings, run)
+        return
     busy = (
         f"{run.folder} is in use by another process of this command: wait for it, or choose "
         "another folder with run=NAME"
@@ -153,4 +153,3 @@ def _run(name: str, main: Main, settings: Any, run: Run) -> Metrics | None:
         metrics = main(settings, run)
         if metrics is not None:
             write_json(run.folder / "metrics.json", metrics)
-    return metrics

@@ -132,11 +132,6 @@ def runs_folder(checkpoints: str, product: str, run: str = "") -> str:
     return f"{checkpoints}/{TRAINER_FOLDERS.get(product, product)}"
 
 
-def is_run_name(run: str) -> bool:
-    """Return whether a name, such as exp-cot or SWEEP/NUMBER, stays within the folder of runs."""
-    return not os.path.isabs(run) and run.split(os.sep)[0] not in (".", "..")
-
-
 def read_finished_metrics(run: Run) -> dict[str, float] | None:
     """Return the metrics of a run that is finished, and log how to train again; otherwise None."""
     path = run.folder / "metrics.json"

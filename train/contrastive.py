@@ -12,7 +12,6 @@ from dynapix.conf.errors import UserError
 from dynapix.conf.gpus import restrict_to_one_gpu
 from dynapix.conf.runs import Run, rank, read_finished_metrics
 from dynapix.conf.schema import ContrastiveCommand
-from dynapix.conf.trackers import check_trackers
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +21,6 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics
     restrict_to_one_gpu()
-    check_trackers(cfg.train.report_to)
 
     from transformers import set_seed
 
@@ -36,6 +34,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from dynapix.train.common.journal import run_metrics
     from dynapix.train.common.model_card import write_run_card
     from dynapix.train.common.training_loop import (
+        check_trackers,
         explain_load_errors,
         newest_checkpoint,
         run_training,
@@ -43,6 +42,7 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     from dynapix.train.retriever.batches import read_pools, split_queries
     from dynapix.train.retriever.trainer import build_trainer
 
+    check_trackers(cfg.train.report_to)
     keep_freed_memory()
     if is_sharded():
         raise UserError(

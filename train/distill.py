@@ -8,7 +8,6 @@ from dynapix.conf.entry import Run, command
 from dynapix.conf.gpus import restrict_to_one_gpu
 from dynapix.conf.runs import read_finished_metrics
 from dynapix.conf.schema import DistillCommand
-from dynapix.conf.trackers import check_trackers
 
 
 @command("train.distill", DistillCommand, ranks=True)
@@ -16,7 +15,6 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics
     restrict_to_one_gpu()
-    check_trackers(cfg.train.report_to)
 
     from dynapix.data.build import ensure_benchmark
     from dynapix.models import compat, distributed
@@ -24,7 +22,7 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
     from dynapix.models.resolved_settings import data_digest
     from dynapix.models.trained_runs import product_folder
     from dynapix.teacher.narrate import ensure_rationales
-    from dynapix.train.common.training_loop import newest_checkpoint
+    from dynapix.train.common.training_loop import check_trackers, newest_checkpoint
     from dynapix.train.on_policy.continuation import (
         inherit_settings,
         load_source,
@@ -41,6 +39,7 @@ def main(cfg: DistillCommand, run: Run) -> dict[str, float]:
         read_teacher_settings,
     )
 
+    check_trackers(cfg.train.report_to)
     compat.keep_freed_memory()
     source, trained = read_source_settings(cfg.model)
     cfg = inherit_settings(cfg, trained)

@@ -12,7 +12,6 @@ from dynapix.conf.entry import Run, command
 from dynapix.conf.gpus import restrict_to_one_gpu
 from dynapix.conf.runs import read_finished_metrics
 from dynapix.conf.schema import ReinforceCommand
-from dynapix.conf.trackers import check_trackers
 
 
 @command("train.reinforce", ReinforceCommand, ranks=True)
@@ -20,14 +19,13 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics
     restrict_to_one_gpu()
-    check_trackers(cfg.train.report_to)
 
     from dynapix.data.build import ensure_benchmark
     from dynapix.models import compat, distributed
     from dynapix.models.fingerprints import weights_digest
     from dynapix.models.resolved_settings import data_digest
     from dynapix.models.trained_runs import product_folder
-    from dynapix.train.common.training_loop import newest_checkpoint
+    from dynapix.train.common.training_loop import check_trackers, newest_checkpoint
     from dynapix.train.on_policy.continuation import (
         inherit_settings,
         load_source,
@@ -38,6 +36,7 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     from dynapix.train.on_policy.judged_items import load_items
     from dynapix.train.on_policy.reinforcement import build_trainer
 
+    check_trackers(cfg.train.report_to)
     compat.keep_freed_memory()
     source, trained = read_source_settings(cfg.model)
     cfg = inherit_settings(cfg, trained)

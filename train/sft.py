@@ -11,7 +11,6 @@ from dynapix.conf.entry import Run, command
 from dynapix.conf.gpus import restrict_to_one_gpu
 from dynapix.conf.runs import rank, read_finished_metrics
 from dynapix.conf.schema import SftCommand
-from dynapix.conf.trackers import check_trackers
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +20,6 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     if (metrics := read_finished_metrics(run)) is not None:
         return metrics
     restrict_to_one_gpu()
-    check_trackers(cfg.train.report_to)
 
     from transformers import set_seed
 
@@ -37,6 +35,7 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     from dynapix.train.student.dataset import load_datasets, tokenizer_corpus
     from dynapix.train.student.trainer import build_trainer
 
+    training_loop.check_trackers(cfg.train.report_to)
     compat.keep_freed_memory()
     # Check the batch and the base now, because building the benchmark may take long.
     distributed.split_batch(cfg.train.batch, cfg.train.micro_batch)

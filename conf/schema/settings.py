@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field, fields
 from math import isfinite
@@ -11,7 +12,7 @@ from urllib.parse import urlsplit
 
 from dynapix.conf.errors import UserError
 from dynapix.conf.files import expand_path, refuse_broken_link
-from dynapix.conf.runs import is_run_name, resolve_run_name
+from dynapix.conf.runs import resolve_run_name
 
 MISSING: Any = "???"
 """Default of a required setting. It equals `omegaconf.MISSING`, but importing the schema does not
@@ -134,7 +135,8 @@ def check_choices(name: str, chosen: Sequence[str] | None, options: Sequence[str
 
 def check_run(run: str, folder: str) -> list[str]:
     """Check that `run` is the name of a run in `folder`, or the path of a folder inside it."""
-    if is_run_name(resolve_run_name(run, folder)):
+    name = resolve_run_name(run, folder)
+    if not os.path.isabs(name) and name.split(os.sep)[0] not in (".", ".."):
         return []
     return [
         f"run={run} is not a run in {folder}: give its name or its folder, and "

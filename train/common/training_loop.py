@@ -9,7 +9,7 @@ import logging
 import os
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
 from tqdm.contrib.logging import logging_redirect_tqdm
 from transformers import PrinterCallback, ProgressCallback, Trainer
+from transformers.integrations import get_reporting_integration_callbacks
 from transformers.trainer_callback import TrainerState
 
 from dynapix.conf.errors import UserError
@@ -63,6 +64,16 @@ READERS = {
 """By suffix, a function that raises an error if a file is incomplete."""
 ACCESS_ERRNOS = (errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE)
 """Numbers of operating system errors that say nothing about the content of a file."""
+
+
+def check_trackers(report_to: Sequence[str]) -> None:
+    """Raise UserError if an experiment tracker is unknown or its package is not installed."""
+    for name in report_to:
+        try:
+            for callback in get_reporting_integration_callbacks([name]):
+                callback()
+        except (ImportError, RuntimeError, ValueError) as error:
+            raise UserError(f"train.report_to={name}: {error}", code="unknown-tracker") from error
 
 
 def newest_checkpoint(folder: Path) -> Path | None:

@@ -18,7 +18,6 @@ from tqdm import tqdm
 from transformers import ProcessorMixin, Qwen3VLConfig
 from transformers.trainer_callback import TrainerControl, TrainerState
 
-from dynapix.conf import trackers
 from dynapix.conf.entry import Run
 from dynapix.conf.schema import SelectCommand, SftCommand
 from dynapix.evaluation.generators.generator import item_sample
@@ -29,6 +28,7 @@ from dynapix.models.student.prompts import build_sample
 from dynapix.train import sft
 from dynapix.train.common.callbacks import MetricsBar
 from dynapix.train.common.journal import read_journal, read_lines
+from dynapix.train.common.training_loop import check_trackers
 from dynapix.train.student.held_out_answers import HeldOutAnswers
 from dynapix.train.student.samples import LazySample, StudentDataset
 from tests.user_errors import raises_user_error
@@ -165,8 +165,8 @@ def test_the_progress_bar_shows_the_latest_measures() -> None:
 
 
 def test_an_unknown_or_missing_tracker_is_refused() -> None:
-    trackers.check_trackers(["tensorboard"])
+    check_trackers(["tensorboard"])
     with raises_user_error("unknown-tracker", contains="train.report_to=tensorbord"):
-        trackers.check_trackers(["tensorbord"])
+        check_trackers(["tensorbord"])
     with raises_user_error("unknown-tracker", contains="pip install dvclive"):
-        trackers.check_trackers(["tensorboard", "dvclive"])
+        check_trackers(["tensorboard", "dvclive"])
