@@ -243,10 +243,10 @@ class Result:
         letters = [o.letter for o in self.outcomes]
         choices = Choices(self.name, mode, None, credits, letters)
         records = [item.record for item in self.items]
-        name, build = self.benchmark.name, self.benchmark.store.identity
         asked = [(TEXT, None, TEXT)] if self._texts else []
         suite = records[0].suite if records[0].suite in PAIRED else None
-        return build_selection_report([choices], records, name, build, self.seed, suite, asked)
+        store = self.benchmark.store
+        return build_selection_report([choices], records, store, self.seed, suite, asked)
 
     @property
     def accuracy(self) -> SelectionResult:

@@ -100,9 +100,7 @@ def main(cfg: SelectCommand, run: Run) -> dict[str, float]:
         if variant[0] == "reasoning"
         and (summary := measure_reasons(items, responses, store, cfg.seed)) is not None
     }
-    report = build_selection_report(
-        choices, items, store.name, store.identity, cfg.seed, cfg.suite, asked, reasons
-    )
+    report = build_selection_report(choices, items, store, cfg.seed, cfg.suite, asked, reasons)
     write_report(report, run.folder, items[0].suite)
     return {
         f"{r.mode}_{name}": value

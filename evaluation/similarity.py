@@ -54,7 +54,7 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
         choices.append(Choices(name, SIMILARITY, None, credits, letters))
 
     write_json_lines(run.folder / "scores.jsonl", score_rows)
-    report = build_selection_report(choices, items, store.name, store.identity, cfg.seed, cfg.suite)
+    report = build_selection_report(choices, items, store, cfg.seed, cfg.suite)
     write_report(report, run.folder, items[0].suite)
     return report.rows[0].metrics
 

@@ -33,4 +33,4 @@ def baseline_results(
         for name, title in TITLES.items()
         if not np.isnan([s[name] for s in scores]).any()
     ]
-    return build_selection_report(choices, items, store.name, store.identity, seed).rows
+    return build_selection_report(choices, items, store, seed).rows

@@ -32,6 +32,7 @@ from dynapix.evaluation.metrics.significance import (
 )
 
 if TYPE_CHECKING:
+    from dynapix.data.store import Store
     from dynapix.evaluation.generators.response_log import Answer
 
 
@@ -81,8 +82,7 @@ def is_best(scores: np.ndarray) -> np.ndarray:
 def build_selection_report(
     choices: Sequence[Choices],
     items: Sequence[SelectionItem],
-    benchmark: str,
-    build: str,
+    store: Store,
     seed: int,
     suite: str | None = None,
     asked: Sequence[tuple[str, str | None, str]] = (),
@@ -91,16 +91,17 @@ def build_selection_report(
     """Return the report of the choices of one or several models on the same items.
 
     Args:
-        benchmark, suite: As in `SelectionResult`.
-        build, asked, reasons: As in `SelectionReport`.
+        store: The benchmark of the items.
         seed: Seed of the resampling of scenes.
+        suite: As in `SelectionResult`.
+        asked, reasons: As in `SelectionReport`.
     """
     scenes = SceneBootstrap([i.scene_id for i in items], seed)
-    results = [_selection_result(c, items, scenes, benchmark, suite) for c in choices]
+    results = [_selection_result(c, items, scenes, store.name, suite) for c in choices]
     by_key = {result.key: c for result, c in zip(results, choices, strict=True)}
     subtypes = [f"{i.family}/{i.subtype}" for i in items]
     return SelectionReport(
-        build,
+        store.identity,
         results,
         controls=_compare_controls(by_key, items, seed),
         subtypes={key: scenes.group_means(c.credits, subtypes) for key, c in by_key.items()},
@@ -137,14 +138,20 @@ def _selection_result(
     suite: str | None,
 ) -> SelectionResult:
     accuracy = accuracy_by_family([i.family for i in items], choices.credits, scenes)
-    letters, parse_rate = choices.letters, None
+    parse_rate = None
     if choices.mode not in (BASELINE, SIMILARITY):
-        parse_rate = sum(x is not None for x in letters) / len(letters)
+        parse_rate = sum(x is not None for x in choices.letters) / len(items)
     return SelectionResult(
-        benchmark, choices.name, choices.mode, accuracy.families, accuracy.macro, accuracy.micro,
-        parse_rate, len(items), accuracy_by_horizon(items, choices.credits, scenes), suite,
-        choices.control,
-    )  # fmt: skip
+        benchmark,
+        choices.name,
+        choices.mode,
+        **vars(accuracy),
+        parse_rate=parse_rate,
+        n=len(items),
+        horizons=accuracy_by_horizon(items, choices.credits, scenes),
+        suite=suite,
+        control=choices.control,
+    )
 
 
 def accuracy_by_horizon(

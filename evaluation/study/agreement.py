@@ -91,5 +91,4 @@ def _majority_vote(votes: pd.DataFrame, counts: pd.DataFrame, seed: int) -> Majo
     choices = majority(counts)
     items = votes.groupby("item_id").first().loc[counts.index]
     accuracy = _accuracy(items, list(choices == items.answer), seed)
-    parts = accuracy.families, accuracy.macro, accuracy.micro
-    return MajorityVote(*parts, undecided=int(choices.isna().sum()))
+    return MajorityVote(**vars(accuracy), undecided=int(choices.isna().sum()))

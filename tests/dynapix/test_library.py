@@ -134,7 +134,7 @@ def test_a_result_is_the_report_of_the_command(bench, micro_store) -> None:
     items = micro_store.selection("test")
     credits = [float(item.letter == "A") for item in items]
     choices = Choices("model", "text", None, credits, ["A"] * len(items))
-    report = build_selection_report([choices], items, "micro", micro_store.identity, 3)
+    report = build_selection_report([choices], items, micro_store, 3)
     assert result.accuracy == report.rows[0]
     assert str(selection_table(report.rows)) in str(result)
 

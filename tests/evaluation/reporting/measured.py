@@ -105,7 +105,7 @@ def select_run(
     title = (model or "small base") + f", prompt of {prompt_regime}" * bool(prompt_regime)
     choices = Choices.from_answers(title, mode, None, answers)
     asked = [(mode, None, "k1")]
-    report = build_selection_report([choices], items, store.name, store.identity, 0, suite, asked)
+    report = build_selection_report([choices], items, store, 0, suite, asked)
     write_report(report, folder, items[0].suite)
     keys = {"key": "k1", "mode": mode}
     lines = [{**keys, "asked": {"control": None, "seed": 0}}]
@@ -146,7 +146,7 @@ def similarity_run(
             rows.append({"by": title, "item_id": item.item_id, "scores": own})
     folder = root / "similarity" / (model or name)
     finish(folder, settings)
-    report = build_selection_report(choices, items, store.name, store.identity, 0)
+    report = build_selection_report(choices, items, store, 0)
     write_report(report, folder, items[0].suite)
     write_json_lines(folder / "scores.jsonl", rows)
     return folder

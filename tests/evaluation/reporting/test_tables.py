@@ -54,7 +54,8 @@ def selection() -> SelectionResult:
         for k, family in enumerate(FAMILIES)
     ]  # fmt: skip
     choices = Choices("one", "answer", None, CREDITS, ["A"] * len(items))
-    return build_selection_report([choices], items, "tiny", "build", seed=4).rows[0]
+    store = SimpleNamespace(name="tiny", identity="build")
+    return build_selection_report([choices], items, store, seed=4).rows[0]
 
 
 @pytest.fixture(scope="module")
