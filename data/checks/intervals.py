@@ -38,15 +38,14 @@ class SceneBootstrap:
     def mean(self, values: Sequence[float]) -> Interval:
         """Return the mean of the values (items,)."""
         values = np.asarray(values, float)
-        return _interval(values.mean(), self._counts @ values / self._counts.sum(1), len(values))
+        return interval_of(values.mean(), self._counts @ values / self._counts.sum(1), len(values))
 
     def ratio(self, parts: Sequence[float], wholes: Sequence[float]) -> Interval:
         """Return the sum of the parts (items,) divided by the sum of the wholes (items,), of which
         at least one is positive. Resamples whose wholes are all 0 do not count."""
         parts, wholes = np.asarray(parts, float), np.asarray(wholes, float)
-        above, below = self._counts @ parts, self._counts @ wholes
-        resampled = np.divide(above, below, out=np.full_like(above, np.nan), where=below > 0)
-        return _interval(parts.sum() / wholes.sum(), resampled, len(parts))
+        resampled = divide(self._counts @ parts, self._counts @ wholes)
+        return interval_of(parts.sum() / wholes.sum(), resampled, len(parts))
 
     def median(self, values: Sequence[float]) -> Interval:
         """Return the median of the values (items,)."""
@@ -56,7 +55,7 @@ class SceneBootstrap:
         total = cumulative[:, -1:]
         # The median of an even number of items is the mean of the middle two.
         middle = [(cumulative > index).argmax(1) for index in ((total - 1) // 2, total // 2)]
-        return _interval(np.median(values), values[order][middle].mean(0), len(values))
+        return interval_of(np.median(values), values[order][middle].mean(0), len(values))
 
     def group_means(self, values: Sequence[float], groups: Sequence[str]) -> dict[str, Interval]:
         """Return the mean of the values of each group, sorted by group.
@@ -72,7 +71,7 @@ class SceneBootstrap:
         names, resampled = self._resample_groups(values, groups)
         members = [values[groups == name] for name in names]
         return {
-            str(name): _interval(own.mean(), resampled[:, k], len(own))
+            str(name): interval_of(own.mean(), resampled[:, k], len(own))
             for k, (name, own) in enumerate(zip(names, members, strict=True))
         }
 
@@ -84,7 +83,7 @@ class SceneBootstrap:
         values, groups = np.asarray(values, float), np.asarray(groups, str)
         names, resampled = self._resample_groups(values, groups)
         mean = np.mean([values[groups == name].mean() for name in names])
-        return _interval(mean, np.nanmean(resampled, axis=1), len(values))
+        return interval_of(mean, np.nanmean(resampled, axis=1), len(values))
 
     def _resample_groups(
         self, values: np.ndarray, groups: np.ndarray
@@ -93,10 +92,15 @@ class SceneBootstrap:
         a group without items."""
         names, codes = np.unique(groups, return_inverse=True)
         member = np.eye(len(names))[codes]
-        sums, counts = self._counts @ (member * values[:, None]), self._counts @ member
-        return names, np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
+        return names, divide(self._counts @ (member * values[:, None]), self._counts @ member)
 
 
-def _interval(value: float, resampled: np.ndarray, n: int) -> Interval:
+def divide(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return sums / counts in resamples: NaN where nothing was counted."""
+    return np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
+
+
+def interval_of(value: float, resampled: np.ndarray, n: int) -> Interval:
+    """Return a statistic of `n` items, with the interval of its values in resamples."""
     low, high = np.nanpercentile(resampled, [2.5, 97.5])
     return Interval(float(value), float(low), float(high), n)

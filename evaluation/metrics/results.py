@@ -12,6 +12,7 @@ from dynapix.data.checks.intervals import Interval, SceneBootstrap
 from dynapix.data.records import FAMILIES, RetrievalQuery
 from dynapix.evaluation.metrics.ranking import query_metrics
 from dynapix.evaluation.metrics.reasons import ReasonSummary
+from dynapix.evaluation.metrics.seeds import MACRO
 from dynapix.evaluation.metrics.significance import PairedComparison, PairScores
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ class SelectionResult:
     def metrics(self) -> dict[str, float]:
         """The accuracies by family, macro and micro."""
         families = {family: interval.value for family, interval in self.families.items()}
-        return {**families, "macro": self.macro.value, "micro": self.micro.value}
+        return {**families, MACRO: self.macro.value, "micro": self.micro.value}
 
 
 def variant_name(mode: str, control: str | None) -> str:

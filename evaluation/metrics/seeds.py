@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dynapix.data.checks.intervals import Interval
+from dynapix.data.checks.intervals import Interval, divide, interval_of
 from dynapix.data.records import FAMILIES
 
 MACRO = "macro"
@@ -59,10 +59,10 @@ class SeedBootstrap:
         return self._summarize(means, draws - self._draws(*second))
 
     def _summarize(self, means: np.ndarray, draws: np.ndarray) -> dict[str, Interval]:
-        low, high = np.nanpercentile(draws, [2.5, 97.5], axis=0)
         counts = [int(members.sum()) for members in self._members.values()]
-        rows = zip(means.tolist(), low.tolist(), high.tolist(), [*counts, sum(counts)], strict=True)
-        return dict(zip((*self._members, MACRO), (Interval(*row) for row in rows), strict=True))
+        columns = zip(means, draws.T, [*counts, sum(counts)], strict=True)
+        intervals = (interval_of(*column) for column in columns)
+        return dict(zip((*self._members, MACRO), intervals, strict=True))
 
     def _means(self, credits: np.ndarray) -> np.ndarray:
         means = [credits[members].mean() for members in self._members.values()]
@@ -79,6 +79,5 @@ class SeedBootstrap:
             np.add.at(sums, self._scene[members], credits[members])
             counts = self._weights @ np.bincount(self._scene[members], minlength=len(sums))
             totals = ((self._weights @ sums) * seed_shares).sum(axis=1)
-            # A draw without an item of a family does not count for it.
-            means.append(np.divide(totals, counts, out=np.full(DRAWS, np.nan), where=counts > 0))
+            means.append(divide(totals, counts))
         return np.column_stack([*means, np.nanmean(means, axis=0)])

@@ -14,6 +14,7 @@ from dynapix.conf.errors import UserError
 from dynapix.data.checks.intervals import Interval, SceneBootstrap
 from dynapix.data.items.controls import pair_items
 from dynapix.data.records import FAMILIES, SelectionItem
+from dynapix.evaluation.metrics.seeds import MACRO
 
 MAX_NAMED_ITEMS = 3
 """Most items of each run that the error about different items names."""
@@ -81,7 +82,7 @@ def compare_runs(
     families = np.array([i.family for i in items])
     scenes = np.array([i.scene_id for i in items])
     masks = {f: families == f for f in FAMILIES if f in families}
-    masks = {**masks, "macro": slice(None)} if len(masks) > 1 else {}
+    masks = {**masks, MACRO: slice(None)} if len(masks) > 1 else {}
     compared = [
         _compare(names, of, credits[mask], families[mask], scenes[mask], seed)
         for of, mask in masks.items()
@@ -181,7 +182,7 @@ def _compare(
     mean = SceneBootstrap(scenes, seed).macro(differences, families)
     p = sign_flip_test(differences, families, scenes, seed)
     counts: tuple = ()
-    if of != "macro":
+    if of != MACRO:
         better = int((differences > 0).sum()), int((differences < 0).sum())
         counts = (*better, mcnemar_test(*better))
     return PairedComparison(
