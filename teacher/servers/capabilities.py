@@ -99,9 +99,14 @@ async def find_capabilities(
     found = await ask(optional, samples)
     if found is None:
         refused = {k for k, v in optional.items() if await ask({k: v}, 1) is None}
-        count = samples
-        while count > 1 and (found := await ask({}, count)) is None:
-            count -= 1
+        # The server gives `given` responses to a request, and does not give `too_many`.
+        given, too_many, count = 1, samples + 1, samples
+        while too_many - given > 1:
+            if (answer := await ask({}, count)) is None:
+                too_many = count
+            else:
+                given, found = count, answer
+            count = (given + too_many) // 2
     most = (len(found) if found else 1) if samples > 1 else None
     for form, asked in constraint_forms(_unlikely(constraint)).items() if constraint else ():
         answer = await ask(asked, 1, PROBE_TOKENS)
