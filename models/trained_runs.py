@@ -48,6 +48,15 @@ def run_title(folder: Path) -> str:
     return f"{folder.parent.name}/{folder.name}" if folder.name.isdigit() else folder.name
 
 
+def locate_run(model: str, checkpoints: Path) -> Path | None:
+    """Return the folder of the run that the setting `model` of an evaluation names; None if there
+    is none. If the runs were moved, or the working directory is another, it is below
+    `checkpoints`, in KIND/NAME or KIND/SWEEP/NUMBER."""
+    path = Path(model)
+    moved = (checkpoints.joinpath(*path.parts[k:]) for k in range(1, len(path.parts) - 1))
+    return next((f for f in (path, *moved) if (f / "config.yaml").is_file()), None)
+
+
 def read_export_record(folder: Path) -> dict[str, Any]:
     """Return the record of an export: the exported `run`, the `format`, and the SHA-256 of the
     adapters (`weights`).

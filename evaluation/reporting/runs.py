@@ -20,7 +20,7 @@ from dynapix.evaluation.metrics.results import (
     from_json,
 )
 from dynapix.evaluation.reporting.run_responses import Responses, read_responses, reading
-from dynapix.models.trained_runs import settings_file
+from dynapix.models.trained_runs import locate_run, settings_file
 
 SELECTION_KINDS, RETRIEVAL_KINDS = ("select", "similarity"), ("retrieve", "two_stage")
 STUDY_KINDS, TRAINING_KINDS = ("export_study",), ("sft", "distill", "reinforce", "contrastive")
@@ -161,12 +161,8 @@ def _training_settings(
     model = settings.get("model") or (settings.get("matcher") or {}).get("model")
     if model is None:
         return None, {}
-    path = Path(str(model))
-    # If the runs were moved, or the working directory is another, the model is below `root`.
-    folders = [path, root / Path(*path.parts[1:])]
-    found = [folder for folder in folders if (folder / "config.yaml").is_file()]
-    if not found:
+    if (folder := locate_run(str(model), root)) is None:
         return {}, {}
-    recipe = _read_settings(found[0])
-    file = settings_file(found[0]).name
-    return (recipe if file == "config.yaml" else _read_settings(found[0], file)), recipe
+    recipe = _read_settings(folder)
+    file = settings_file(folder).name
+    return (recipe if file == "config.yaml" else _read_settings(folder, file)), recipe

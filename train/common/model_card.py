@@ -19,10 +19,10 @@ from dynapix.models.fingerprints import is_hub_model
 from dynapix.models.resolved_settings import read_resolved
 from dynapix.models.student.chat_format import TIMED_PROCESSORS
 from dynapix.models.student.prompts import choose_instruction, write_time
-from dynapix.models.trained_runs import modes_of_regime, read_settings
+from dynapix.models.trained_runs import locate_run, modes_of_regime, read_settings
 
 CARD = "README.md"
-EVALUATIONS = ("select", "similarity", "retrieve")
+EVALUATIONS = ("select", "similarity", "retrieve", "two_stage")
 """Folders below checkpoints/ of the evaluations whose results a card shows."""
 TIMES = {
     "video": (
@@ -51,7 +51,8 @@ def find_evaluations(checkpoints: Path, run: Path) -> list[Evaluation]:
     for command in EVALUATIONS:
         for metrics in sorted(checkpoints.glob(f"{command}/**/metrics.json")):
             settings = read_settings(metrics.parent / "config.yaml")
-            if not settings.get("model") or Path(settings["model"]).resolve() != run.resolve():
+            model = settings.get("model") and locate_run(settings["model"], checkpoints)
+            if not model or model.resolve() != run.resolve():
                 continue
             if settings.get("limit") is None and settings.get("control") is None:
                 benchmark = settings["benchmark"]["name"]
