@@ -23,12 +23,7 @@ from dynapix.data.records import LETTERS
 from dynapix.evaluation.metrics.future_moment import FutureMoment, measure_future_moment
 from dynapix.evaluation.metrics.ranking import to_array
 from dynapix.evaluation.metrics.results import SIMILARITY, SelectionReport, SelectionResult
-from dynapix.evaluation.metrics.selection import (
-    Choices,
-    build_selection_report,
-    choose_letters,
-    credit_choices,
-)
+from dynapix.evaluation.metrics.selection import Choices, build_selection_report
 from dynapix.evaluation.metrics.significance import PairedComparison, compare_runs
 from dynapix.evaluation.reporting.run_responses import nearest_candidates
 from dynapix.integrations.logs import Log, name_damage, read_inspect, read_lmms_eval
@@ -145,9 +140,10 @@ def _read(item: Item, prediction: Any) -> Outcome:
         return _failure(item, f"predict returned {_shorten(prediction)}")
     if not np.isfinite(scores).all():
         return _failure(item, f"predict returned the scores {scores.tolist()}, not all finite")
-    [letter], credit = choose_letters(scores[None]), credit_choices(scores[None], [item.index])
+    chosen = nearest_candidates(scores.tolist())
+    letter, credit = chosen.letter, chosen.credit(item.answer)
     reason = None if letter else "tied scores"
-    return Outcome(item.item_id, None, tuple(scores.tolist()), letter, float(credit[0]), reason)
+    return Outcome(item.item_id, None, tuple(scores.tolist()), letter, credit, reason)
 
 
 def _read_text(item: Item, text: str, truncated: bool = False) -> Outcome:

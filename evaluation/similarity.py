@@ -26,13 +26,8 @@ log = logging.getLogger(__name__)
 def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     from dynapix.data.records import FrameRef
     from dynapix.evaluation.embedders.embedder import open_retriever
-    from dynapix.evaluation.metrics.results import SIMILARITY
-    from dynapix.evaluation.metrics.selection import (
-        Choices,
-        build_selection_report,
-        choose_letters,
-        credit_choices,
-    )
+    from dynapix.evaluation.metrics.selection import Choices, build_selection_report
+    from dynapix.evaluation.reporting.run_responses import nearest_candidates
     from dynapix.evaluation.select import select_items, write_report
     from dynapix.models.distributed import end_ranks
 
@@ -46,12 +41,10 @@ def main(cfg: SimilarityCommand, run: Run) -> dict[str, float]:
     choices, score_rows = [], []
     for name, queries, embeddings in embedded:
         log.info("scoring %s items with %s", f"{len(items):,}", name)
-        scores = score_candidates(items, queries, embeddings, preset)
-        credits = credit_choices(scores, [item.answer for item in items])
-        for item, row in zip(items, scores.tolist(), strict=True):
+        scores = score_candidates(items, queries, embeddings, preset).tolist()
+        for item, row in zip(items, scores, strict=True):
             score_rows.append({"by": name, "item_id": item.item_id, "scores": row})
-        letters = choose_letters(scores)
-        choices.append(Choices(name, SIMILARITY, None, credits, letters))
+        choices.append(Choices.from_scores(name, [*map(nearest_candidates, scores)], items))
 
     write_json_lines(run.folder / "scores.jsonl", score_rows)
     report = build_selection_report(choices, items, store, cfg.seed, cfg.suite)

@@ -8,13 +8,11 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from dynapix.conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
 from dynapix.data.checks.intervals import Interval, SceneBootstrap
 from dynapix.data.items.controls import pair_items
 from dynapix.data.items.recipes import TIME_CELLS
-from dynapix.data.records import LETTERS, SelectionItem
+from dynapix.data.records import SelectionItem
 from dynapix.evaluation.metrics.reasons import ReasonSummary
 from dynapix.evaluation.metrics.results import (
     BASELINE,
@@ -34,6 +32,7 @@ from dynapix.evaluation.metrics.significance import (
 if TYPE_CHECKING:
     from dynapix.data.store import Store
     from dynapix.evaluation.generators.response_log import Answer
+    from dynapix.evaluation.reporting.run_responses import ItemResponse
 
 
 @dataclass(frozen=True)
@@ -61,22 +60,13 @@ class Choices:
         credits = [float(answer.right) for answer in answers]
         return cls(name, mode, control, credits, [a.letter for a in answers], answers)
 
-
-def credit_choices(scores: np.ndarray, answers: Sequence[int]) -> np.ndarray:
-    """Return credits (items,): 1 if the target alone has the highest score, 1/m if m candidates
-    with the target among them have it, and 0 otherwise."""
-    best = is_best(scores)
-    return best[np.arange(len(best)), answers] / best.sum(axis=1)
-
-
-def choose_letters(scores: np.ndarray) -> list[str | None]:
-    """Return the letter of each item's highest score; None for a tie."""
-    return [LETTERS[row.argmax()] if row.sum() == 1 else None for row in is_best(scores)]
-
-
-def is_best(scores: np.ndarray) -> np.ndarray:
-    """Return which candidates (items, candidates) have their item's highest score."""
-    return scores == scores.max(axis=1, keepdims=True)
+    @classmethod
+    def from_scores(
+        cls, name: str, responses: Sequence[ItemResponse], items: Sequence[SelectionItem]
+    ) -> Choices:
+        """Return the choices of a retriever, which `nearest_candidates` returned for its scores."""
+        credits = [r.credit(item.letter) for r, item in zip(responses, items, strict=True)]
+        return cls(name, SIMILARITY, None, credits, [r.letter for r in responses])
 
 
 def build_selection_report(

@@ -20,7 +20,7 @@ from dynapix.data.records import FPS, FRAMES, FrameRef, sample_prefix_frames
 from dynapix.evaluation import similarity
 from dynapix.evaluation.embedders.joint_encoder import load_encoder
 from dynapix.evaluation.embedders.languagebind import LanguageBindVideo, spread, unit_rows
-from dynapix.evaluation.metrics.selection import choose_letters, credit_choices
+from dynapix.evaluation.reporting.run_responses import nearest_candidates
 from tests.evaluation.models import released
 from tests.evaluation.models.conftest import NO_LORA, new_run
 from tests.user_errors import raises_user_error
@@ -178,9 +178,10 @@ def test_the_nearest_candidate_is_chosen(presets, frames, micro, micro_store, tm
 
 
 def test_tied_candidates_share_the_credit_and_none_is_chosen() -> None:
-    scores = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [0, 2, 1, 0], [3, 3, 3, 4]], np.float32)
-    assert credit_choices(scores, [1, 0, 1, 0]).tolist() == [0.5, 0.25, 1, 0]
-    assert choose_letters(scores) == [None, None, "B", "D"]
+    scores = [[1, 1, 0, 0], [1, 1, 1, 1], [0, 2, 1, 0], [3, 3, 3, 4]]
+    nearest = [nearest_candidates(each) for each in scores]
+    assert [n.credit(x) for n, x in zip(nearest, "BABA", strict=True)] == [0.5, 0.25, 1, 0]
+    assert [n.letter for n in nearest] == [None, None, "B", "D"]
 
 
 @pytest.mark.parametrize(

@@ -29,13 +29,9 @@ from dynapix.data.records import SelectionItem
 from dynapix.data.store import Store
 from dynapix.evaluation import report
 from dynapix.evaluation.generators.response_log import score_response
-from dynapix.evaluation.metrics.results import SIMILARITY, compare_retrievers, retrieval_results
-from dynapix.evaluation.metrics.selection import (
-    Choices,
-    build_selection_report,
-    choose_letters,
-    credit_choices,
-)
+from dynapix.evaluation.metrics.results import compare_retrievers, retrieval_results
+from dynapix.evaluation.metrics.selection import Choices, build_selection_report
+from dynapix.evaluation.reporting.run_responses import nearest_candidates
 from dynapix.evaluation.retrieval.exact_search import Ranks
 from dynapix.evaluation.select import limit_items, write_report
 from dynapix.models.student.responses import GeneratedText
@@ -139,10 +135,9 @@ def similarity_run(
         scores = {model: np.eye(4, dtype=np.float32)[answers], **scores}
     choices, rows = [], []
     for title, by_item in scores.items():
-        credits = credit_choices(by_item, answers)
-        letters = choose_letters(by_item)
-        choices.append(Choices(title, SIMILARITY, None, credits, letters))
-        for item, own in zip(items, by_item.tolist(), strict=True):
+        by_item = by_item.tolist()
+        choices.append(Choices.from_scores(title, [*map(nearest_candidates, by_item)], items))
+        for item, own in zip(items, by_item, strict=True):
             rows.append({"by": title, "item_id": item.item_id, "scores": own})
     folder = root / "similarity" / (model or name)
     finish(folder, settings)
