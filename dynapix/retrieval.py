@@ -104,7 +104,7 @@ class RetrievalScores:
         twins = [t.name for q in queries if (t := q.record.factual_twin)]
         twin_above = share_above(choose(twins), targets).T if twins else None
         found = np.ones(len(queries), bool)
-        ranks = Ranks((None,), above, tied, found, len(frames), 0, 0.0, twin_above)
+        ranks = Ranks((None,), above, tied, found, len(frames), twin_above=twin_above)
         rows = retrieval_results(benchmark.name, name, ranks, [q.record for q in queries], seed)
         return cls(rows, ranks, name, benchmark, queries, seed)
 

@@ -16,17 +16,10 @@ from zipfile import BadZipFile
 import pyarrow as pa
 
 from dynapix.conf.errors import UserError
+from dynapix.models.student.responses import GeneratedText
 
 ZSTANDARD, LOCAL_HEADER = 93, 30
 """Zip files: the number of a compression that Python reads from 3.14 on; bytes before a name."""
-
-
-@dataclass(frozen=True)
-class LoggedResponse:
-    """A response in a log: its text, and whether it ended at the limit of tokens."""
-
-    text: str
-    truncated: bool
 
 
 @dataclass(frozen=True)
@@ -34,7 +27,7 @@ class Log:
     """A model's responses by item id."""
 
     model: str
-    responses: dict[str, LoggedResponse]
+    responses: dict[str, GeneratedText]
 
 
 @contextmanager
@@ -101,12 +94,12 @@ def _read_archive(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         return read(archive.getinfo("header.json")), samples
 
 
-def _read_output(output: dict[str, Any]) -> LoggedResponse:
+def _read_output(output: dict[str, Any]) -> GeneratedText:
     choice = output["choices"][0]
     content = choice["message"]["content"]
     if not isinstance(content, str):
         content = "".join(part["text"] for part in content if part["type"] == "text")
-    return LoggedResponse(content, choice["stop_reason"] == "max_tokens")
+    return GeneratedText(content, choice["stop_reason"] == "max_tokens")
 
 
 def read_lmms_eval(path: Path) -> Log:
@@ -121,7 +114,7 @@ def read_lmms_eval(path: Path) -> Log:
             row = json.loads(line)
             # The task writes the id before the question.
             item_id, text = row["input"].partition(": ")[0], row["filtered_resps"]
-            responses[item_id] = LoggedResponse(text if isinstance(text, str) else text[0], False)
+            responses[item_id] = GeneratedText(text if isinstance(text, str) else text[0])
     return Log(path.parent.name, responses)
 
 

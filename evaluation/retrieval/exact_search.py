@@ -45,6 +45,7 @@ class Ranks:
         found: (queries,) False for a miss: a query that could not be ranked.
         frames: Number of frames in the database.
         vectors: Number of vectors in the database; a multi-vector retriever has several per frame.
+            0 without embeddings.
         seconds: Time to rank the database for all queries at all widths.
         twin_above: (widths, queries) 1 if the factual twin of a counterfactual query scores above
             the target, 1/2 if they tie; None in the future pool.
@@ -55,8 +56,8 @@ class Ranks:
     tied: np.ndarray
     found: np.ndarray
     frames: int
-    vectors: int
-    seconds: float
+    vectors: int = 0
+    seconds: float = 0.0
     twin_above: np.ndarray | None = None
 
 

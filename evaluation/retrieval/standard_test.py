@@ -45,7 +45,7 @@ def score_scene_alone(
     tied = count_frames_of_scene(queries, database)[None] - 1
     found = np.ones(len(queries), bool)
     twin_above = np.full(tied.shape, 0.5) if queries[0].factual_twin else None
-    ranks = Ranks((None,), np.zeros_like(tied), tied, found, len(database), 0, 0.0, twin_above)
+    ranks = Ranks((None,), np.zeros_like(tied), tied, found, len(database), twin_above=twin_above)
     return retrieval_results(benchmark, SCENE_ALONE, ranks, queries, seed)
 
 

@@ -76,9 +76,8 @@ def create(
     """
     partial = path.with_suffix(".partial")
     partial.unlink(missing_ok=True)
-    # Only the owner may read the votes. SQLite's other files get the permissions of this file.
-    partial.touch(mode=0o600)
-    partial.chmod(0o600)
+    # SQLite's other files get the permissions of this file.
+    _create_private(partial)
     people = [(name, new_token()) for name in annotators]
     plan = [(a.annotator, a.item_id, a.rank, "".join(map(str, a.order))) for a in assignments]
     with closing(_connect(partial)) as db, transaction(db):
@@ -139,8 +138,7 @@ def write_links(db: sqlite3.Connection, path: Path, address: str) -> dict[str, s
     annotator."""
     rows = db.execute("SELECT name, secret FROM annotator ORDER BY rowid")
     links = {row["name"]: f"{address}/link/{row['secret']}" for row in rows}
-    path.touch(mode=0o600)
-    path.chmod(0o600)
+    _create_private(path)
     path.write_text("".join(f"{name}  {link}\n" for name, link in links.items()))
     return links
 
@@ -177,6 +175,12 @@ def read_votes(db: sqlite3.Connection) -> pd.DataFrame:
         db,
     )
     return votes.assign(right=votes.choice == votes.answer)
+
+
+def _create_private(path: Path) -> None:
+    """Create a file, unless it exists, that only its owner may read."""
+    path.touch(mode=0o600)
+    path.chmod(0o600)
 
 
 def _connect(path: Path) -> sqlite3.Connection:
