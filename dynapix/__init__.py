@@ -26,54 +26,26 @@ if TYPE_CHECKING:
     from dynapix.selection import Comparison, Outcome, Result, evaluate
     from dynapix.teacher.numbers.detection import find_numbers
 
-_HOMES = {
-    "Benchmark": "dynapix.benchmark",
-    "Comparison": "dynapix.selection",
-    "Frame": "dynapix.benchmark",
-    "Item": "dynapix.benchmark",
-    "Observers": "dynapix.observers",
-    "Outcome": "dynapix.selection",
-    "ParsedAnswer": "dynapix.models.student.answer_parser",
-    "Query": "dynapix.benchmark",
-    "RationaleScore": "dynapix.rationales",
-    "Result": "dynapix.selection",
-    "RetrievalScores": "dynapix.retrieval",
-    "UserError": "dynapix.conf.errors",
-    "evaluate": "dynapix.selection",
-    "evaluate_retrieval": "dynapix.retrieval",
-    "find_numbers": "dynapix.teacher.numbers.detection",
-    "load": "dynapix.benchmark",
-    "observer": "dynapix.observers",
-    "parse_choice": "dynapix.models.student.answer_parser",
-    "rank_metrics": "dynapix.evaluation.metrics.ranking",
-    "score_rationale": "dynapix.rationales",
-    "sufficiency": "dynapix.rationales",
+_MODULES = {
+    "benchmark": ("Benchmark", "Frame", "Item", "Query", "load"),
+    "conf.errors": ("UserError",),
+    "evaluation.metrics.ranking": ("rank_metrics",),
+    "models.student.answer_parser": ("ParsedAnswer", "parse_choice"),
+    "observers": ("Observers", "observer"),
+    "rationales": ("RationaleScore", "score_rationale", "sufficiency"),
+    "retrieval": ("RetrievalScores", "evaluate_retrieval"),
+    "selection": ("Comparison", "Outcome", "Result", "evaluate"),
+    "teacher.numbers.detection": ("find_numbers",),
 }
-"""The module that defines each public name."""
+"""The public names by the module that defines them."""
+_HOMES = {name: f"dynapix.{module}" for module, names in _MODULES.items() for name in names}
 
 __all__ = [
-    "Benchmark",
-    "Comparison",
-    "Frame",
-    "Item",
-    "Observers",
-    "Outcome",
-    "ParsedAnswer",
-    "Query",
-    "RationaleScore",
-    "Result",
-    "RetrievalScores",
-    "UserError",
-    "evaluate",
-    "evaluate_retrieval",
-    "find_numbers",
-    "load",
-    "observer",
-    "parse_choice",
-    "rank_metrics",
-    "score_rationale",
+    "Benchmark", "Comparison", "Frame", "Item", "Observers", "Outcome", "ParsedAnswer", "Query",
+    "RationaleScore", "Result", "RetrievalScores", "UserError", "evaluate", "evaluate_retrieval",
+    "find_numbers", "load", "observer", "parse_choice", "rank_metrics", "score_rationale",
     "sufficiency",
-]
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
