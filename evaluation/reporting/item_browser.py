@@ -207,10 +207,7 @@ def page_entries(
                 for letter, c in zip(LETTERS, item.candidates, strict=True)
             ],
             "answer": item.letter,
-            "truth": [
-                *describe_truth(item, store),
-                *_describe_ceiling(ceilings.get(item.item_id)),
-            ],
+            "truth": describe_truth(item, store, ceilings.get(item.item_id)),
             "facts": list_oracle_facts(item, store),
             "responses": [
                 _response_entry(label, r[item.item_id], item, store)
@@ -220,8 +217,9 @@ def page_entries(
         }
 
 
-def describe_truth(item: SelectionItem, store: Store) -> list[str]:
-    """Return sentences about the target, and about the collisions between the prefix and it."""
+def describe_truth(item: SelectionItem, store: Store, ceiling: float | None) -> list[str]:
+    """Return sentences about the target, about the collisions between the prefix and it, and about
+    the chance of an observer, if one has seen the item."""
     scene = store.scene(item.scene_id)
     sentences = [
         f"{item.letter} is correct: frame {item.target_frame}, "
@@ -231,15 +229,12 @@ def describe_truth(item: SelectionItem, store: Store) -> list[str]:
     for collision in collisions_in(scene, item.prefix_stop + 1, item.target_frame):
         first, second = (scene.objects[k].noun_phrase for k in collision.objects)
         sentences.append(f"The {first} and the {second} collide at frame {collision.frame}.")
-    return sentences
-
-
-def _describe_ceiling(chance: float | None) -> Iterator[str]:
-    if chance is not None:
-        yield (
+    if ceiling is not None:
+        sentences.append(
             f"An observer who sees the objects with an error of {CEILING_ERROR:g} px and simulates "
-            f"the scene is right in {100 * chance:.0f}% of its draws."
+            f"the scene is right in {100 * ceiling:.0f}% of its draws."
         )
+    return sentences
 
 
 def list_oracle_facts(item: SelectionItem, store: Store) -> list[str]:

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from dynapix.data.checks.intervals import Interval
 from dynapix.data.records import FAMILIES
 from dynapix.evaluation.metrics.future_moment import FutureMoment
 from dynapix.evaluation.metrics.reasons import ReasonSummary
@@ -57,7 +56,7 @@ def selection_table(results: Sequence[SelectionResult], suite: str = SUITE) -> T
 
 def selection_rows(name: str, result: SelectionResult) -> list[Row]:
     """Return a row of `SELECTION_COLUMNS`, and a row for each horizon of the time family."""
-    row = accuracy_row(name, result.families, result.macro, result.micro)
+    row = accuracy_row(name, result)
     horizons = [
         {"name": f"{DETAIL}time, {horizon}", "Time": accuracy, "Items": accuracy.n, "ranked": False}
         for horizon, accuracy in result.horizons.items()
@@ -66,11 +65,10 @@ def selection_rows(name: str, result: SelectionResult) -> list[Row]:
     return [{**row, "Parsed": result.parse_rate}, *horizons]
 
 
-def accuracy_row(
-    name: str, families: Mapping[str, Interval], macro: Interval, micro: Interval
-) -> Row:
-    by_family = {family.capitalize(): families.get(family) for family in FAMILIES}
-    return {"name": name, **by_family, "Macro": macro, "Micro": micro, "Items": micro.n}
+def accuracy_row(name: str, accuracy: Accuracy | SelectionResult) -> Row:
+    by_family = {family.capitalize(): accuracy.families.get(family) for family in FAMILIES}
+    overall = {"Macro": accuracy.macro, "Micro": accuracy.micro, "Items": accuracy.micro.n}
+    return {"name": name, **by_family, **overall}
 
 
 def detail_tables(reports: Mapping[str, tuple[str, SelectionReport]]) -> list[Table]:
@@ -299,8 +297,7 @@ def human_table(study: StudyReport) -> Table:
 
 def human_row(name: str, accuracy: Accuracy) -> Row:
     """Return the row of an annotator or of the majority vote, which is never marked as the best."""
-    row = accuracy_row(name, accuracy.families, accuracy.macro, accuracy.micro)
-    return {**row, "Parsed": None, "ranked": False}
+    return {**accuracy_row(name, accuracy), "Parsed": None, "ranked": False}
 
 
 def _human_notes(study: StudyReport) -> tuple[str, ...]:
