@@ -28,7 +28,6 @@ from dynapix.models.fingerprints import (
     pin_revisions,
     weights_digest,
 )
-from dynapix.models.precision import resolve_precision
 
 RESOLVED = "resolved.yaml"
 
@@ -65,6 +64,27 @@ def resolve_run(folder: Path, precision: str, preset: Preset, data: str) -> tupl
         resolved = {"precision": precision, "base": base_id(preset), "data": data}
         write_text(folder / RESOLVED, yaml.safe_dump(resolved, sort_keys=False))
     return precision, preset
+
+
+def resolve_precision(precision: str, *, on_cpu: bool = False) -> str:
+    """Resolve auto to bf16 or fp32; return bf16 and fp32 unchanged.
+
+    auto is bf16 if the GPU or CPU has instructions for bf16. A CPU without them takes several times
+    as long in bf16 as in fp32.
+
+    Args:
+        on_cpu: Whether the model computes on the CPU even if there is a GPU.
+    """
+    if precision != "auto":
+        return precision
+    import torch
+
+    if torch.cuda.is_available() and not on_cpu:
+        has_bf16 = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        capabilities = torch.cpu.get_capabilities()
+        has_bf16 = any(has for name, has in capabilities.items() if "bf16" in name)
+    return "bf16" if has_bf16 else "fp32"
 
 
 def read_resolved(folder: Path) -> dict[str, str]:

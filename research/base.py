@@ -28,7 +28,7 @@ def main(cfg: TinyBaseCommand, run: Run) -> dict[str, float]:
     from dynapix.data.frames.frame_cache import FrameReader
     from dynapix.models import compat, loading
     from dynapix.models.distributed import end_ranks, main_first, split_batch
-    from dynapix.models.precision import resolve_precision
+    from dynapix.models.resolved_settings import resolve_precision
     from dynapix.train.common.held_out import shuffled
     from research.tiny_base.measures import measure_generated_answers
     from research.tiny_base.samples import ItemSampler, split_items, tokenizer_corpus

@@ -33,7 +33,7 @@ from benchmarks.arguments import positive_int
 from dynapix.conf.errors import SettingsError, UserError
 from dynapix.conf.runs import Run
 from dynapix.conf.schema import TrainConfig
-from dynapix.models.precision import resolve_precision
+from dynapix.models.resolved_settings import resolve_precision
 from dynapix.models.tiny_qwen3_vl import SPECIAL_TOKENS, build_processor
 from dynapix.train.common.training_loop import common_arguments
 

@@ -50,7 +50,7 @@ from dynapix.data.frames.frame_cache import FrameReader
 from dynapix.data.items.cells import family_quotas
 from dynapix.data.parallel import Workers
 from dynapix.data.store import JOURNAL, open_store
-from dynapix.models.precision import resolve_precision
+from dynapix.models.resolved_settings import resolve_precision
 from dynapix.teacher.narrate import narrate_store
 
 BUILD_PARTS = {

@@ -27,7 +27,7 @@ from transformers import Trainer, TrainerCallback
 from benchmarks.speed import comparison, contrastive, sft
 from benchmarks.speed.comparison import AVX2, Measurements, run_in_process
 from dynapix.conf.failures import report_failures
-from dynapix.models.precision import resolve_precision
+from dynapix.models.resolved_settings import resolve_precision
 
 COUNTED, TIMED, PROFILED = 2, (3, 4, 5), 6
 """Numbers of the steps, from 1."""

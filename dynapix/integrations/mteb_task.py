@@ -38,7 +38,7 @@ from dynapix.conf.files import expand_path
 from dynapix.conf.schema import ContrastiveCommand
 from dynapix.data.frames.frame_cache import encode_png
 from dynapix.models.fingerprints import model_id, weights_digest
-from dynapix.models.precision import resolve_precision
+from dynapix.models.resolved_settings import resolve_precision
 from dynapix.models.retriever.embedder import load_trained
 from dynapix.models.retriever.inputs import embed
 from dynapix.models.trained_runs import product_folder, read_trained_settings, run_title

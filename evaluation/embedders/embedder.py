@@ -27,8 +27,7 @@ from dynapix.evaluation.metrics.results import UNTRAINED
 from dynapix.models.checks import check_widths
 from dynapix.models.distributed import main_first
 from dynapix.models.fingerprints import model_id, pin_revisions, processor_digest, weights_digest
-from dynapix.models.precision import resolve_precision
-from dynapix.models.resolved_settings import check_base
+from dynapix.models.resolved_settings import check_base, resolve_precision
 from dynapix.models.trained_runs import product_folder, resolve_model, run_title
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from dynapix.evaluation.generators.response_schema import (
     build_record_schema,
     write_record_instruction,
 )
-from dynapix.models.precision import resolve_precision
+from dynapix.models.resolved_settings import resolve_precision
 from dynapix.models.student.prompts import Sample, choose_instruction, selection_sample
 from dynapix.models.student.responses import response_token_limit
 

@@ -29,7 +29,7 @@ from dynapix.data.parallel import batched
 from dynapix.data.records import SelectionItem
 from dynapix.data.store import Store
 from dynapix.models import loading
-from dynapix.models.precision import resolve_precision
+from dynapix.models.resolved_settings import resolve_precision
 from dynapix.models.student.collator import IGNORED, Collator
 from dynapix.models.student.prompts import selection_sample
 from dynapix.models.trained_runs import product_folder, read_trained_settings

@@ -11,12 +11,12 @@ from safetensors.torch import load_file, save_file
 
 from dynapix.conf.schema import RetrieverConfig, StudentConfig
 from dynapix.models.fingerprints import model_id, pin_revisions
-from dynapix.models.precision import resolve_precision
 from dynapix.models.resolved_settings import (
     RESOLVED,
     check_base,
     data_digest,
     read_resolved,
+    resolve_precision,
     resolve_run,
     with_resolved_commit,
 )
