@@ -123,11 +123,9 @@ def walk_all(folder: str) -> Iterator[tuple[str, list[str]]]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("walks", nargs="*", metavar="WALK", help="all by default")
-    asked = parser.parse_args().walks or WALKS
-    if unknown := {*asked} - {*WALKS}:
-        parser.error(f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(WALKS)}")
+    parser.add_argument("walks", nargs="*", choices=["all", *WALKS], default="all")
+    asked = parser.parse_args().walks
     with tempfile.TemporaryDirectory() as folder:
         for name, files in walk_all(folder):
-            if name in asked:
+            if name in asked or "all" in asked:
                 print(name, *(f"  {file}" for file in files), f"{len(files)} files", sep="\n")

@@ -243,7 +243,7 @@ def watch_memory() -> Iterator[list[float]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("stages", nargs="*", metavar="STAGE", help=f"of {', '.join(STAGES)}")
+    parser.add_argument("stages", nargs="*", choices=["all", *STAGES], default="all")
     parser.add_argument("--sizes", type=positive_int, nargs="+", help="instead of the stage's own")
     parser.add_argument("--folder", type=Path, default=Path("store/growth"))
     parser.add_argument("--store", default="store", help="folder of the built benchmarks")
@@ -251,9 +251,7 @@ def main() -> None:
     parser.add_argument("--settings", nargs="+", default=[], help="of the benchmark that is built")
     parser.add_argument("--parallel", choices=["loky", "ray"], default="loky")
     args = parser.parse_args()
-    if unknown := {*args.stages} - {*STAGES}:
-        parser.error(f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(STAGES)}")
-    for stage in args.stages or STAGES:
+    for stage in STAGES if "all" in args.stages else args.stages:
         rows: list[dict[str, Any]] = []
         for size in tqdm(args.sizes or STAGES[stage].sizes, desc=stage, unit="measurement"):
             rows += comparison.run_in_process(measure, stage, size, args)
