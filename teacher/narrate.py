@@ -108,7 +108,8 @@ def ensure_rationales(store: Store, cfg: TeacherConfig) -> list[Rationale]:
 
 
 def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) -> Narration:
-    """Write the missing rationales of training items, and save the accepted ones as parquet too.
+    """Write the missing rationales of training items to rationales.jsonl, and the accepted ones to
+    rationales.parquet too if their facts are those of the oracle (`teacher.grounding`).
 
     Args:
         limit: Number of items to narrate, a random sample; None narrates all.
@@ -134,15 +135,7 @@ def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) ->
                 "simulator's record",
                 cfg.grounding,
             )
-        responses: dict[str, list[Rationale]] = defaultdict(list)
-        for rationale in journal.rationales:
-            if grader.is_current(rationale) and (cfg.fallback or not rationale.fallback):
-                responses[rationale.item_id].append(rationale)
-        for records in responses.values():
-            own = [r for r in records if not r.fallback]
-            if len(own) < cfg.attempts:
-                # The server has attempts left, for example because its responses are out of date.
-                records[:] = own
+        responses = usable_responses(journal, grader)
 
         def is_settled(item: SelectionItem) -> bool:
             return any(r.accepted for r in responses[item.item_id])
@@ -153,7 +146,7 @@ def narrate_store(store: Store, cfg: TeacherConfig, limit: int | None = None) ->
             for item in items
             if (attempts := len(responses[item.item_id])) < cfg.attempts and not is_settled(item)
         ]
-        progress = Progress(len(items), len(items) - len(jobs))
+        progress = Progress(len(items), len(items) - len(jobs), sum(map(is_settled, items)))
 
         def record(new: list[Rationale]) -> None:
             new = [replace(rationale, sample=sample) for rationale in new]
@@ -206,9 +199,9 @@ def sample_items(items: list[SelectionItem], limit: int | None, seed: int) -> li
 class Progress:
     """A progress bar with the numbers of accepted and rejected responses, and tokens per second."""
 
-    def __init__(self, total: int, done: int) -> None:
+    def __init__(self, total: int, done: int, accepted: int) -> None:
         self.bar = tqdm(total=total, initial=done, desc="narrating", unit="item", mininterval=1.0)
-        self.accepted = self.tokens = 0
+        self.accepted, self.tokens = accepted, 0
         self.rejected: Counter[str] = Counter()
         self.servers = ""
         self.started = time.monotonic()
@@ -256,6 +249,21 @@ def report_other_vocabularies(journal: Journal, cfg: TeacherConfig) -> None:
             "teacher.predicates=%s asks for %s",
             *(journal.path, count, name, cfg.predicates, current),
         )
+
+
+def usable_responses(journal: Journal, grader: RationaleGrader) -> dict[str, list[Rationale]]:
+    """Return the responses of a journal that need not be requested again, by item id. They follow
+    the settings of the grader, such as the vocabulary."""
+    cfg, responses = grader.cfg, defaultdict(list)
+    for rationale in journal.rationales:
+        if grader.is_current(rationale) and (cfg.fallback or not rationale.fallback):
+            responses[rationale.item_id].append(rationale)
+    for records in responses.values():
+        own = [r for r in records if not r.fallback]
+        if len(own) < cfg.attempts:
+            # The server has attempts left, for example because its responses are out of date.
+            records[:] = own
+    return responses
 
 
 def _write_rationales(
