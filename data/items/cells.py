@@ -83,13 +83,13 @@ def make_items_and_queries(
         # A release may have changed since a killed build, while its scenes keep their ids.
         every = [f"{SCENES_FOLDER}/{name}.npz" for ids in scene_ids.values() for name in ids]
         recipe = *recipe, hash_files(folder, every)
-    inputs = [component_versions(asdict(cfg)), scene_ids, *recipe, *settings]
+    shared = [component_versions(asdict(cfg)), scene_ids, *recipe, *settings]
     jobs, sizes, paths = {}, {}, {}
     # Largest quotas first, so that no single worker is left with a large job at the end.
     for name, quota in sorted(quotas.items(), key=lambda job: -job[1].train):
-        cell = CellInputs(scene_ids, partial(load_cached, folder), quota, *settings)
-        paths[name] = path = part_path(folder, [*inputs, name, asdict(quota)])
-        jobs[path] = partial(_make_cell, cfg, name, cell, path)
+        inputs = CellInputs(scene_ids, partial(load_cached, folder), quota, *settings)
+        paths[name] = path = part_path(folder, [*shared, name, asdict(quota)])
+        jobs[path] = partial(_make_cell, cfg, name, inputs, path)
         sizes[path] = quota.train + quota.test
     if is_balanced(cfg) or cfg.selection.interventions:
         # Alternative futures have the same names for other settings: a result from before a change
@@ -114,30 +114,30 @@ def make_items_and_queries(
     return items, queries, dict(dropped)
 
 
-def _make_cell(cfg: BenchmarkConfig, name: str, cell: CellInputs, path: Path) -> None:
+def _make_cell(cfg: BenchmarkConfig, name: str, inputs: CellInputs, path: Path) -> None:
     """Make the items or queries of one cell, and write them to a file."""
     group, _, subtype = name.partition("/")
     part: dict[str, Any] = {}
     if group == COUNTERFACTUAL:
-        made, dropped = make_counterfactual_queries(cell)
+        made, dropped = make_counterfactual_queries(inputs)
     elif _is_query_cell(group):
-        made, dropped = make_future_queries(int(group.split()[1]), cell)
+        made, dropped = make_future_queries(int(group.split()[1]), inputs)
     elif group == INTERVENTIONS:
         make_picker = partial(InterventionPicker, world=cfg.world, folder=path.parents[1])
-        actual, dropped = fill_quota(name, make_intervention_recipe(subtype), cell, make_picker)
-        pairs = (make_intervention_pair(item, cell.scene_of(item.scene_id)) for item in actual)
+        actual, dropped = fill_quota(name, make_intervention_recipe(subtype), inputs, make_picker)
+        pairs = (make_intervention_pair(item, inputs.scene_of(item.scene_id)) for item in actual)
         made = [item for pair in pairs for item in pair]
     elif group == MATCHED_ANCHOR:
-        by_time, dropped = fill_quota(name, recipes.MATCHED, cell)
+        by_time, dropped = fill_quota(name, recipes.MATCHED, inputs)
         made = [paired for item in by_time for paired in recipes.make_pair(item)]
     else:
         pickers = {"paper": DistractorPicker, "balanced": BalancedPicker, CONTACT: ContactPicker}
         make_picker = pickers[cfg.distractors]
         if is_balanced(cfg):
             make_picker = partial(make_picker, world=cfg.world, folder=path.parents[1])
-        made, dropped = fill_quota(subtype, cell_recipe(cfg, group, subtype), cell, make_picker)
+        made, dropped = fill_quota(subtype, cell_recipe(cfg, group, subtype), inputs, make_picker)
         if is_balanced(cfg):
-            compared = (compare_item(item, cell.scene_of, asdict(cfg)) for item in made)
+            compared = (compare_item(item, inputs.scene_of, asdict(cfg)) for item in made)
             part["scores"] = [each.item_scores().tolist() for each in compared]
     part |= {"rows": [asdict(row) for row in made], "dropped": dropped}
     write_bytes(path, json.dumps(part).encode())

@@ -104,13 +104,13 @@ class DistractorPicker:
     item can be made because too few distractors differ from the target and from each other.
     """
 
-    cell: CellInputs
+    inputs: CellInputs
     split: str
     rng: np.random.Generator
     dropped: Counter[str] = field(default_factory=Counter)
 
     def make_item(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+        self, recipe: Recipe, scene: Scene, timing: Timing, subjects: tuple[int, ...]
     ) -> SelectionItem | None:
         """Return an item whose first candidate is the target, or None if too few distractors are
         suitable."""
@@ -120,11 +120,11 @@ class DistractorPicker:
             # Stop if the remaining pools cannot complete the item.
             if len(chosen) + sum(limit for _, limit in pools[k:]) < 4:
                 break
-            wanted, bound = min(len(chosen) + count, 4), self.cell.min_displacement
+            wanted, bound = min(len(chosen) + count, 4), self.inputs.min_displacement
             for candidate in pool:
                 if len(chosen) == wanted:
                     break
-                if all(self._displacement(candidate, c, about) >= bound for c in chosen):
+                if all(self._displacement(candidate, c, subjects) >= bound for c in chosen):
                     chosen.append(candidate)
         if len(chosen) < 4:
             self.dropped["too alike"] += 1
@@ -133,12 +133,12 @@ class DistractorPicker:
         return new_item(recipe, scene, timing, chosen, least)
 
     def _displacement(
-        self, a: FrameRef, b: FrameRef, about: tuple[int, ...] | None = None
+        self, a: FrameRef, b: FrameRef, subjects: tuple[int, ...] | None = None
     ) -> float:
-        scene = self.cell.scene_of(a.scene_id)
+        scene = self.inputs.scene_of(a.scene_id)
         if a.scene_id == b.scene_id:
-            return float(frame_displacements(scene, about)[a.frame, b.frame])
-        return cross_scene_displacement(scene, a.frame, self.cell.scene_of(b.scene_id), b.frame)
+            return float(frame_displacements(scene, subjects)[a.frame, b.frame])
+        return cross_scene_displacement(scene, a.frame, self.inputs.scene_of(b.scene_id), b.frame)
 
 
 def new_item(
@@ -170,7 +170,7 @@ def new_item(
 def fill_quota(
     cell_name: str,
     recipe: Recipe,
-    cell: CellInputs,
+    inputs: CellInputs,
     make_picker: Callable[..., DistractorPicker] = DistractorPicker,
 ) -> tuple[list[SelectionItem], Counter[str]]:
     """Make the items of one cell, at most one per scene, from scenes in a seeded order. An item has
@@ -182,20 +182,20 @@ def fill_quota(
     """
     items, dropped = [], Counter[str]()
     for split in SPLITS:
-        scene_ids = cell.scene_ids[split]
-        rng = named_rng(cell.seed, cell_name, split)
-        picker = make_picker(cell, split, rng)
+        scene_ids = inputs.scene_ids[split]
+        rng = named_rng(inputs.seed, cell_name, split)
+        picker = make_picker(inputs, split, rng)
         made: list[SelectionItem] = []
         for index in rng.permutation(len(scene_ids)):
-            if len(made) == getattr(cell.quota, split):
+            if len(made) == getattr(inputs.quota, split):
                 break
-            scene = cell.scene_of(scene_ids[index])
+            scene = inputs.scene_of(scene_ids[index])
             timings = recipe.timings(scene)
             if recipe.lacks and not timings:
                 dropped[recipe.lacks] += 1
             for timing in (timings[k] for k in rng.permutation(len(timings))):
-                about = recipe.subjects(scene, timing)
-                if about and (item := picker.make_item(recipe, scene, timing, about)):
+                subjects = recipe.subjects(scene, timing)
+                if subjects and (item := picker.make_item(recipe, scene, timing, subjects)):
                     made.append(item)
                     break
         items += shuffle_candidates(made, rng)

@@ -107,7 +107,7 @@ BUILDERS: dict[int, Callable[[Scene], Iterator[TimedQuestion]]] = {
 """Each builder yields all questions that it can ask about a scene."""
 
 
-def make_future_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
+def make_future_queries(builder: int, inputs: CellInputs) -> tuple[list[RetrievalQuery], int]:
     """Make the queries of one builder, and count those dropped; see `fill_query_quota`."""
 
     def queries_of(scene: Scene) -> Iterator[RetrievalQuery]:
@@ -125,10 +125,10 @@ def make_future_queries(builder: int, cell: CellInputs) -> tuple[list[RetrievalQ
                 target=FrameRef(scene.scene_id, target),
             )
 
-    return fill_query_quota(str(builder), cell, queries_of, QUERIES_PER_SCENE[str(builder)] == 1)
+    return fill_query_quota(str(builder), inputs, queries_of, QUERIES_PER_SCENE[str(builder)] == 1)
 
 
-def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery], int]:
+def make_counterfactual_queries(inputs: CellInputs) -> tuple[list[RetrievalQuery], int]:
     """Make the counterfactual queries, and count those dropped; see `fill_query_quota`.
 
     A query names the removed object and the object that its absence displaces most, among those
@@ -137,17 +137,17 @@ def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery],
     """
 
     def queries_of(scene: Scene) -> Iterator[RetrievalQuery]:
-        removed = removed_object(scene, cell.seed)
+        removed = removed_object(scene, inputs.seed)
         if removed is None:
             return
         stop = last_factual_frame(scene, removed)
         other = counterfactual_id(scene.scene_id, removed)
-        shifts = removal_displacements(scene, cell.scene_of(other), removed)
+        shifts = removal_displacements(scene, inputs.scene_of(other), removed)
         # The question can only name an object that the observation shows.
         shifts[:, ~visible_positions(scene)[1][: stop + 1].any(axis=0)] = 0.0
         for seconds in COUNTERFACTUAL_SECONDS:
             target = stop + int(seconds * FPS)
-            if target >= scene.frames or shifts[target].max() < cell.min_displacement:
+            if target >= scene.frames or shifts[target].max() < inputs.min_displacement:
                 continue
             most = int(shifts[target].argmax())
             absent, asked = (scene.objects[k].noun_phrase for k in (removed, most))
@@ -170,12 +170,12 @@ def make_counterfactual_queries(cell: CellInputs) -> tuple[list[RetrievalQuery],
                 asked_object=asked,
             )
 
-    return fill_query_quota("counterfactual", cell, queries_of)
+    return fill_query_quota("counterfactual", inputs, queries_of)
 
 
 def fill_query_quota(
     builder: str,
-    cell: CellInputs,
+    inputs: CellInputs,
     queries_of: Callable[[Scene], Iterable[RetrievalQuery]],
     one_per_scene: bool = False,
 ) -> tuple[list[RetrievalQuery], int]:
@@ -194,17 +194,17 @@ def fill_query_quota(
         queries: list[RetrievalQuery], rng: np.random.Generator
     ) -> Iterator[RetrievalQuery | None]:
         for query in queries:
-            yield (completed := add_hard_negatives(query, cell, rng))
+            yield (completed := add_hard_negatives(query, inputs, rng))
             if completed is not None and one_per_scene:
                 return
 
     made, dropped = [], 0
     for split in SPLITS:
-        rng = named_rng(cell.seed, "retrieval", builder, split)
-        scene_ids, wanted = cell.scene_ids[split], getattr(cell.quota, split) + len(made)
+        rng = named_rng(inputs.seed, "retrieval", builder, split)
+        scene_ids, wanted = inputs.scene_ids[split], getattr(inputs.quota, split) + len(made)
         queues = []
         for index in rng.permutation(len(scene_ids)) if wanted > len(made) else ():
-            queries = list(queries_of(cell.scene_of(scene_ids[index])))
+            queries = list(queries_of(inputs.scene_of(scene_ids[index])))
             order = rng.permutation(len(queries))[::-1]
             queues.append(attempts([queries[k] for k in order], rng))
         for query in round_robin(queues):
@@ -218,31 +218,31 @@ def fill_query_quota(
 
 
 def add_hard_negatives(
-    query: RetrievalQuery, cell: CellInputs, rng: np.random.Generator
+    query: RetrievalQuery, inputs: CellInputs, rng: np.random.Generator
 ) -> RetrievalQuery | None:
     """Complete a query's hard negatives with other frames of its target's scene.
 
     The added frames differ from the target, from each other and from the hard negatives that the
-    query already has by at least `cell.min_displacement`. Frames of the prefix are included: the
+    query already has by at least `inputs.min_displacement`. Frames of the prefix are included: the
     database contains them too, and a retriever has to rank them below the target. Return None if
     there are too few such frames.
     """
-    scene, target = cell.scene_of(query.target.scene_id), query.target.frame
+    scene, target = inputs.scene_of(query.target.scene_id), query.target.frame
     displacements = frame_displacements(scene)
     preferred = [target + side * offset for offset in OFFSETS for side in (-1, 1)]
     dense = list(range(target % DENSE_STEP, scene.frames, DENSE_STEP))
-    count = 1 + cell.hard_negatives - len(query.hard_negatives)
+    count = 1 + inputs.hard_negatives - len(query.hard_negatives)
     chosen = [target]
     for frame in [*rng.permutation(preferred), *rng.permutation(dense)]:
         if len(chosen) == count:
             break
         is_in_scene = 0 <= frame < scene.frames
-        if is_in_scene and displacements[frame, chosen].min() >= cell.min_displacement:
+        if is_in_scene and displacements[frame, chosen].min() >= inputs.min_displacement:
             chosen.append(int(frame))
     wrong = chosen[1:]
     if len(chosen) < count or any(
-        cross_scene_displacement(cell.scene_of(given.scene_id), given.frame, scene, frame)
-        < cell.min_displacement
+        cross_scene_displacement(inputs.scene_of(given.scene_id), given.frame, scene, frame)
+        < inputs.min_displacement
         for given in query.hard_negatives
         for frame in wrong
     ):

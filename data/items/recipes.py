@@ -178,15 +178,15 @@ def window_recipe(suite: str, subtype: str) -> Recipe:
         stops = range(WINDOW_OBSERVED - 1, scene.frames - horizon)
         return [Timing(stop - WINDOW_OBSERVED + 1, stop, stop + horizon) for stop in stops]
 
-    def subjects(scene: Scene, timing: Timing) -> tuple[int, ...]:
+    def find_subjects(scene: Scene, timing: Timing) -> tuple[int, ...]:
         if window_group(scene, timing.start, timing.stop, horizon) != group:
             return ()
         visible = visible_objects(scene, timing)
         return tuple(k for k in window_subjects(window_family, scene, timing) if k in visible)
 
     def pools(scene: Scene, timing: Timing, picker: DistractorPicker) -> Sequence[Pool]:
-        about = subjects(scene, timing)
-        frames = timing.outside_prefix(similar_frames(scene, timing.target, about))
+        subjects = find_subjects(scene, timing)
+        frames = timing.outside_prefix(similar_frames(scene, timing.target, subjects))
         if not is_hard:
             # Shuffled, because the least similar frames are consecutive and the target would stand
             # out.
@@ -197,7 +197,7 @@ def window_recipe(suite: str, subtype: str) -> Recipe:
         "subtype": subtype, "question": WINDOW_QUESTION, "distractors": source, "group": group,
         "window_family": window_family, "horizon": horizon, "difficulty": difficulty,
     }  # fmt: skip
-    return Recipe("window", timings, lambda timing: fields, pools, subjects, suite)
+    return Recipe("window", timings, lambda timing: fields, pools, find_subjects, suite)
 
 
 def window_subjects(window_family: str, scene: Scene, timing: Timing) -> tuple[int, ...]:
@@ -250,9 +250,11 @@ def pair_key(item: SelectionItem) -> str:
     return f"{item.scene_id}-{item.prefix_stop}-{item.target_frame}"
 
 
-def similar_frames(scene: Scene, target: int, about: tuple[int, ...] | None = None) -> np.ndarray:
+def similar_frames(
+    scene: Scene, target: int, subjects: tuple[int, ...] | None = None
+) -> np.ndarray:
     """Return the frames of a scene except the target, those most similar to it first."""
-    similar = np.argsort(object_match_scores(scene, target, about), kind="stable")
+    similar = np.argsort(object_match_scores(scene, target, subjects), kind="stable")
     return similar[similar != target]
 
 
@@ -266,10 +268,10 @@ def cross_scene_targets(
 ) -> list[Candidate]:
     """Return the first target of up to `count` other scenes of the split and of the scene's
     scenario. Scenes that share more objects with `scene` come first."""
-    cell, scene_ids = picker.cell, picker.cell.scene_ids[picker.split]
+    inputs, scene_ids = picker.inputs, picker.inputs.scene_ids[picker.split]
     order = picker.rng.permutation(len(scene_ids))
     # The generators are lazy: no more scenes are loaded than needed.
-    scenes = (cell.scene_of(scene_ids[k]) for k in order)
+    scenes = (inputs.scene_of(scene_ids[k]) for k in order)
     others = (s for s in scenes if s.scene_id != scene.scene_id and s.scenario == scene.scenario)
     found = islice(((s, own) for s in others if (own := timings(s))), count)
     objects = {*scene.objects}

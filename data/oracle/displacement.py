@@ -26,17 +26,17 @@ def visible_positions(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=64)
-def frame_displacements(scene: Scene, about: tuple[int, ...] | None = None) -> np.ndarray:
-    """Return the largest displacement of an object of `about` (indices; all by default) between any
-    two frames, (F, F) px at 336 x 336.
+def frame_displacements(scene: Scene, subjects: tuple[int, ...] | None = None) -> np.ndarray:
+    """Return the largest displacement of an object of `subjects` (indices; all by default) between
+    any two frames, (F, F) px at 336 x 336.
 
     Only objects that are visible (see `visible_positions`) in at least one of the two frames count,
     because the edge of an object on the border of the image, or an object behind another one, does
     not suffice to distinguish frames. The image's diagonal is the maximum.
     """
     positions, visible = visible_positions(scene)
-    if about is not None:
-        positions, visible = positions[:, about], visible[:, about]
+    if subjects is not None:
+        positions, visible = positions[:, subjects], visible[:, subjects]
     distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     counts = visible[:, None] | visible[None]
     return np.minimum(np.where(counts, distance, 0.0).max(axis=-1, initial=0.0), DIAGONAL)
@@ -90,11 +90,11 @@ def _positions_by_appearance(
 
 
 def object_match_scores(
-    scene: Scene, target: int, about: tuple[int, ...] | None = None
+    scene: Scene, target: int, subjects: tuple[int, ...] | None = None
 ) -> np.ndarray:
     """Return the object-match score of each frame with frame `target`, (F,); lower is more similar.
 
-    The score is the mean displacement of the objects of `about` (indices; all by default) in the
+    The score is the mean displacement of the objects of `subjects` (indices; all by default) in the
     image, as a fraction of the image's diagonal. An object that is in view in only one of the
     frames counts as 1; in neither, as 0.
     """
@@ -102,4 +102,4 @@ def object_match_scores(
     share = np.minimum(distance / np.hypot(*scene.image_size), 1.0)
     in_view, target_in_view = scene.in_view, scene.in_view[target]
     scores = np.where(in_view & target_in_view, share, in_view ^ target_in_view)
-    return (scores if about is None else scores[:, about]).mean(axis=-1)
+    return (scores if subjects is None else scores[:, subjects]).mean(axis=-1)

@@ -49,31 +49,31 @@ class BalancedPicker(FuturesPicker):
         self.balance = Balance(self.rng)
 
     def make_item(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+        self, recipe: Recipe, scene: Scene, timing: Timing, subjects: tuple[int, ...]
     ) -> SelectionItem | None:
         """As in `FuturesPicker`. Timings at which nothing moves visibly do not count as tries."""
-        shift = frame_displacements(scene, about)[timing.stop, timing.target]
-        if shift < self.cell.min_displacement or not moving_objects(scene, timing.stop, about):
+        shift = frame_displacements(scene, subjects)[timing.stop, timing.target]
+        if shift < self.inputs.min_displacement or not moving_objects(scene, timing.stop, subjects):
             return None
-        return super().make_item(recipe, scene, timing, about)
+        return super().make_item(recipe, scene, timing, subjects)
 
     def _make_from_futures(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+        self, recipe: Recipe, scene: Scene, timing: Timing, subjects: tuple[int, ...]
     ) -> SelectionItem | str:
         # A time item has a single timing, but each try has another wrong moment.
         count = TRIES if recipe.family == "time" else 1
-        tries = (self._try_futures(recipe, scene, timing, about) for _ in range(count))
+        tries = (self._try_futures(recipe, scene, timing, subjects) for _ in range(count))
         return next(filter(None, tries), "no suitable distractors")
 
     def _try_futures(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+        self, recipe: Recipe, scene: Scene, timing: Timing, subjects: tuple[int, ...]
     ) -> SelectionItem | None:
         stop, moments = timing.stop, [timing.target]
         if recipe.family == "time":
-            moments += self._wrong_moment(scene, timing, about)
+            moments += self._wrong_moment(scene, timing, subjects)
             if len(moments) == 1:
                 return None
-        groups = changed_groups(recipe.family, scene, timing, about)
+        groups = changed_groups(recipe.family, scene, timing, subjects)
         count, quarter = FUTURES[recipe.family], int(self.balance.excess_of("nearness").argmin())
         velocities = sample_velocities(scene, stop, groups, count, quarter, self.rng)
         branches = branches_of_velocities(scene, stop, velocities)
@@ -86,9 +86,9 @@ class BalancedPicker(FuturesPicker):
         candidates += [Candidate(own, m, "alternative") for m in moments for own in futures]
         futures[scene.scene_id] = own_motion(scene, stop, max(moments))
         options = Options(scene, timing, candidates, futures, self.world)
-        displacement = options.displacement(about)
+        displacement = options.displacement(subjects)
         choices = list_choices(len(moments), count)
-        choices = distinct_choices(choices, displacement, self.cell.min_displacement)
+        choices = distinct_choices(choices, displacement, self.inputs.min_displacement)
         choices = choices_of_difficulty(choices, displacement, IS_HARD.get(fields["distractors"]))
         if not len(choices):
             return None
@@ -97,7 +97,7 @@ class BalancedPicker(FuturesPicker):
             return None
         return self._make_from_options(recipe, options, choices[best], distractors="alternative")
 
-    def _wrong_moment(self, scene: Scene, timing: Timing, about: tuple[int, ...]) -> list[int]:
+    def _wrong_moment(self, scene: Scene, timing: Timing, subjects: tuple[int, ...]) -> list[int]:
         """Sample a moment after the prefix that differs visibly from the target, on the side of the
         target that balances its rank in time; return an empty list if there is none.
 
@@ -112,12 +112,12 @@ class BalancedPicker(FuturesPicker):
         excess = self.balance.excess_of("moment")
         lead = horizon * share if excess[0] >= excess[3] else horizon / share
         moment = timing.stop + int(lead)
-        shift = frame_displacements(scene, about)[timing.target, moment]
-        return [moment] if shift >= self.cell.min_displacement else []
+        shift = frame_displacements(scene, subjects)[timing.target, moment]
+        return [moment] if shift >= self.inputs.min_displacement else []
 
 
 def changed_groups(
-    family: str, scene: Scene, timing: Timing, about: tuple[int, ...]
+    family: str, scene: Scene, timing: Timing, subjects: tuple[int, ...]
 ) -> list[Group]:
     """Return the groups of objects whose velocities are changed to make distractors. Their objects
     move at the end of the prefix.
@@ -125,7 +125,7 @@ def changed_groups(
     In event and window items, objects that collide change by one velocity: otherwise the target
     would often be the only candidate in which objects touch.
     """
-    moving = moving_objects(scene, timing.stop, about)
+    moving = moving_objects(scene, timing.stop, subjects)
     if family == "time":
         return [(k,) for k in moving]
     return joint_groups(scene, timing.stop, timing.target, moving)

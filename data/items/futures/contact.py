@@ -99,9 +99,9 @@ class ContactPicker(FuturesPicker):
         self.balances = {with_ghost: Balance(self.rng, names) for with_ghost in (False, True)}
 
     def _make_from_futures(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+        self, recipe: Recipe, scene: Scene, timing: Timing, subjects: tuple[int, ...]
     ) -> SelectionItem | str:
-        stop, target, least = timing.stop, timing.target, self.cell.min_displacement
+        stop, target, least = timing.stop, timing.target, self.inputs.min_displacement
         pair = next_collision(scene, stop).objects
         sources, branches = zip(*sample_outcomes(scene, stop, pair, self.rng), strict=True)
         outcomes = simulate_futures(scene, stop, target, branches, self.world)
@@ -112,7 +112,7 @@ class ContactPicker(FuturesPicker):
         named = zip(motions, ["target", *sources], strict=True)
         candidates = [Candidate(own, target, source) for own, source in named]
         options = Options(scene, timing, candidates, motions, self.world)
-        displacement = options.displacement(about)
+        displacement = options.displacement(subjects)
         if displacement[0, 1] > STRAY * least:
             return "target cannot be simulated again"
         suitable = [

@@ -159,9 +159,9 @@ class InterventionPicker(FuturesPicker):
         self.balance = Balance(self.rng)
 
     def _make_from_futures(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+        self, recipe: Recipe, scene: Scene, timing: Timing, subjects: tuple[int, ...]
     ) -> SelectionItem | str:
-        stop, target, least = timing.stop, timing.target, self.cell.min_displacement
+        stop, target, least = timing.stop, timing.target, self.inputs.min_displacement
         subtype = recipe.fields(timing)["subtype"]
         possible = [*find_interventions(subtype, scene, stop, self.world)]
         if not possible:
@@ -180,13 +180,13 @@ class InterventionPicker(FuturesPicker):
                 key: without_object(motion, chosen.changed, self.world)
                 for key, motion in motions.items()
             }
-            about = tuple(k for k in about if k != chosen.changed)
+            subjects = tuple(k for k in subjects if k != chosen.changed)
             question = UNSEEN.format(scene.objects[chosen.changed].noun_phrase) + question
         sources = ["target", INTERVENTION, *["alternative"] * (len(motions) - 2)]
         named = zip(motions, sources, strict=True)
         candidates = [Candidate(key, target, source) for key, source in named]
         options = Options(scene, timing, candidates, motions, self.world)
-        displacement = options.displacement(about)
+        displacement = options.displacement(subjects)
         if displacement[0, 2] > STRAY * least:
             return "target cannot be simulated again"
         pairs = combinations(range(3, len(candidates)), 2)
@@ -202,7 +202,7 @@ class InterventionPicker(FuturesPicker):
         collisions = {key: join_collisions(scene, stop, each) for key, each in motions.items()}
         collisions[own] = scene.collisions
         return self._make_from_options(
-            recipe, options, choices[best], about, collisions, question=question
+            recipe, options, choices[best], subjects, collisions, question=question
         )
 
 

@@ -55,10 +55,10 @@ class Options:
         states = np.stack([scene_states(self.scene)[stop], *shown])
         return scene_with_states(self.scene, "futures", states, self.world)
 
-    def displacement(self, about: tuple[int, ...] | None = None) -> np.ndarray:
-        """Return the displacement of an object of `about` (all by default) between any two
+    def displacement(self, subjects: tuple[int, ...] | None = None) -> np.ndarray:
+        """Return the displacement of an object of `subjects` (all by default) between any two
         candidates, (O, O) px at 336 x 336."""
-        return frame_displacements(self.frames, about)[1:, 1:]
+        return frame_displacements(self.frames, subjects)[1:, 1:]
 
     def scores(self, choices: np.ndarray, further: Sequence[np.ndarray] = ()) -> np.ndarray:
         """Return the scores (S, T, 4) of choices (T, 4) of candidates. `further` are more scores of
@@ -83,19 +83,19 @@ class FuturesPicker(DistractorPicker):
     _tries: Counter[str] = field(default_factory=Counter)
 
     def make_item(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+        self, recipe: Recipe, scene: Scene, timing: Timing, subjects: tuple[int, ...]
     ) -> SelectionItem | None:
         self._tries[scene.scene_id] += 1
         if self._tries[scene.scene_id] > TRIES:
             return None
-        made = self._make_from_futures(recipe, scene, timing, about)
+        made = self._make_from_futures(recipe, scene, timing, subjects)
         if isinstance(made, SelectionItem):
             return made
         self.dropped[made] += 1
         return None
 
     def _make_from_futures(
-        self, recipe: Recipe, scene: Scene, timing: Timing, about: tuple[int, ...]
+        self, recipe: Recipe, scene: Scene, timing: Timing, subjects: tuple[int, ...]
     ) -> SelectionItem | str:
         """Make an item from new futures, or return why no choice of them is suitable."""
         raise NotImplementedError
@@ -105,14 +105,14 @@ class FuturesPicker(DistractorPicker):
         recipe: Recipe,
         options: Options,
         choice: np.ndarray,
-        about: tuple[int, ...] | None = None,
+        subjects: tuple[int, ...] | None = None,
         collisions: Mapping[str, tuple[Collision, ...]] = {},
         **fields: Any,
     ) -> SelectionItem:
         """Save the futures of four chosen candidates (4,) of `options`, and return their item.
 
         Args:
-            about: The objects whose displacement counts for the minimum; all by default.
+            subjects: The objects whose displacement counts for the minimum; all by default.
             collisions: The contacts in the futures by scene id, if they are recorded.
             fields: Fields of the item that replace those of the recipe.
         """
@@ -123,7 +123,7 @@ class FuturesPicker(DistractorPicker):
             future = alternative_scene(scene, name, timing.stop, states, self.world)
             future = replace(future, collisions=collisions.get(name, ()))
             save_scene(future, scene_path(self.folder, name))
-        pairs = options.displacement(about)[np.ix_(choice, choice)]
+        pairs = options.displacement(subjects)[np.ix_(choice, choice)]
         least = float(pairs[np.triu_indices(4, 1)].min())
         return new_item(recipe, scene, timing, candidates, least, **fields)
 

@@ -33,12 +33,12 @@ Group = tuple[int, ...]
 """Indices of objects whose velocities change together."""
 
 
-def moving_objects(scene: Scene, frame: int, about: Sequence[int]) -> list[int]:
-    """Return the objects of `about` that move along the ground at a frame and that are visible in
-    the last `SEEN_FRAMES` frames up to it."""
+def moving_objects(scene: Scene, frame: int, subjects: Sequence[int]) -> list[int]:
+    """Return the objects of `subjects` that move along the ground at a frame and are visible in the
+    last `SEEN_FRAMES` frames up to it."""
     speeds = np.linalg.norm(scene.velocities[frame, :, :2], axis=-1)
     seen = visible_positions(scene)[1][max(frame - SEEN_FRAMES + 1, 0) : frame + 1].all(axis=0)
-    return [k for k in about if speeds[k] > MOVING and seen[k]]
+    return [k for k in subjects if speeds[k] > MOVING and seen[k]]
 
 
 def joint_groups(scene: Scene, frame: int, last: int, moving: Sequence[int]) -> list[Group]:
