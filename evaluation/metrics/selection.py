@@ -8,7 +8,10 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from dynapix.conf.schema.benchmark import INTERVENTIONS, MATCHED_ANCHOR
+from dynapix.data.checks.baselines import score_baselines
 from dynapix.data.checks.intervals import Interval, SceneBootstrap
 from dynapix.data.items.controls import pair_items
 from dynapix.data.items.recipes import TIME_CELLS
@@ -33,6 +36,15 @@ if TYPE_CHECKING:
     from dynapix.data.store import Store
     from dynapix.evaluation.generators.response_log import Answer
     from dynapix.evaluation.reporting.run_responses import ItemResponse
+
+BASELINES = {
+    "nearest": "nearest to the last observed frame",
+    "odd": "odd one out",
+    "first": "first candidate",
+    "latest": "latest candidate",
+    "velocity": "constant velocity to the target's moment",
+}
+"""Name in tables of each reported baseline. Only `velocity` predicts, and it knows the moment."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +130,20 @@ def _score_interventions(
         )
         for key, c in choices.items()
     }
+
+
+def baseline_results(
+    items: Sequence[SelectionItem], store: Store, seed: int
+) -> list[SelectionResult]:
+    """Return the accuracies of the baselines on items. `seed` is that of the resampling."""
+    scores = [score_baselines(item, store) for item in items]
+    letters = [None] * len(items)
+    choices = [
+        Choices(title, BASELINE, None, [s[name] for s in scores], letters)
+        for name, title in BASELINES.items()
+        if not np.isnan([s[name] for s in scores]).any()
+    ]
+    return build_selection_report(choices, items, store, seed).rows
 
 
 def _selection_result(

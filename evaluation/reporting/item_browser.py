@@ -23,10 +23,10 @@ from dynapix.data.oracle.events import collisions_in
 from dynapix.data.records import FAMILIES, LETTERS, FrameRef, SelectionItem, sample_prefix_frames
 from dynapix.data.seeded_order import interleave
 from dynapix.data.store import Store, open_store
-from dynapix.evaluation.metrics.baselines import baseline_results
 from dynapix.evaluation.metrics.future_moment import FutureMoment, measure_future_moment
 from dynapix.evaluation.metrics.reasons import item_predicates, read_reasons
 from dynapix.evaluation.metrics.results import SelectionResult
+from dynapix.evaluation.metrics.selection import baseline_results
 from dynapix.evaluation.metrics.significance import PairedComparison
 from dynapix.evaluation.reporting.measurements import (
     Measurement,

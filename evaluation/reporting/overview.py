@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from dynapix.data.checks.intervals import Interval
-from dynapix.evaluation.metrics.baselines import TITLES
 from dynapix.evaluation.metrics.results import TWIN_ABOVE, RetrievalResult
+from dynapix.evaluation.metrics.selection import BASELINES
 from dynapix.evaluation.reporting.item_browser import ItemBrowser
 from dynapix.evaluation.reporting.measurements import Measurement, widest_results
 
@@ -57,7 +57,7 @@ def _describe_student(
     for m in students:
         if m is not main and m.group == main.group and m.regime == "answer_only":
             beside.append(f"{m.label}, trained on answers alone, {percent(m.result.micro)}")
-    rules = [r for r in browser.baselines.get(main.group, []) if r.name != TITLES["velocity"]]
+    rules = [r for r in browser.baselines.get(main.group, []) if r.name != BASELINES["velocity"]]
     if rules:
         best = max(rules, key=lambda rule: rule.micro.value)
         beside.append(f"best rule without prediction, {best.name}, {percent(best.micro)}")

@@ -27,8 +27,8 @@ from dynapix.conf.schema.benchmark import MATCHED_ANCHOR
 from dynapix.data.records import FAMILIES
 from dynapix.data.store import Store
 from dynapix.data.versions import BUILDERS
-from dynapix.evaluation.metrics.baselines import baseline_results
 from dynapix.evaluation.metrics.seeds import MACRO, SeedBootstrap
+from dynapix.evaluation.metrics.selection import baseline_results
 from dynapix.models.fingerprints import weights_digest
 from dynapix.teacher.narrator import NARRATOR_VERSION
 from dynapix.teacher.predicates.vocabulary import VERSIONS
