@@ -127,7 +127,7 @@ class DistractorPicker:
                 if all(self._displacement(candidate, c, subjects) >= bound for c in chosen):
                     chosen.append(candidate)
         if len(chosen) < 4:
-            self.dropped["too alike"] += 1
+            self.dropped["too few suitable distractors"] += 1
             return None
         least = min(self._displacement(a, b) for a, b in combinations(chosen, 2))
         return new_item(recipe, scene, timing, chosen, least)

@@ -129,7 +129,7 @@ class ContactPicker(FuturesPicker):
         ]
         choices = distinct_choices(np.array(choices, int).reshape(-1, 4), displacement, least)
         if not len(choices):
-            return "outcomes too alike"
+            return "too few suitable outcomes"
         shown = [(options.frames, k) for k in range(options.frames.frames)]
         camera = Camera.from_settings(self.world.camera)
         scores = options.scores(choices, [*collision_scores(scene, stop, target, shown, camera)])

@@ -193,7 +193,7 @@ class InterventionPicker(FuturesPicker):
         choices = np.array([(0, 1, *pair) for pair in pairs])
         choices = distinct_choices(choices, displacement, least)
         if not len(choices):
-            return "futures too alike"
+            return "too few suitable futures"
         # The changed future is often beyond the scene's own one, such as that of a faster object,
         # so that only the ranks of both together can be even.
         best = self.balance.choose(options.scores(choices), targets=(0, 1))

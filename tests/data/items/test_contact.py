@@ -310,7 +310,7 @@ def test_reasons_of_dropped_items_are_counted(tmp_path: Path) -> None:
         builders={"1": Quota(2, 0)}, database=0, source=8, counterfactual_source=0
     )
     store = ensure_items(cfg, tmp_path, Workers(1))
-    assert store.manifest["counts"]["items dropped, outcomes too alike/event"] > 0
+    assert store.manifest["counts"]["items dropped, too few suitable outcomes/event"] > 0
     summary = summarize_store(store)
     assert "short: event/collision_gap10/test has 0 of 8" in summary
     assert "benchmark.world.start.distance" in summary.splitlines()[-1]
