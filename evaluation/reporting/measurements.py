@@ -30,7 +30,8 @@ from dynapix.evaluation.reporting.run_responses import Responses
 from dynapix.evaluation.reporting.runs import FinishedRun
 
 TRANSFER_SUITES = {"movi_a": "MoVi-A", "physion": "Physion"}
-"""Names of the paper's transfer suites, by the setting `benchmark.simulator`."""
+"""Names of the paper's transfer suites, by `benchmark.simulator` of a release or by
+`benchmark.recipe` of a simulated stand-in."""
 REGIMES = {
     "answer_only": "answer-only",
     "cot": "full student",
