@@ -76,9 +76,9 @@ def main(cfg: ContrastiveCommand, run: Run) -> dict[str, float]:
     use_fast_layers(model)
 
     trainer = build_trainer(cfg, run, store, model, training, validation, rank_batch, checkpoint)
-    lower = "lower train.mini_batch, set train.reuse_features=false"
-    shrink = "retriever.image_size or retriever.frames"
-    run_training(trainer, run, checkpoint, lower, shrink)
+    remedy = "lower train.mini_batch, set train.reuse_features=false"
+    last_resort = "retriever.image_size or retriever.frames"
+    run_training(trainer, run, checkpoint, remedy, last_resort)
 
     metrics = run_metrics(run.folder)
     if rank() == 0:

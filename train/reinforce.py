@@ -59,8 +59,8 @@ def main(cfg: ReinforceCommand, run: Run) -> dict[str, float]:
     trainer = build_trainer(
         cfg, run, trained.student, model, processor, training, validation, checkpoint
     )
-    shrink = "train.batch or train.responses"
-    return train_and_save(trainer, processor, run, checkpoint, trained, shrink)
+    last_resort = "train.batch or train.responses"
+    return train_and_save(trainer, processor, run, checkpoint, trained, last_resort)
 
 
 if __name__ == "__main__":

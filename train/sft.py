@@ -67,9 +67,9 @@ def main(cfg: SftCommand, run: Run) -> dict[str, float]:
     use_fast_layers(model)
 
     trainer = build_trainer(cfg, run, model, processor, training, validation, checkpoint)
-    lower = "lower train.micro_batch, set train.reuse_features=false"
-    shrink = "student.image_size or student.frames"
-    training_loop.run_training(trainer, run, checkpoint, lower, shrink)
+    remedy = "lower train.micro_batch, set train.reuse_features=false"
+    last_resort = "student.image_size or student.frames"
+    training_loop.run_training(trainer, run, checkpoint, remedy, last_resort)
 
     weights = training_loop.gather_weights(trainer)
     metrics = run_metrics(run.folder)

@@ -36,7 +36,7 @@ PROJECT = "dynapix"
 """Name of the project in experiment trackers."""
 SCHEDULES = {"cosine": "cosine", "linear": "linear", "constant": "constant_with_warmup"}
 """The name in transformers of each value of train.schedule."""
-MESSAGE_PREFIX = f"{UserError.__module__}.{UserError.__qualname__}: "
+USER_ERROR_PREFIX = f"{UserError.__module__}.{UserError.__qualname__}: "
 """The text before the message of a UserError in the traceback of another process."""
 MIN_CHECKPOINTS = 2
 """Minimum number of checkpoints of a run, so that a killed run loses at most half of it."""
@@ -187,13 +187,13 @@ def common_arguments(
 
 
 def run_training(
-    trainer: Trainer, run: Run, checkpoint: Path | None, lower: str, shrink: str
+    trainer: Trainer, run: Run, checkpoint: Path | None, remedy: str, last_resort: str
 ) -> None:
     """Train from the start or a checkpoint, and keep the journal and the curves.
 
     Args:
-        lower: What to do if memory runs out, without changing the result of the run.
-        shrink: Settings that also save memory if they are lowered, but change the result.
+        remedy: What to do if memory runs out, without changing the result of the run.
+        last_resort: Settings to lower if this is not enough; they change the result.
 
     Raises:
         UserError: memory runs out, or a worker process or another rank raises a UserError.
@@ -201,8 +201,8 @@ def run_training(
     add_callbacks(trainer, run)
     check_fsdp(trainer, checkpoint)
     advice = (
-        f"{lower} or set train.gradient_checkpointing=true, and run the same command, which goes "
-        f"on from the last checkpoint; if this is not enough, lower {shrink} in another run "
+        f"{remedy} or set train.gradient_checkpointing=true, and run the same command, which goes "
+        f"on from the last checkpoint; if this is not enough, lower {last_resort} in another run "
         "(run=NAME)"
     )
     with explain_errors("while training", advice):
@@ -251,7 +251,7 @@ def explain_errors(when: str, advice: str) -> Iterator[None]:
         with explain_out_of_memory(when, advice):
             yield
     except RuntimeError as error:
-        if MESSAGE_PREFIX not in str(error):
+        if USER_ERROR_PREFIX not in str(error):
             raise
         # A UserError of another rank, whose traceback is part of the library's message.
         raise UserError(user_message(error), code="failed-rank") from error
@@ -267,7 +267,7 @@ def explain_load_errors(group: str) -> AbstractContextManager[None]:
 
 def user_message(error: Exception) -> str:
     """Return an error's message without the traceback of a worker process or of another rank."""
-    return str(error).rpartition(MESSAGE_PREFIX)[2].strip()
+    return str(error).rpartition(USER_ERROR_PREFIX)[2].strip()
 
 
 def check_fsdp(trainer: Trainer, checkpoint: Path | None) -> None:

@@ -124,17 +124,17 @@ def train_and_save(
     run: Run,
     checkpoint: Path | None,
     trained: SftCommand,
-    shrink: str,
+    last_resort: str,
 ) -> dict[str, float]:
     """Train a student, save it in the run's folder, and return the run's metrics.
 
     Args:
         trainer: A trainer with a `response_sampler`.
         trained: The settings of the student, from `resolve_continuation`.
-        shrink: Settings that save memory if they are lowered, but change the result.
+        last_resort: Settings to lower if memory still runs out; they change the result.
     """
-    lower = "lower train.micro_batch or train.sampling_batch,"
-    run_training(trainer, run, checkpoint, lower, shrink)
+    remedy = "lower train.micro_batch or train.sampling_batch,"
+    run_training(trainer, run, checkpoint, remedy, last_resort)
     metrics, folder = run_metrics(run.folder), run.folder / "student"
     if rank() == 0:
         loading.save_student(trainer.model, processor, folder, trained.train.precision)

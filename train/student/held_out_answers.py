@@ -65,11 +65,11 @@ class HeldOutAnswers:
         first = [samples[k] for k in range(min(train.generated_items, len(samples)))]
         limit = response_token_limit(mode, student.max_new_tokens)
         when = f"while generating {min(BATCH, len(first))} answers after step {step}"
-        lower = "set train.generated_items=0 in another run (run=NAME)"
+        advice = "set train.generated_items=0 in another run (run=NAME)"
 
         def answer(batch: list[Sample]) -> list[GeneratedText]:
             inputs = self._collator([replace(sample, response=None) for sample in batch])
-            with explain_out_of_memory(when, lower):
+            with explain_out_of_memory(when, advice):
                 return generate(model, self._processor, inputs, limit, train.precision)
 
         # Under FSDP, all ranks take part in each forward pass.
