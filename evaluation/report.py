@@ -16,7 +16,7 @@ from dynapix.conf.files import write_text
 from dynapix.conf.schema import ReportCommand
 
 if TYPE_CHECKING:
-    from dynapix.evaluation.reporting.item_browser import ItemBrowser
+    from dynapix.evaluation.reporting.item_results import ItemResults
     from dynapix.evaluation.reporting.sections import Section
 
 log = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ PAGE = "report.html"
 
 @command("evaluation.report", ReportCommand)
 def main(cfg: ReportCommand, run: Run) -> None:
-    from dynapix.evaluation.reporting.item_browser import browse_items
+    from dynapix.evaluation.reporting.item_results import read_item_results
     from dynapix.evaluation.reporting.measurements import read_measurements
     from dynapix.evaluation.reporting.overview import write_overview
     from dynapix.evaluation.reporting.runs import RETRIEVAL_KINDS, SELECTION_KINDS, gather_runs
@@ -41,15 +41,15 @@ def main(cfg: ReportCommand, run: Run) -> None:
         log.warning("%s", sentence)
     selections = read_measurements(runs, SELECTION_KINDS)
     retrievals = read_measurements(runs, RETRIEVAL_KINDS)
-    browser = browse_items(selections, Path(cfg.store), cfg.items, cfg.seed)
-    sections = build_sections(selections, retrievals, runs, browser)
+    by_item = read_item_results(selections, Path(cfg.store), cfg.items, cfg.seed)
+    sections = build_sections(selections, retrievals, runs, by_item)
     tables = [table for section in sections for table in section.tables]
     text = "\n\n".join(str(table) for table in tables if not table.folded)
 
     # All files are rendered before the first is written: an error leaves the previous report as is.
     contents = {
         "report.txt": text + "\n",
-        PAGE: render_page(sections, browser, [r.title for r in runs], left_out),
+        PAGE: render_page(sections, by_item, [r.title for r in runs], left_out),
     }
     for figure in (figure for section in sections for figure in section.figures):
         contents[f"figures/{figure.name}.svg"] = figure.svg
@@ -63,14 +63,14 @@ def main(cfg: ReportCommand, run: Run) -> None:
         write_text(run.folder / name, content)
 
     log.info("%s", text)
-    if overview := write_overview(selections, retrievals, browser):
+    if overview := write_overview(selections, retrievals, by_item):
         log.info("\n%s", overview)
     log.info("\ntables: %s\npage: %s", run.folder / "tables", run.folder / PAGE)
 
 
 def render_page(
     sections: Sequence[Section],
-    browser: ItemBrowser,
+    by_item: ItemResults,
     runs: Sequence[str],
     left_out: Sequence[str],
 ) -> str:
@@ -97,7 +97,7 @@ def render_page(
         svgs={f.name: Markup(inline_svg(f.svg, k)) for k, f in enumerate(figures)},
         runs=runs,
         left_out=left_out,
-        browser=browser,
+        by_item=by_item,
         style=Markup((templates / "page.css").read_text(encoding="utf-8")),
         script=Markup((templates / "page.js").read_text(encoding="utf-8")),
     )

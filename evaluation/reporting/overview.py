@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dynapix.data.checks.intervals import Interval
 from dynapix.evaluation.metrics.results import TWIN_ABOVE, RetrievalResult
 from dynapix.evaluation.metrics.selection import BASELINES
-from dynapix.evaluation.reporting.item_browser import ItemBrowser
+from dynapix.evaluation.reporting.item_results import ItemResults
 from dynapix.evaluation.reporting.measurements import Measurement, widest_results
 
 CHANCE = 25.0
@@ -16,7 +16,7 @@ CHANCE = 25.0
 
 
 def write_overview(
-    selections: Sequence[Measurement], retrievals: Sequence[Measurement], browser: ItemBrowser
+    selections: Sequence[Measurement], retrievals: Sequence[Measurement], by_item: ItemResults
 ) -> str:
     """Return the overview of a report; empty if no trained model was measured."""
     students = [m for m in selections if m.trained and not m.variants]
@@ -24,7 +24,7 @@ def write_overview(
     main = max(reasoning or students, key=lambda m: m.run.started, default=None)
     lines = []
     if main is not None:
-        lines.append(_describe_student(main, students, browser))
+        lines.append(_describe_student(main, students, by_item))
         reasons = main.run.report.reasons.get(main.result.key)
         if reasons is not None:
             shares = {
@@ -49,7 +49,7 @@ def percent(interval: Interval) -> str:
 
 
 def _describe_student(
-    main: Measurement, students: Sequence[Measurement], browser: ItemBrowser
+    main: Measurement, students: Sequence[Measurement], by_item: ItemResults
 ) -> str:
     """Return the accuracy of a student, beside students that answer at once and the best baseline
     that does not predict."""
@@ -57,7 +57,7 @@ def _describe_student(
     for m in students:
         if m is not main and m.group == main.group and m.regime == "answer_only":
             beside.append(f"{m.label}, trained on answers alone, {percent(m.result.micro)}")
-    rules = [r for r in browser.baselines.get(main.group, []) if r.name != BASELINES["velocity"]]
+    rules = [r for r in by_item.baselines.get(main.group, []) if r.name != BASELINES["velocity"]]
     if rules:
         best = max(rules, key=lambda rule: rule.micro.value)
         beside.append(f"best rule without prediction, {best.name}, {percent(best.micro)}")

@@ -10,7 +10,7 @@ from typing import Any
 
 from dynapix.data.checks.observer_curve import plot_observers
 from dynapix.evaluation.reporting import figures, summary_tables, tables
-from dynapix.evaluation.reporting.item_browser import ItemBrowser
+from dynapix.evaluation.reporting.item_results import ItemResults
 from dynapix.evaluation.reporting.measurements import (
     ABLATED_REGIMES,
     REGIMES,
@@ -63,7 +63,7 @@ class Section:
 
 
 def build_sections(
-    selections: Results, retrievals: Results, runs: Sequence[FinishedRun], browser: ItemBrowser
+    selections: Results, retrievals: Results, runs: Sequence[FinishedRun], by_item: ItemResults
 ) -> list[Section]:
     """Return the sections that have tables or figures, in the order of the paper.
 
@@ -79,13 +79,13 @@ def build_sections(
     studies = [run for run in runs if run.kind in STUDY_KINDS]
     widest = widest_results(retrievals)
     sections = [
-        build_zero_shot([m for m in in_domain if not m.trained], widest, studies, browser),
-        build_distillation(in_domain, widest, browser),
+        build_zero_shot([m for m in in_domain if not m.trained], widest, studies, by_item),
+        build_distillation(in_domain, widest, by_item),
         build_ablation(unchanged),
-        build_transfer(unchanged, transfers, browser),
+        build_transfer(unchanged, transfers, by_item),
         build_controls([m for m in selections if m.variants], runs),
         Section("Human study", [_study_table(study) for study in studies]),
-        build_selection_details(unchanged, transfers, browser),
+        build_selection_details(unchanged, transfers, by_item),
         build_retrieval_details([m for m in retrievals if m.result.builder is None]),
         build_training([run for run in runs if run.kind in TRAINING_KINDS]),
     ]
@@ -96,14 +96,14 @@ def build_zero_shot(
     selections: Results,
     retrievals: Results,
     studies: Sequence[FinishedRun],
-    browser: ItemBrowser,
+    by_item: ItemResults,
 ) -> Section:
     """Released models, without any training by this project, and the votes of humans."""
     section = Section("Zero-shot")
     for rows in group_by_item_set(selections).values():
         people = [row for study in studies for row in _majority_rows(study, rows[0])]
-        baselines = browser.baselines.get(rows[0].group, [])
-        observers = browser.observers.get(rows[0].item_set, {})
+        baselines = by_item.baselines.get(rows[0].group, [])
+        observers = by_item.observers.get(rows[0].item_set, {})
         table = summary_tables.summary_table("selection", rows, people, baselines, observers)
         section.tables.append(table)
         section.figures.append(_family_figure("zero-shot", rows))
@@ -121,19 +121,19 @@ def _majority_rows(study: FinishedRun, m: Measurement) -> list[Row]:
     return [tables.human_row(f"Majority vote, {study.name}", report.majority)]
 
 
-def build_distillation(selections: Results, retrievals: Results, browser: ItemBrowser) -> Section:
+def build_distillation(selections: Results, retrievals: Results, by_item: ItemResults) -> Section:
     """Trained models beside released models, on benchmarks that do not test transfer."""
     section = Section("Distillation")
     for rows in group_by_item_set(selections).values():
         if any(m.trained for m in rows):
-            baselines = browser.baselines.get(rows[0].group, [])
-            observers = browser.observers.get(rows[0].item_set, {})
+            baselines = by_item.baselines.get(rows[0].group, [])
+            observers = by_item.observers.get(rows[0].item_set, {})
             table = summary_tables.summary_table(
                 "distillation-selection", rows, baselines=baselines, observers=observers
             )
             section.tables.append(table)
             section.figures.append(_family_figure("families", rows))
-            section.tables += _model_differences(rows[0].group, browser)
+            section.tables += _model_differences(rows[0].group, by_item)
     for rows in group_by_item_set(retrievals).values():
         if trained := {m.run.folder: m.run for m in rows if m.trained}:
             section.tables.append(summary_tables.summary_table("distillation-retrieval", rows))
@@ -156,7 +156,7 @@ def build_ablation(selections: Results) -> Section:
     return Section("Ablation", [table])
 
 
-def build_transfer(selections: Results, transfers: Container[str], browser: ItemBrowser) -> Section:
+def build_transfer(selections: Results, transfers: Container[str], by_item: ItemResults) -> Section:
     """The models that were measured on transfer benchmarks: their accuracies on all benchmarks."""
     section = Section("Transfer")
     models = {(m.result.name, m.result.mode) for m in selections if m.benchmark in transfers}
@@ -165,20 +165,20 @@ def build_transfer(selections: Results, transfers: Container[str], browser: Item
         section.tables.append(table)
     for rows in group_by_item_set(selections).values():
         if rows[0].benchmark in transfers:
-            observers = browser.observers.get(rows[0].item_set, {})
+            observers = by_item.observers.get(rows[0].item_set, {})
             table = summary_tables.summary_table("transfer-selection", rows, observers=observers)
             section.tables.append(table)
             # The paper's accuracies by family are on CLEVRER.
             section.figures.append(_family_figure("families", rows, with_paper=False))
-            section.tables += _model_differences(rows[0].group, browser)
+            section.tables += _model_differences(rows[0].group, by_item)
     return section
 
 
-def _model_differences(group: str, browser: ItemBrowser) -> list[Table]:
+def _model_differences(group: str, by_item: ItemResults) -> list[Table]:
     """Return the accuracies of trainings with several seeds, and the differences between models
     over all items and, in a folded table, by family."""
-    seeded = summary_tables.seed_tables(*browser.seeds.get(group, ([], {})), group)
-    comparisons = browser.comparisons.get(group)
+    seeded = summary_tables.seed_tables(*by_item.seeds.get(group, ([], {})), group)
+    comparisons = by_item.comparisons.get(group)
     if not comparisons:
         return seeded
     overall = tables.paired_table(p for p in comparisons if p.of == "all")
@@ -211,7 +211,7 @@ def _study_table(run: FinishedRun) -> Table:
 
 
 def build_selection_details(
-    selections: Results, transfers: Container[str], browser: ItemBrowser
+    selections: Results, transfers: Container[str], by_item: ItemResults
 ) -> Section:
     section = Section("Selection in detail")
     for benchmark, rows in group_by_item_set(selections).items():
@@ -221,12 +221,12 @@ def build_selection_details(
             section.figures.append(
                 Figure(file_stem(f"horizons-{benchmark}"), caption, plot, horizons)
             )
-        if curves := browser.observers.get(benchmark):
+        if curves := by_item.observers.get(benchmark):
             plot = partial(plot_observers, models={m.label: m.result.micro for m in rows})
             caption = f"Accuracy of models and of observers, by their error, on {benchmark}."
             name = file_stem(f"observer-{benchmark}")
             section.figures.append(Figure(name, caption, plot, curves))
-        if split := browser.future_moment.get(benchmark):
+        if split := by_item.future_moment.get(benchmark):
             section.tables.append(_name_table(tables.future_moment_table(split), benchmark))
         details = tables.detail_tables({m.label: (m.result.key, m.run.report) for m in rows})
         section.tables += [_name_table(replace(t, folded=True), benchmark) for t in details]

@@ -12,7 +12,7 @@ from dynapix.data.checks.intervals import SceneBootstrap
 from dynapix.data.records import LETTERS, SelectionItem
 from dynapix.data.store import Store
 from dynapix.evaluation.metrics.reasons import ReasonSummary, measure_reasons, read_reasons
-from dynapix.evaluation.reporting.item_browser import mark_claims
+from dynapix.evaluation.reporting.item_results import mark_claims
 from dynapix.evaluation.reporting.run_responses import parse_response
 from dynapix.evaluation.reporting.tables import reason_table
 from dynapix.teacher.narrator import write_match_lines, write_rationale

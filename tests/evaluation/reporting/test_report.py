@@ -15,7 +15,7 @@ import pytest
 from dynapix.conf.schema import ExportStudyCommand
 from dynapix.conf.schema.benchmark import MATCHED_ANCHOR
 from dynapix.data.checks.observer import ERRORS, EXTRAPOLATES, SIMULATES
-from dynapix.evaluation.reporting import item_browser
+from dynapix.evaluation.reporting import item_results
 from tests.evaluation.reporting.measured import (
     finish,
     read_table,
@@ -361,7 +361,7 @@ def test_accuracies_are_reported_as_errors_of_observers(
     shares = [1.0, 1.0, 1.0, 1.0, 0.9, 0.75, 0.5, 0.25, 0.25]
     seen = pd.DataFrame([shares] * len(names), index=names, columns=[0.0, *ERRORS])
     results = {SIMULATES: seen, EXTRAPOLATES: seen}
-    monkeypatch.setattr(item_browser, "load_observers", lambda store, split: results)
+    monkeypatch.setattr(item_results, "load_observers", lambda store, split: results)
     folder = report(items=3)
     table = read_table(folder, "distillation-selection-micro")
     [right] = [line for line in table.splitlines() if line.startswith("| cot (reasoning)")]

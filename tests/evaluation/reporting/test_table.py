@@ -7,7 +7,7 @@ import re
 
 from dynapix.data.checks.intervals import Interval
 from dynapix.evaluation.report import render_page
-from dynapix.evaluation.reporting.item_browser import ItemBrowser
+from dynapix.evaluation.reporting.item_results import ItemResults
 from dynapix.evaluation.reporting.sections import Section
 from dynapix.evaluation.reporting.table import Table
 
@@ -57,7 +57,7 @@ def test_markdown_and_latex_show_every_cell():
 
 
 def test_html_shows_every_cell_as_text():
-    page = render_page([Section("One", [TABLE])], ItemBrowser(), [], [])
+    page = render_page([Section("One", [TABLE])], ItemResults(), [], [])
     table = re.search(r"<table>.*</table>", page, re.DOTALL)[0]
     rows = [
         re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row)

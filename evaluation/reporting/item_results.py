@@ -1,4 +1,4 @@
-"""The items that the page shows, with their frames and the responses of the models."""
+"""What the page shows that depends on the items of a benchmark, not only on the reports of runs."""
 
 from __future__ import annotations
 
@@ -47,8 +47,9 @@ WEBP_QUALITY = 70
 
 
 @dataclass
-class ItemBrowser:
-    """The items that the page shows, and comparisons of the models over all items.
+class ItemResults:
+    """Results that need the items of a benchmark: comparisons of models over all items, and some of
+    the items with their frames and the responses of the models.
 
     Attributes:
         entries: The shown items, in the form that page.js reads.
@@ -136,11 +137,11 @@ class ItemBrowser:
         return results
 
 
-def browse_items(
+def read_item_results(
     selections: Sequence[Measurement], stores: Path, limit: int, seed: int
-) -> ItemBrowser:
+) -> ItemResults:
     """Return at most `limit` items of each group of results whose benchmark is in `stores`."""
-    browser = ItemBrowser()
+    by_item = ItemResults()
     for group in dict.fromkeys(m.group for m in selections):
         of_group = [m for m in selections if m.group == group]
         name, build = of_group[0].benchmark, of_group[0].run.report.build
@@ -148,14 +149,14 @@ def browse_items(
         try:
             store = open_store(stores / name)
             if build == store.identity:
-                browser.add_group(group, store, models, limit, seed)
+                by_item.add_group(group, store, models, limit, seed)
                 continue
             # Items of two builds can differ although they have the same ids.
             problem = f"{store.folder} has another build"
         except UserError as error:
             problem = str(error).replace("benchmark=NAME", f"benchmark={name}")
-        browser.notes.append(f"The items of {group} cannot be shown: {problem}.")
-    return browser
+        by_item.notes.append(f"The items of {group} cannot be shown: {problem}.")
+    return by_item
 
 
 def choose_items(

@@ -12,7 +12,7 @@ from PIL import Image
 
 from dynapix.data.records import LETTERS
 from dynapix.evaluation.metrics.reasons import item_predicates, read_reasons
-from dynapix.evaluation.reporting import item_browser
+from dynapix.evaluation.reporting import item_results
 from dynapix.evaluation.reporting.run_responses import nearest_candidates, parse_response
 
 
@@ -46,31 +46,31 @@ def ids_by_verdict(items, responses):
 def test_chosen_items_cover_correct_and_wrong_answers_of_every_subtype(items, responses):
     one = {"one": responses["one"]}
     expected = ids_by_verdict(items, one)
-    chosen = item_browser.choose_items(items, one, len(expected), 0)
+    chosen = item_results.choose_items(items, one, len(expected), 0)
     assert len({i.item_id for i in chosen}) == len(chosen) == len(expected)
     assert ids_by_verdict(chosen, one).keys() == expected.keys()
-    both = item_browser.choose_items(items, responses, len(expected), 0)
+    both = item_results.choose_items(items, responses, len(expected), 0)
     covered = len(ids_by_verdict(both, responses))
     assert covered > 0.8 * len(ids_by_verdict(items, responses))
-    assert item_browser.choose_items(items, responses, len(expected), 0) == both
-    assert item_browser.choose_items(items, responses, len(expected), 1) != both
-    everything = item_browser.choose_items(items, responses, 10**6, 0)
+    assert item_results.choose_items(items, responses, len(expected), 0) == both
+    assert item_results.choose_items(items, responses, len(expected), 1) != both
+    everything = item_results.choose_items(items, responses, 10**6, 0)
     assert {i.item_id for i in everything} == {i.item_id for i in items}
-    assert item_browser.choose_items(items, responses, 0, 0) == []
+    assert item_results.choose_items(items, responses, 0, 0) == []
 
 
 def test_every_shown_frame_is_encoded_as_a_small_image(micro_store, items):
     few = [*items[:6], items[0]]
-    frames, errors = item_browser.encode_frames(few, micro_store)
+    frames, errors = item_results.encode_frames(few, micro_store)
     assert errors == []
-    entries = list(item_browser.page_entries(few, {}, micro_store, "micro", {}))
+    entries = list(item_results.page_entries(few, {}, micro_store, "micro", {}))
     names = {n for e in entries for n in (*e["prefix"], *(c["frame"] for c in e["candidates"]))}
     assert names == frames.keys()
     for url in frames.values():
         kind, _, content = url.partition(",")
         assert kind == "data:image/webp;base64"
         image = Image.open(io.BytesIO(base64.b64decode(content)))
-        assert (image.format, image.width) == ("WEBP", item_browser.FRAME_WIDTH)
+        assert (image.format, image.width) == ("WEBP", item_results.FRAME_WIDTH)
         assert len(content) < 12_000
     target = f"{micro_store.name}/{few[0].scene_id}/{few[0].target_frame}"
     assert entries[0]["candidates"][few[0].answer]["frame"] == target
@@ -89,7 +89,7 @@ def test_the_verdict_on_a_response_is_that_of_its_parsed_answer(micro_store, ite
     item = items[0]
     wrong = next(letter for letter in LETTERS if letter != item.letter)
     response = parse_response(text.format(right=item.letter, wrong=wrong), False)
-    [entry] = item_browser.page_entries(
+    [entry] = item_results.page_entries(
         [item], {"one": {item.item_id: response}}, micro_store, "micro", {}
     )
     [shown] = entry["responses"]
@@ -99,7 +99,7 @@ def test_the_verdict_on_a_response_is_that_of_its_parsed_answer(micro_store, ite
 
 
 def test_the_facts_of_an_item_contradict_no_claim_that_they_make(micro_store, items):
-    described = {item: item_browser.list_oracle_facts(item, micro_store) for item in items[:20]}
+    described = {item: item_results.list_oracle_facts(item, micro_store) for item in items[:20]}
     assert any(described.values())
     for item, facts in described.items():
         assert bool(facts) == (item_predicates(item, micro_store) is not None)
