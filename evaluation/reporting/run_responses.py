@@ -11,7 +11,7 @@ from dynapix.conf.errors import UserError
 from dynapix.conf.files import read_json_lines
 from dynapix.data.records import LETTERS
 from dynapix.evaluation.metrics.results import SelectionReport, variant_name
-from dynapix.models.student.answer_parser import Reason, parse_choice
+from dynapix.models.student.answer_parser import ParseFailure, parse_choice
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def nearest_candidates(scores: Sequence[float]) -> ItemResponse:
     by_letter = dict(zip(LETTERS, scores, strict=True))
     letters = "".join(x for x, score in by_letter.items() if score == max(scores))
     text = ", ".join(f"{x} {score:.4f}" for x, score in by_letter.items())
-    return ItemResponse(text, letters, None if len(letters) == 1 else str(Reason.SEVERAL))
+    return ItemResponse(text, letters, None if len(letters) == 1 else str(ParseFailure.SEVERAL))
 
 
 def parse_response(text: str, truncated: bool) -> ItemResponse:

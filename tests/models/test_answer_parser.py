@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dynapix.models.student.answer_parser import Reason, parse_choice
+from dynapix.models.student.answer_parser import ParseFailure, parse_choice
 from tests.scaling import SIZE, is_linear
 
 RECORD = {
@@ -41,12 +41,14 @@ def test_a_response_that_is_cut_off_gives_only_a_complete_choice():
     for stop in range(len(FULL)):
         choice, is_stated = parse_choice(FULL[:stop]), stop >= FULL.index(",")
         assert choice.letter == ("B" if is_stated else None)
-        reasons = (Reason.CUT_OFF,) if is_stated else (Reason.CUT_OFF, Reason.NO_ANSWER)
+        reasons = (
+            (ParseFailure.CUT_OFF,) if is_stated else (ParseFailure.CUT_OFF, ParseFailure.NO_ANSWER)
+        )
         assert choice.reason in reasons
     for raw in ("Answer: B.", "Answer: B\nThe", FULL, FULL[:40]):
         assert parse_choice(raw, truncated=True).letter == "B"
     for raw in ("Answer: B", "B", "Option"):
-        assert parse_choice(raw, truncated=True).reason is Reason.CUT_OFF
+        assert parse_choice(raw, truncated=True).reason is ParseFailure.CUT_OFF
 
 
 def test_any_text_gives_a_letter_of_the_item_or_a_reason():
